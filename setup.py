@@ -192,7 +192,7 @@ class BuildWasm(Command):
             if WASM["is_current"](here, Path(), part):
                 out.write_bytes(here.read_bytes())
                 continue
-            reason = WASM["missing_requirement"]()
+            reason = WASM["explain_missing_requirement"]()
             if reason:
                 self.announce(f"no WebAssembly module {name}: {reason}", level=logging.INFO)
             else:
@@ -254,7 +254,7 @@ class BuildLibrary(Command):
 def make_library():
     """Bring lavender/export/c/lavender.c up to date with the kernels and return its path."""
     out = Path("lavender", "export", "c", "lavender.c")
-    if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
+    if not (out.exists() and LIBRARY["hash_sources"](Path()) in out.read_text(encoding="utf-8")[:1000]):
         put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
     return out
 
@@ -268,7 +268,7 @@ class ReproducibleArchive(sdist):
         for name, part in WASM["PARTS"].items():
             path = Path("lavender", "sim", "web", f"{name}.wasm")
             if not WASM["is_current"](path, Path(), part):
-                if reason := WASM["missing_requirement"]():
+                if reason := WASM["explain_missing_requirement"]():
                     raise CompileError(
                         f"a source distribution contains {path}, which cannot be built here: {reason}"
                     )

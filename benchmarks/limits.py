@@ -117,10 +117,10 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
 
     problem, cold = ready(), make()
     impulse = np.ones(problem.m)
-    yield "the judge", lambda: residuals.setup_time(cold), least(make, lambda p: p.metric)
+    yield "the judge", lambda: residuals.estimate_judge_setup_time(cold), least(make, lambda p: p.metric)
     yield (
         "his pass",
-        lambda: residuals.judging_time(problem) - residuals.RESULT_TIME,
+        lambda: residuals.estimate_judging_time(problem) - residuals.RESULT_TIME,
         least(ready, lambda p: residuals.judge_impulse(p, impulse)),
     )
     stretched = with_ellipses(make())

@@ -34,5 +34,5 @@ def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]],
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
     """Write lines (dataclasses or dictionaries) with machine and package versions; the file is written atomically."""
     rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
-    more = {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}
+    more = {"cpu": machine.get_cpu_name(), "versions": machine.get_versions(), **more, "lines": rows}
     write_text(path, json.dumps(more, indent=1) + "\n")

@@ -64,7 +64,7 @@ def opened(address, **options):
         raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
         pages.write_page(Path(folder), print)
-        server = pages.server(Path(folder))
+        server = pages.create_file_server(Path(folder))
         threading.Thread(target=server.serve_forever, daemon=True).start()
         # In containers and as root there are no user namespaces for the sandbox.
         browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])

@@ -30,13 +30,13 @@ from benchmarks.output import markdown, out_option, write_json
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import ListType
-from lavender.lab.bench.machine import versions
+from lavender.lab.bench.machine import get_versions
 from lavender.lab.phenomena.engines import (
     PACKAGES_OF_NODE,
     Stepping,
     create_engine,
-    missing_installation_command,
-    versions_of_node,
+    get_missing_installation_command,
+    get_npm_versions,
 )
 from lavender.lab.phenomena.parts import has_fallen
 from lavender.sim.scene import Scene
@@ -95,7 +95,7 @@ class Standing:
 
     def centres(self) -> FloatArray:
         """Return the centres of the boxes (n, 3) [m]."""
-        x: FloatArray = self.engine.state()[0][1:]
+        x: FloatArray = self.engine.get_state()[0][1:]
         return x.copy()
 
 
@@ -156,7 +156,7 @@ ENGINES: dict[str, Contestant] = {
 
 def missing(name: str) -> str:
     """Return the missing requirement of an engine, empty if it can run."""
-    return missing_installation_command(ENGINES[name].needs)
+    return get_missing_installation_command(ENGINES[name].needs)
 
 
 def installed() -> list[str]:
@@ -196,9 +196,9 @@ def _watch(made: Standing, tower: Tower) -> Line:
     spent, drift, start, stood, steps = 0.0, 0.0, None, tower.seconds, 0
     first = made.centres()
     for _ in range(looks):
-        begin = made.engine.clock()
+        begin = made.engine.get_cpu_time()
         made.engine.advance(every)
-        spent += made.engine.clock() - begin
+        spent += made.engine.get_cpu_time() - begin
         steps += every
         time = steps * tower.dt
         now = made.centres()
@@ -353,4 +353,4 @@ def command(
 
 def _versions(names: Sequence[str]) -> dict[str, str]:
     needed = {p for n in names if (p := ENGINES[n].needs)}
-    return {p: v for p, v in (versions(needed) | versions_of_node()).items() if p in needed}
+    return {p: v for p, v in (get_versions(needed) | get_npm_versions()).items() if p in needed}

@@ -50,7 +50,7 @@ def installed() -> Iterator[Path]:
 def states(path: Path, worlds: int, seed: int) -> tuple[Any, Any, np.ndarray]:
     """Return MuJoCo, the model with cold Newton's method, and `worlds` states of ten runs."""
     runs = Runs(str(path), worlds=10, steps=LOOK * -(-worlds // 10), seed=seed)
-    mj, model = runs.load()
+    mj, model = runs.load_model()
     found = np.concatenate(
         [simulate_world(mj, model, runs, i)[0][LOOK - 1 :: LOOK] for i in range(runs.worlds)]
     )

@@ -38,10 +38,10 @@ import lavender_ext
 from benchmarks import stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.lab.bench import format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
-from lavender.lab.report import geometric_means, reaches, table_specs
+from lavender.lab.report import compute_geometric_means, compute_reaches, table_specs
 from lavender.lab.report.figures import build_figures, build_work_precision
 from lavender.lab.report.findings import Report
 from lavender.lab.report.page import render_page
@@ -259,7 +259,7 @@ def _times(ratio):
 def standing(records, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
     by_case = {}
-    for reach in reaches(records, TOLERANCES):
+    for reach in compute_reaches(records, TOLERANCES):
         by_case.setdefault(reach.case, []).append(reach)
     rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
     for case, all_reaches in by_case.items():
@@ -277,7 +277,7 @@ def standing(records, solver):
             if t <= NEAR * fastest:
                 best[tolerance].append(case)
             ratio = "" if fastest == float("inf") else f" ({_times(t / fastest)} ×)"
-            cells.append(f"{seconds(t)}{ratio}")
+            cells.append(f"{format_seconds(t)}{ratio}")
         cells.append(format_residual(mine.best) + (" (floor)" if mine.at_floor else ""))
         rows.append(cells)
     if not rows:
@@ -421,7 +421,7 @@ def measured_page(site, records, figures):
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     drawn = []
-    for law in geometric_means(records):
+    for law in compute_geometric_means(records):
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
             shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
@@ -431,7 +431,7 @@ def measured_page(site, records, figures):
         (
             f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
             f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
-            f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\n"
+            f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {format_seconds(PLAN.time_limit)}\n"
             "a solve. This is a small measurement, not a benchmark: `lavender report` on your own problems says more. "
             "Every run, mean and claim, with the cases, is in\n[the report](report.html) of these records."
         ),
@@ -445,14 +445,16 @@ def measured_page(site, records, figures):
 def by_law(records):
     """Return the table of the three fastest solvers for each law, to each tolerance."""
     rows = []
-    for law, by_tolerance in geometric_means(records).items():
+    for law, by_tolerance in compute_geometric_means(records).items():
         cells = []
         for tolerance in TOLERANCES:
             most = max(solved for _, solved, _ in by_tolerance[tolerance].values())
             names = sorted(
                 (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
             )
-            cells.append("<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "none")
+            cells.append(
+                "<br>".join(f"**{name}** {format_seconds(t)}" for t, name in names[:3]) if most else "none"
+            )
         rows.append((LAW_NAMES[law], *cells))
     return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
 

@@ -16,7 +16,7 @@ import numpy as np
 from panels import Numbers, put_legend_right, show
 
 import lavender as lv
-from lavender.lab.bench import carry
+from lavender.lab.bench import carry_impulses
 from lavender.sim.engine import Simulation
 
 SCENE = "stack"
@@ -40,7 +40,7 @@ def solve_steps(steps, **budget):
     """Return sweeps and residual of each step, each started from the impulses of the step before."""
     before, sweeps, residuals = None, [], []
     for problem in steps:
-        start = problem.start() if before is None else carry(*before, problem)
+        start = problem.start() if before is None else carry_impulses(*before, problem)
         solution = lv.solve(problem, SOLVER, impulse=start, **budget)
         before = (problem, solution.impulse)
         sweeps.append(solution.iterations)

@@ -54,7 +54,9 @@ def furthest(motions):
     """Return the two motions with the largest distance."""
     p = motions.problem
     pairs = [(i, j) for i in range(len(motions)) for j in range(i)]
-    return min(pairs, key=lambda ij: -lv.motion.distance(p, *(motions[k].impulse for k in ij)).speed)[::-1]
+    return min(
+        pairs, key=lambda ij: -lv.motion.measure_motion_distance(p, *(motions[k].impulse for k in ij)).speed
+    )[::-1]
 
 
 def figure(found, path):

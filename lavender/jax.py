@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, make_step, result_shapes
+from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, infer_result_shapes, make_step
 from lavender.problem.cones import Cones
 
 try:
@@ -32,7 +32,7 @@ def _call(function: Any, like: Any, arrays: Any) -> Any:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _solve(step: Step, *arrays: Any) -> Any:
-    like = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in result_shapes(arrays))
+    like = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in infer_result_shapes(arrays))
     return _call(step.forward, like, arrays)
 
 
@@ -95,7 +95,7 @@ def solve(
             raise InputError(
                 f"{name} is {x.dtype}; float64 is needed: jax.config.update('jax_enable_x64', True) before it is made"
             )
-    result_shapes(arguments)  # raises InputError
+    infer_result_shapes(arguments)  # raises InputError
     # `broadcast_all` of `vmap` adds its axis at the front, so all arrays need the same number of batch axes.
     batch_axes = max(x.ndim - n for x, n in zip(arguments, ARGUMENT_AXES, strict=True))
     arguments = [

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, make_step, result_shapes
+from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, infer_result_shapes, make_step
 from lavender.problem.cones import Cones
 
 try:
@@ -28,7 +28,7 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
 
     @staticmethod
     def forward(step: Step, *arrays: Any) -> Any:
-        """Compute velocity and impulse."""
+        """Solve the step for the velocity after it and its impulses."""
         return tuple(map(torch.from_numpy, step.forward(*(x.detach().numpy() for x in arrays))))
 
     @staticmethod
@@ -146,7 +146,7 @@ def solve(
             raise InputError(
                 f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
             )
-    result_shapes(arguments)  # raises InputError
+    infer_result_shapes(arguments)  # raises InputError
     arguments[1] = 0.5 * (arguments[1] + arguments[1].transpose(-1, -2))
     velocity, impulse = _Solve.apply(make_step(arguments, cones, friction, solver, tol), *arguments)
     return velocity, impulse

@@ -153,12 +153,12 @@ def shipped(name):
     """A module of WebAssembly of these sources, as bytes; built once for each state of the sources."""
     from lavender.base.errors import LavenderError
     from lavender.sim.web import pages
-    from lavender.sim.web.compile import missing_requirement
+    from lavender.sim.web.compile import explain_missing_requirement
 
     try:
-        return pages.module(name=name)
+        return pages.get_module(name=name)
     except LavenderError as error:
-        if not missing_requirement():  # what it is made with is there: it must be made
+        if not explain_missing_requirement():  # what it is made with is there: it must be made
             raise
         pytest.skip(str(error))
 

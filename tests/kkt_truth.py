@@ -155,8 +155,8 @@ def parts(c, i, number=float):
     """(rows, most of their norm over the normal impulse) of all that a contact bounds by itself."""
     mu, first = number(c.mu[i]), c.ptr[i] + 1
     found = [(np.arange(first, first + c.n_together[i]), mu)] if c.n_together[i] else []
-    if c.apart_rows[i] >= 0:  # spin, or the other side of a box
-        found.append((c.apart_rows[i : i + 1], mu * number(c.patch_radius[i])))
+    if c.separate_rows[i] >= 0:  # spin, or the other side of a box
+        found.append((c.separate_rows[i : i + 1], mu * number(c.patch_radius[i])))
     if c.rolling_rows[i] >= 0:
         found.append((c.rolling_rows[i] + np.arange(2), number(c.rolling[i])))
     return found

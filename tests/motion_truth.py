@@ -8,7 +8,7 @@ from kkt_truth import Wide, matrix_in, shift_in, solution_in
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
-from lavender.lab.motion.bound import difference, witness
+from lavender.lab.motion.bound import compute_witness, subtract_impulses
 from lavender.lab.motion.operator import make_operator
 
 SHAPES = ("disk", "disk", "box", "rolling")
@@ -76,16 +76,16 @@ def random_impulse(rng, problem, solution):
 def draw(rng):
     """A random draw; None without a witness. The witness is the reference four times out of five, or at random."""
     problem = random_problem(rng)
-    reference = lv.motion.reference(problem)
+    reference = lv.motion.get_reference(problem)
     good = bool(rng.random() < 0.8)
-    if good and not reference.accepted:
+    if good and not reference.is_accepted:
         return None
     y = reference.impulse if good else random_impulse(rng, problem, reference.impulse)
     operator = make_operator(problem)
-    assert operator.refusal() is None
-    proof = witness(problem, operator, y)
+    assert operator.explain_refusal() is None
+    proof = compute_witness(problem, operator, y)
     x = random_impulse(rng, problem, reference.impulse)
-    bound = difference(operator, x, y)[1].upper_bound + proof.radius
+    bound = subtract_impulses(operator, x, y)[1].upper_bound + proof.radius
     return Draw(problem, x, y, good, float(bound), float(proof.moved))
 
 

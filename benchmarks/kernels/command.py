@@ -45,7 +45,7 @@ def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
 
     CASES are names of cases; default: all.
     """
-    click.echo(f"{machine.cpu_name()}\n")
+    click.echo(f"{machine.get_cpu_name()}\n")
     found: list[Row] = []
     list(run([name for name in cases if name not in CASES]))  # raises an error for an unknown name
     for name in cases or CASES:

@@ -25,10 +25,16 @@ import scipy.sparse as sp
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import PROGRAM_FORMS, QP, bound_rows, impulse_form, velocity_form
+from lavender.external.as_qp import (
+    PROGRAM_FORMS,
+    QP,
+    build_impulse_form,
+    build_velocity_form,
+    make_bound_rows,
+)
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
-from lavender.external.qp_solver import QPSolver, refusal
+from lavender.external.qp_solver import QPSolver, explain_refusal
 from lavender.external.running import Limits
 from lavender.judge.residuals import get_reference
 from lavender.lab.bench.stopwatch import measure_backend_time
@@ -92,7 +98,7 @@ def _limits(eps: float, n: int, limit: float) -> Limits:
 def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
     if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
         return qp.problem.start()
-    return qp.impulse(x, np.zeros(0) if zeta is None else zeta, np.zeros(qp.n))
+    return qp.recover_impulse(x, np.zeros(0) if zeta is None else zeta, np.zeros(qp.n))
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
@@ -132,8 +138,8 @@ def _cone(name: str, form: str) -> Contestant:
     """Return the runs of a solver of second-order cone programs by its own interface."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
-        first, bounds = qp.n_zero + qp.n_nonneg, bound_rows(qp)
+        qp = build_velocity_form(problem) if form == "velocity" else build_impulse_form(problem)
+        first, bounds = qp.n_zero + qp.n_nonneg, make_bound_rows(qp)
         more = sum(len(at) for *_, at in bounds)
         rows = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
         rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
@@ -176,7 +182,7 @@ def _cone(name: str, form: str) -> Contestant:
     def refuses(problem: Problem) -> str | None:
         if problem.law != "cone":
             return "for the convex law of friction"
-        return "no rows" if form == "velocity" and problem.rows is None else refusal(problem)
+        return "no rows" if form == "velocity" and problem.rows is None else explain_refusal(problem)
 
     return Contestant(f"{name} cones ({form})", True, runs, refuses)
 

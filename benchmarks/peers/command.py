@@ -72,13 +72,13 @@ def command(
 
     steps: list[Step] = []
     found: list[Result] = []
-    versions = machine.versions(PACKAGES)
+    versions = machine.get_versions(PACKAGES)
 
     def keep() -> None:
         if out is not None:
             write_json(out, found, versions=versions, steps=[asdict(s) for s in steps])
 
-    click.echo(f"{machine.cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
+    click.echo(f"{machine.get_cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
     absent = [name for name in PACKAGES if name not in versions] + (
         [] if siconos else ["siconos (--siconos)"]
     )

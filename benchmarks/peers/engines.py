@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import stand
 from benchmarks.stand import Contestant, Tower
 from lavender.base.errors import UnknownName
-from lavender.lab.phenomena.engines import create_engine, missing_installation_command
+from lavender.lab.phenomena.engines import create_engine, get_missing_installation_command
 from lavender.problem import Problem
 from lavender.sim.scene import Scene
 
@@ -87,7 +87,7 @@ def export(scene: str, cone: str = "elliptic", settle: int = 120) -> Problem:
     made: Any = create_engine("mujoco", _scene(scene), cone=cone, dt=DT, sweeps=16, tree=False)
     made.advance(settle)
     mujoco.mj_forward(made.model, made.data)
-    problem: Problem = made.problem()
+    problem: Problem = made.read_last_problem()
     return problem
 
 
@@ -123,7 +123,7 @@ def measure_scene(
         if name not in ENGINES:
             raise UnknownName("engine", name, ENGINES)
     asked = Tower(0, DT, sweeps)
-    known = [ENGINES[name] for name in engines if not missing_installation_command(ENGINES[name].needs)]
+    known = [ENGINES[name] for name in engines if not get_missing_installation_command(ENGINES[name].needs)]
     notes: dict[int, str] = {}
     with ExitStack() as stack:
         made = []
@@ -154,7 +154,7 @@ def measure_scene(
                 found.append(Step(scene, name, not one.sweeps, note=notes[i]))
                 continue
             stepping.step()
-            contacts, depth, relative = stepping.last_step_quality()
-            speed = float(np.linalg.norm(stepping.state()[2][:, :3], axis=1).max(initial=0.0))
+            contacts, depth, relative = stepping.measure_last_step()
+            speed = float(np.linalg.norm(stepping.get_state()[2][:, :3], axis=1).max(initial=0.0))
             found.append(Step(scene, name, not one.sweeps, float(best[i]), contacts, depth, speed, relative))
         return found

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from benchmarks.peers import engines
 from lavender.base.errors import InputError, UnknownName
-from lavender.lab.bench.cases import resolve
+from lavender.lab.bench.cases import resolve_sources
 from lavender.problem import Problem
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
@@ -89,5 +89,5 @@ def problems(
             simulation.step()
             yield word, simulation.constraint_problem()
         else:
-            for item in resolve([word]):
+            for item in resolve_sources([word]):
                 yield item.name, item.problem

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
-from lavender.base.deadline import seconds
-from lavender.lab.bench.statistics import geometric_mean
+from lavender.base.deadline import format_seconds
+from lavender.lab.bench.statistics import compute_geometric_mean
 from lavender.lab.report.text import format_residual
 
 LARGE = 1000  # minimum rows of a large problem
@@ -36,7 +36,7 @@ def engines_table(steps: Sequence[Step]) -> str:
             continue
         over = over_ours(s, steps)
         known = format_residual(s.relative) if math.isfinite(s.relative) else "not known"
-        timed = f"{_ratio(over)} ({seconds(s.time)})"
+        timed = f"{_ratio(over)} ({format_seconds(s.time)})"
         rows.append(
             (s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", format_residual(s.speed), known)
         )
@@ -149,7 +149,7 @@ def means(results: Sequence[Result]) -> list[Mean]:
                 some = [c.ratios for c in of_size if c.target == target]
                 if some:
                     columns = [[x for x in column if math.isfinite(x)] for column in zip(*some, strict=True)]
-                    ours, scratch, auto = map(geometric_mean, columns)
+                    ours, scratch, auto = map(compute_geometric_mean, columns)
                     which = f"{group}, {size}"
                     out.append(
                         Mean(
@@ -165,7 +165,7 @@ def _ratio(x: float) -> str:
 
 
 def _timed(name: str, time: float) -> str:
-    return f"{name}, {seconds(time)}" if math.isfinite(time) else name
+    return f"{name}, {format_seconds(time)}" if math.isfinite(time) else name
 
 
 def _list(compared: Sequence[Comparison]) -> str:

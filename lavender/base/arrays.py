@@ -1,6 +1,6 @@
 """Validation of arguments: dtype, shape and range of arrays; numbers, flags and names. Kernels check nothing.
 
-The ranges are defined in `lavender_ext/core/validate.pxd`: numbers are at most 1e60 in absolute value, and masses,
+The ranges are defined in `lavender_ext/core/validate.pxd`: absolute values do not exceed 1e60, and masses,
 lengths and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer,
 so the message suggests a unit to change.
 """
@@ -41,7 +41,7 @@ def _matches_shape(actual: tuple[int, ...], required: tuple[int | None, ...]) ->
     return True
 
 
-def read_only(array: np.ndarray) -> np.ndarray:
+def mark_read_only(array: np.ndarray) -> np.ndarray:
     """Mark an array read-only, and return it."""
     array.setflags(write=False)
     return array
@@ -143,9 +143,9 @@ def as_array(
         if is_valid and len(shape) == 1 and shape[0] is not None:
             array = np.empty(shape[0])
             array.fill(value)
-            return read_only(array)
+            return mark_read_only(array)
     elif type(value) is np.ndarray and value.dtype is INT32 and _matches_shape(value.shape, shape):
-        return read_only(value.copy() if copy or not value.flags.c_contiguous else value)
+        return mark_read_only(value.copy() if copy or not value.flags.c_contiguous else value)
     label = f"{name} [{unit}]" if unit and unit != "-" else name
     array = to_numpy(label, value)
     if array.dtype.kind not in "buif":
@@ -176,11 +176,11 @@ def as_array(
         array = _round_to_float64(array)
     array = np.array(array, dtype, order="C") if copy else np.require(array, dtype, ["C", "A", "E"])
     if finite and array.dtype.kind == "f":
-        check_inside(label, array, unit)
-    return read_only(array)
+        check_magnitudes(label, array, unit)
+    return mark_read_only(array)
 
 
-def as_floats(name: str, value: Any) -> np.ndarray:
+def as_float_array(name: str, value: Any) -> np.ndarray:
     """Convert `value` to an array of float32 or float64 of any shape, without a copy if it is one of them.
 
     The numbers are not checked.
@@ -190,7 +190,7 @@ def as_floats(name: str, value: Any) -> np.ndarray:
     InputError
         The value is not numeric, is complex, has masked entries, or has nested sequences of different lengths.
     """
-    shape_of(name, value)
+    get_shape(name, value)
     check_unmasked(name, value)
     array = to_numpy(name, value)
     if array.dtype in FLOAT_DTYPES:
@@ -212,7 +212,7 @@ def check_unmasked(name: str, value: Any) -> None:
         raise InputError(f"{name} has no value at [{index}], {len(masked)} masked in all: fill them")
 
 
-def shape_of(name: str, value: Any) -> tuple[int, ...]:
+def get_shape(name: str, value: Any) -> tuple[int, ...]:
     """Return the shape of array-like data; raise InputError for nested sequences of different lengths."""
     try:
         return np.shape(value)
@@ -253,7 +253,7 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
         return range(n)[i]
     check_unmasked(name, i)
     entries = check_sequence(name, i, "whole numbers, or a mask,")
-    shape = shape_of(name, entries)
+    shape = get_shape(name, entries)
     index = np.array(entries)
     if len(shape) != 1 or (index.dtype.kind not in "biu" and index.size):
         raise InputError(f"{name} is {i!r:.60}; whole numbers, or a mask, are needed")
@@ -342,13 +342,13 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         a = a if copy else a.copy()
         a.sum_duplicates()
     data = as_array(name, a.data, (None,), finite=False, copy=False)
-    check_inside(name, data, unit, a)
+    check_magnitudes(name, data, unit, a)
     fields = ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
-    arrays = tuple(read_only(np.ascontiguousarray(x, dtype)) for x, dtype in fields)
+    arrays = tuple(mark_read_only(np.ascontiguousarray(x, dtype)) for x, dtype in fields)
     return sp.csr_array(arrays, shape=a.shape)
 
 
-def precision_of(*values: Any) -> str:
+def get_common_precision(*values: Any) -> str:
     """Return "float32" if all values that are not None are dense or sparse arrays of float32, else "float64"."""
     types = {getattr(x, "dtype", None) for x in values if x is not None}
     if types == {FLOAT32} or FLOAT64 in types:
@@ -387,7 +387,7 @@ def _format_index(index: np.ndarray, csr: Any) -> str:
     return ", ".join(map(str, index))
 
 
-def check_inside(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
+def check_magnitudes(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
     """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
     if checks.all_valid(array.reshape(-1)):
         return
@@ -399,13 +399,13 @@ def check_inside(name: str, array: np.ndarray, unit: str = "", csr: Any = None) 
     )
 
 
-def check_sizes(name: str, array: np.ndarray, unit: str = "") -> None:
+def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -> None:
     """Raise InputError at the first number that is negative, or neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE]."""
     flat = array.reshape(-1)
     position = checks.first_invalid_magnitude_of(flat)
     if position < 0:
         return
-    check_inside(name, array, unit)
+    check_magnitudes(name, array, unit)
     check_not_negative(name, flat)
     index = ", ".join(map(str, np.unravel_index(position, array.shape)))
     raise InputError(

@@ -74,7 +74,7 @@ class Deadline:
 NEVER = Deadline()
 
 
-def seconds(t: float) -> str:
+def format_seconds(t: float) -> str:
     """Format a time [s] with three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):
         return "–"

@@ -12,7 +12,7 @@ from typing import Any
 from lavender.base.lazy_import import sparse as sp
 
 
-def sparse_lu(matrix: Any, **options: Any) -> Any:
+def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
     """Factor a square sparse matrix (n, n), n > 0, by SuperLU; raise RuntimeError if it is singular.
 
     `options` are the options of `scipy.sparse.linalg.splu`.

@@ -6,6 +6,13 @@ from collections.abc import Collection
 
 #: Owner -> {name that does not exist: name to use}.
 INSTEAD = {
+    "Cones": {
+        "apart_rows": "separate_rows",
+        "has_more_parts": "has_more_components",
+        "parts": "friction_components",
+        "reach": "friction_coefficient",
+        "take": "select",
+    },
     "lavender": {
         "Motions": "SolutionSet",
         "Suspicion": "Diagnostic",
@@ -23,11 +30,10 @@ INSTEAD = {
         "x": "impulse",
     },
     "Residual": {
-        "energy_at_zero": "energy_at_zero",
+        "energy_start": "energy_at_zero",
         "floor": "roundoff_floor",
-        "velocity_at_zero": "velocity_at_zero",
+        "velocity_start": "velocity_at_zero",
     },
-    "Status": {"ROUNDOFF_LIMIT": "ROUNDOFF_LIMIT", "INVALID_PROBLEM": "INVALID_PROBLEM"},
 }
 
 #: Keyword argument of other packages -> arguments with that meaning; the first one that a call has is suggested.

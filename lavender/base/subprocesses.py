@@ -25,17 +25,17 @@ from typing import IO, Any
 
 import numpy as np
 
-START_TIMEOUT = 60.0  # s. On a loaded machine, importing a function and its modules may take this long.
-KILL_TIMEOUT = 10.0  # s. The system may need longer to end a killed process that waits for a broken disk.
-PIPE_TIMEOUT = 0.1  # s. A pipe that stays open for longer after the kill is held by another process.
-MAX_TEXT_SIZE = 2**20  # bytes. An answer that announces more JSON than this is invalid.
-MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
+START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a function and its modules may take this long.
+KILL_TIMEOUT = 10.0  # [s] The system may need longer to end a killed process that waits for a broken disk.
+PIPE_TIMEOUT = 0.1  # [s] A pipe that stays open for longer after the kill is held by another process.
+MAX_TEXT_SIZE = 2**20  # [bytes] An answer that announces more JSON than this is invalid.
+MAX_ERROR_LENGTH = 500  # [characters] Longer texts of errors are cut.
 #: If set, a process is killed together with the processes that it started.
 PROCESS_GROUPS = os.name == "posix"
 #: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
 SERVE_SCRIPT = (
-    "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
-    "serve(*map(int, sys.argv[1:]))"
+    "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve_requests; "
+    "serve_requests(*map(int, sys.argv[1:]))"
 )
 
 #: The JSON object and the arrays (None: not given) of an answer.
@@ -70,7 +70,7 @@ class ProcessBackend:
     memory : int, bytes
         Limit of the address space if the system has one; 0 for no limit.
     environment : mapping, optional
-        Environment variables in addition to those of this process.
+        Environment variables that are added to the environment of this process.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ProcessBackend:
         self._exchange_thread: threading.Thread | None = None
 
     @property
-    def alive(self) -> bool:
+    def is_alive(self) -> bool:
         """Whether the process runs."""
         return self.popen is not None and self.popen.poll() is None
 
@@ -98,12 +98,12 @@ class ProcessBackend:
         ProcessEnded
             The system starts no process, or the function cannot be imported.
         """
-        if self.alive:
+        if self.is_alive:
             return
         self.close()
         try:
             self._start()
-            self.call(self._function, timeout=START_TIMEOUT, max_bytes=0)
+            self.call_function(self._function, timeout=START_TIMEOUT, max_bytes=0)
         except (OSError, InvalidAnswer) as error:
             raise ProcessEnded(str(error) or "no answer") from None
         except RemoteError as error:
@@ -134,7 +134,9 @@ class ProcessBackend:
             if lifeline >= 0:
                 os.close(lifeline)
 
-    def call(self, *arguments: Any, timeout: float, max_bytes: int) -> tuple[dict[str, Any], list[Any]]:
+    def call_function(
+        self, *arguments: Any, timeout: float, max_bytes: int
+    ) -> tuple[dict[str, Any], list[Any]]:
         """Call the function, and return the JSON object and the arrays of its answer.
 
         Parameters
@@ -168,10 +170,12 @@ class ProcessBackend:
                 process.stdin.write(struct.pack("<Q", len(request)))
                 process.stdin.write(request)
                 process.stdin.flush()
-                text_size, array_size = struct.unpack("<QQ", _read(process.stdout, 16))
+                text_size, array_size = struct.unpack("<QQ", _read_bytes(process.stdout, 16))
                 if text_size > MAX_TEXT_SIZE or array_size > max_bytes:
                     raise InvalidAnswer(f"answers of {text_size} and {array_size} bytes are too large")
-                received.append((_read(process.stdout, text_size), _read(process.stdout, array_size)))
+                received.append(
+                    (_read_bytes(process.stdout, text_size), _read_bytes(process.stdout, array_size))
+                )
             except BaseException as error:
                 _close_streams(process)
                 received.append(error)
@@ -184,7 +188,7 @@ class ProcessBackend:
                 raise TimeoutError
             answer = received[0]
             if isinstance(answer, OSError | EOFError):
-                raise ProcessEnded(self._end())
+                raise ProcessEnded(self._kill_and_describe_end())
             if isinstance(answer, BaseException):
                 raise answer
             return unpack_answer(*answer)
@@ -194,7 +198,7 @@ class ProcessBackend:
             self.close()
             raise
 
-    def _end(self) -> str:
+    def _kill_and_describe_end(self) -> str:
         """Kill the process and return how it ended."""
         process = self.popen
         assert process is not None
@@ -241,7 +245,7 @@ def _close_streams(process: subprocess.Popen[bytes]) -> None:
             stream.close()
 
 
-def _read(stream: IO[bytes], size: int) -> bytes:
+def _read_bytes(stream: IO[bytes], size: int) -> bytes:
     """Read `size` bytes; EOFError if the stream ends before."""
     data = stream.read(size)
     if len(data) < size:
@@ -276,12 +280,12 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
 # -- in the other process -----------------------------------------------------------------------------
 
 
-def serve(lifeline: int, memory: int) -> None:
+def serve_requests(lifeline: int, memory: int) -> None:
     """Answer requests until the pipe ends: the first names the function, the others hold its arguments."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if lifeline >= 0:
-        _end_with_parent(lifeline)
-    requests, answers = _take_streams()
+        _kill_with_parent(lifeline)
+    requests, answers = _detach_standard_streams()
     if memory:
         with contextlib.suppress(ImportError, ValueError, OSError):
             import resource
@@ -290,8 +294,8 @@ def serve(lifeline: int, memory: int) -> None:
     function: Callable[..., Answer] | None = None
     while True:
         try:
-            (size,) = struct.unpack("<Q", _read(requests, 8))
-            request = _read(requests, size)
+            (size,) = struct.unpack("<Q", _read_bytes(requests, 8))
+            request = _read_bytes(requests, size)
         except EOFError:
             return
         try:
@@ -316,7 +320,7 @@ def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, 
     return json.dumps({**fields, "sizes": sizes}).encode(), numbers
 
 
-def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
+def _detach_standard_streams() -> tuple[IO[bytes], IO[bytes]]:
     """Return the streams of requests and answers; discard all later output."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
@@ -325,7 +329,7 @@ def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
     return requests, answers
 
 
-def _end_with_parent(lifeline: int) -> None:
+def _kill_with_parent(lifeline: int) -> None:
     """Have this process and those that it starts killed when the parent ends.
 
     On Linux the kernel sends the signal when the last writing end of the pipe closes, so code that never returns to

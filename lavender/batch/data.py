@@ -17,14 +17,14 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     as_array,
-    as_floats,
+    as_float_array,
     check_choice,
+    check_nonnegative_magnitudes,
     check_sequence,
-    check_sizes,
     check_unmasked,
-    precision_of,
+    get_common_precision,
+    get_shape,
     resolve_index,
-    shape_of,
 )
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION_LAWS, Problem
@@ -111,14 +111,16 @@ class Batch(Sequence[Problem]):
     ) -> None:
         friction = check_choice("friction", friction, FRICTION_LAWS)
         values, *pattern = M if isinstance(M, tuple) else (M,)
-        jac, mass, free = (as_floats(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
+        jac, mass, free = (
+            as_float_array(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free))
+        )
         if row_ptr is not None and count is None:
-            rows = _pointers("row_ptr", row_ptr)
+            rows = _check_world_pointers("row_ptr", row_ptr)
             if jac.ndim == 2 and velocity_ptr is None:
                 n, nv = len(rows) - 1, jac.shape[1]
                 velocities = nv * np.arange(n + 1)
             elif velocity_ptr is not None:
-                n, velocities = len(rows) - 1, _pointers("velocity_ptr", velocity_ptr)
+                n, velocities = len(rows) - 1, _check_world_pointers("velocity_ptr", velocity_ptr)
             else:
                 raise InputError(
                     f"J has shape {jac.shape}; ragged it is (rows of all worlds, nv), or one array of "
@@ -132,7 +134,7 @@ class Batch(Sequence[Problem]):
             capacity = None
         elif row_ptr is None and velocity_ptr is None and jac.ndim == 3:
             n, capacity, nv = jac.shape
-            sizes = np.full(n, capacity) if count is None else check_counts("count", count, n, capacity)
+            sizes = np.full(n, capacity) if count is None else check_row_counts("count", count, n, capacity)
             nvs = np.full(n, nv)
             rows, velocities = capacity * np.arange(n + 1), nv * np.arange(n + 1)
             self.shape, self.velocity_shape = (n, capacity), (n, nv)
@@ -141,13 +143,13 @@ class Batch(Sequence[Problem]):
                 f"J has shape {jac.shape}; stacked it is (n, m, nv), ragged (rows, nv) with row_ptr"
             )
         self._n, self.friction = n, friction
-        self.precision = precision_of(*(np.asarray(x) for x in (jac, mass, free)))
+        self.precision = get_common_precision(*(np.asarray(x) for x in (jac, mass, free)))
         # offsets and sizes of each world (n, columns of PLACE)
         self.at = at = np.zeros((n, len(PLACE)), np.int64)
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
         self._set_cones(cones)
-        self._pattern = check_triangle(pattern, nvs, mass) if pattern else None
+        self._pattern = check_shared_lower_triangles(pattern, nvs, mass) if pattern else None
         if capacity is not None and mass.ndim == 2 and not pattern:
             mass = np.broadcast_to(mass, (n, *mass.shape))
         shapes = (None, None) if capacity is None else ((capacity, nv), (nv, nv))
@@ -187,11 +189,11 @@ class Batch(Sequence[Problem]):
         cones, mu, friction
             As for `Batch`.
         """
-        matrix, rhs = as_floats("A", A), as_floats("b", b)
+        matrix, rhs = as_float_array("A", A), as_float_array("b", b)
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
             raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
         n, m = rhs.shape
-        batch = cls._make_empty(n, m, friction, precision_of(matrix, rhs))
+        batch = cls._make_empty(n, m, friction, get_common_precision(matrix, rhs))
         batch._set_cones(cones)
         at = batch.at
         flat, at[:, PLACE["jac"]], batch._jac_row = _flatten_matrices("A", matrix, n, (m, m), None)
@@ -224,7 +226,7 @@ class Batch(Sequence[Problem]):
         if unknown:
             raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(n_axes)}")
         for name, x in (*fields.items(), *bounds.items()):
-            shape_of(name, x)
+            get_shape(name, x)
             check_unmasked(name, x)
         arrays = {name: np.asarray(x) for name, x in fields.items()}
         more = {name: np.asarray(x) if np.ndim(x) else x for name, x in bounds.items() if x is not None}
@@ -282,7 +284,7 @@ class Batch(Sequence[Problem]):
             at[:, PLACE["blocks"]] = cones.n_blocks
             return
         self._has_shared_cones = False
-        first = _offsets_of_sizes(sizes)
+        first = _compute_offsets(sizes)
         if len(self) and first[-1] + sizes[-1] != cones.n_rows:
             alternative = (
                 f", or {sizes[0]} of each"
@@ -311,15 +313,15 @@ class Batch(Sequence[Problem]):
         flat, self.at[:, PLACE["mu"]] = _flatten_vectors("mu", mu, len(self), n_blocks, block_counts)
         return flat
 
-    def _cones_of(self, i: int, mu: FloatArray | None = None) -> Cones:
+    def _get_cones_of_world(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Return the blocks of world i, with mu (k,) if it is given."""
         block, k = (int(self.at[i, PLACE[name]]) for name in ("block", "blocks"))
         if self._has_shared_cones and mu is None:
             return self.cones
-        cones = self.cones._take_blocks(np.arange(block, block + k))
+        cones = self.cones._select_blocks(np.arange(block, block + k))
         if mu is None:
             return cones
-        check_sizes("mu", mu, "-")
+        check_nonnegative_magnitudes("mu", mu, "-")
         return replace(cones, mu=mu)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -350,7 +352,7 @@ class Batch(Sequence[Problem]):
         if self._bodies is not None:
             return self._make_body_problem(i, *self._bodies)
         jac, mass, free, target, compliance, mu = (self._array_of_world(i, which) for which in range(6))
-        cones = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
+        cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
         if mass is None:
             return Problem(target, cones, jac, friction=self.friction, precision=self.precision)
         return Problem.from_jacobian(
@@ -404,19 +406,19 @@ class Batch(Sequence[Problem]):
         first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
         return slice(first, first + m)
 
-    def start(self, i: int) -> FloatArray:
+    def make_zero_impulse(self, i: int) -> FloatArray:
         """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
         if self._arrays is None:
             return self[i].start()
         first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
         return zero_impulse(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
 
-    def impulses(self, name: str, value: Any) -> FloatArray:
+    def flatten_impulses(self, name: str, value: Any) -> FloatArray:
         """Convert impulses [N s] of the batch's shape to a new flat array; numbers need not be finite."""
         array = as_array(name, value, self.shape, finite=False, unit="N s")
         return array.reshape(-1).copy()
 
-    def worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
+    def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
         worlds = Worlds(self.at, impulse, velocity, cold)
         if self._bodies is not None and (body_arrays := self._get_body_arrays()):
@@ -464,7 +466,7 @@ class Batch(Sequence[Problem]):
             if np.ndim(x) <= default.ndim:
                 with_stride[name] = np.ascontiguousarray(default), 0
             elif x.shape == (n, *default.shape) and (
-                x.dtype in FLOAT_DTYPES if dtype is np.float64 else _are_indices(x)
+                x.dtype in FLOAT_DTYPES if dtype is np.float64 else _are_int32_indices(x)
             ):
                 with_stride[name] = np.ascontiguousarray(x, dtype), default.size
             else:
@@ -481,19 +483,19 @@ class Batch(Sequence[Problem]):
 # -- conversion of arguments --------------------------------------------------------------------------
 
 
-def _are_indices(x: np.ndarray) -> bool:
+def _are_int32_indices(x: np.ndarray) -> bool:
     """Return whether all entries are integers of 32 bits."""
     return x.dtype.kind == "i" and (x.itemsize <= 4 or bool(((x >= -(2**31)) & (x < 2**31)).all()))
 
 
-def _offsets_of_sizes(sizes: Any) -> np.ndarray:
+def _compute_offsets(sizes: Any) -> np.ndarray:
     """Compute the offsets of consecutive parts from their sizes."""
     return (
         np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64) if len(sizes) else np.zeros(0, np.int64)
     )
 
 
-def _pointers(name: str, value: Any) -> np.ndarray:
+def _check_world_pointers(name: str, value: Any) -> np.ndarray:
     """Convert pointers of worlds to an array (n + 1,); raise InputError for invalid ones."""
     ptr = as_array(name, value, (None,), dtype=np.int32).astype(np.int64)
     if not len(ptr) or ptr[0] != 0 or (np.diff(ptr) < 0).any():
@@ -501,7 +503,9 @@ def _pointers(name: str, value: Any) -> np.ndarray:
     return ptr
 
 
-def check_triangle(arrays: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def check_shared_lower_triangles(
+    arrays: Sequence[Any], nvs: Any, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
     if len(arrays) != 2:
         raise InputError(f"M is a tuple of {1 + len(arrays)}; (values, indices, indptr) is needed")
@@ -526,7 +530,7 @@ def check_triangle(arrays: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple
     return ptr, col
 
 
-def check_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray:
+def check_row_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray:
     """Return the numbers of rows of n worlds (n,); raise InputError unless they are from 0 to the rows of J."""
     count = as_array(name, value, (n,), dtype=np.int32).astype(np.int64)
     bad = np.flatnonzero((count < 0) | (count > capacity))
@@ -537,7 +541,7 @@ def check_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray:
     return count
 
 
-def _view_memory(x: np.ndarray) -> np.ndarray:
+def _make_flat_memory_view(x: np.ndarray) -> np.ndarray:
     """Return a flat view of all memory that an array spans; its strides must be multiples of an item from 0 up."""
     if not x.size:
         return np.zeros(0, x.dtype)
@@ -569,7 +573,7 @@ def _flatten_matrices(
     if not _is_readable_in_place(x) or (shape[0] > 1 and x.strides[1] < shape[1] * x.itemsize):
         x = np.ascontiguousarray(x)
     row_stride = x.strides[1] // x.itemsize if shape[0] > 1 else shape[1]
-    return _view_memory(x), np.arange(n) * (x.strides[0] // x.itemsize), row_stride
+    return _make_flat_memory_view(x), np.arange(n) * (x.strides[0] // x.itemsize), row_stride
 
 
 def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
@@ -577,7 +581,7 @@ def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any
 
     `size`: size of every vector; None if the vectors are concatenated and have the sizes `sizes` (n,).
     """
-    x = as_floats(name, value)
+    x = as_float_array(name, value)
     if x.ndim == 0:
         return np.full(int(np.max(sizes, initial=0)), float(x)), 0
     if size is None:
@@ -587,7 +591,7 @@ def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any
     if x.shape != (n, size):
         raise InputError(f"{name} has shape {x.shape}; {(n, size)} or ({size},) is needed")
     x = x if _is_readable_in_place(x) else np.ascontiguousarray(x)
-    return _view_memory(x), np.arange(n) * (x.strides[0] // x.itemsize)
+    return _make_flat_memory_view(x), np.arange(n) * (x.strides[0] // x.itemsize)
 
 
 def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
@@ -597,7 +601,7 @@ def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, A
         raise InputError(
             f"{name} has shape {x.shape}; {total} numbers, those of all worlds in order, are needed"
         )
-    return np.ascontiguousarray(x).reshape(-1), _offsets_of_sizes(sizes)
+    return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes)
 
 
 def _concatenate_cones(cones: Any, n: int) -> Cones:

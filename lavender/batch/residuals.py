@@ -19,7 +19,7 @@ from lavender.base.arrays import (
     check_float,
     check_int,
     check_sequence,
-    read_only,
+    mark_read_only,
     resolve_index,
 )
 from lavender.base.errors import InputError, LavenderError
@@ -62,7 +62,7 @@ class Many:
             self._sizes, self._first = at[:, PLACE["rows"]], at[:, PLACE["row"]]
             self._impulse = np.zeros(int(np.prod(problems.shape))) if cold else starts
             self._velocity: FloatArray | None = np.zeros(int(np.prod(problems.velocity_shape)))
-            self._worlds: Worlds = problems.worlds(self._impulse, self._velocity, cold)
+            self._worlds: Worlds = problems.make_kernel_worlds(self._impulse, self._velocity, cold)
             return
         self._data, self._sizes = data_of(problems, Problem)
         at = np.zeros((len(problems), len(PLACE)), np.int64)
@@ -75,47 +75,47 @@ class Many:
     @property
     def relative(self) -> FloatArray:
         """Relative residual (n,) [-]; NaN for an invalid world."""
-        return self._numbers("relative")
+        return self._get_column("relative")
 
     @property
     def energy(self) -> FloatArray:
         """Energy norm of the error (n,) [sqrt J]."""
-        return self._numbers("energy")
+        return self._get_column("energy")
 
     @property
     def velocity_error(self) -> FloatArray:
         """Velocity error of the worst row (n,) [m/s]."""
-        return self._numbers("speed")
+        return self._get_column("speed")
 
     @property
     def velocity_at_zero(self) -> FloatArray:
         """Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."""
-        return self._numbers("reference_speed")
+        return self._get_column("reference_speed")
 
     @property
     def impulse_error(self) -> FloatArray:
         """Impulse error of the worst row (n,) [N s]."""
-        return self._numbers("push")
+        return self._get_column("push")
 
     @property
     def roundoff_floor(self) -> FloatArray:
         """Relative residual that rounding alone can cause (n,) [-]."""
-        return self._numbers("roundoff_floor")
+        return self._get_column("roundoff_floor")
 
     @property
     def worst_row(self) -> np.ndarray:
         """Row of the largest velocity error (n,), as an index in its world; -1 for a world without rows."""
         self._judge_late_worlds()
-        return read_only(self._worlds.worst[:-1])
+        return mark_read_only(self._worlds.worst[:-1])
 
-    def _numbers(self, which: str) -> FloatArray:
+    def _get_column(self, which: str) -> FloatArray:
         self._judge_late_worlds()
-        return read_only(self._worlds.numbers[NUMBER[which], :-1])
+        return mark_read_only(self._worlds.numbers[NUMBER[which], :-1])
 
     def _judge_late_worlds(self) -> None:
         """Judge worlds that were not judged during the call; a derived class may have some."""
 
-    def _rows(self, i: int) -> slice:
+    def _get_rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
 
     def _store_residual(self, i: int, residual: Residual) -> None:
@@ -147,13 +147,13 @@ class Many:
             return [self[j] for j in i]
         if i in self.faults:
             raise self.faults[i]
-        return self._get(i)
+        return self._get_result(i)
 
-    def _get(self, i: int) -> Any:
+    def _get_result(self, i: int) -> Any:
         """Return the result of a valid world."""
         raise NotImplementedError
 
-    def _run(
+    def _process_worlds(
         self,
         process_next: Callable[[Worker], int],
         process_single: Callable[[int], None],
@@ -225,14 +225,14 @@ class Residuals(Many):
     @cached_property
     def verdict(self) -> np.ndarray:
         """Verdict of each world (n,), as `Residual.verdict`; "" for an invalid world."""
-        nothing_to_do = (self._numbers("relative_at_zero") < 0.5) | (
-            self._numbers("reference_speed") < MAX_REST_VELOCITY
+        nothing_to_do = (self._get_column("relative_at_zero") < 0.5) | (
+            self._get_column("reference_speed") < MAX_REST_VELOCITY
         )
         for i, value in self._nothing_to_do.items():
             nothing_to_do[i] = value
         names = "relative", "roundoff_floor", "above_floor", "energy", "speed", "rhs_energy"
         arguments = zip(
-            *(self._numbers(name).tolist() for name in names),
+            *(self._get_column(name).tolist() for name in names),
             nothing_to_do.tolist(),
             self.precision,
             strict=True,
@@ -240,7 +240,7 @@ class Residuals(Many):
         verdicts = [compute_verdict(*x, self.threshold) for x in arguments]  # type: ignore[call-arg]
         for i in self.faults:
             verdicts[i] = ""
-        return read_only(np.array(verdicts, f"U{max(map(len, VERDICTS))}"))
+        return mark_read_only(np.array(verdicts, f"U{max(map(len, VERDICTS))}"))
 
     @property
     def excess(self) -> FloatArray:
@@ -248,14 +248,14 @@ class Residuals(Many):
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.relative == 0.0, 0.0, self.relative / self.roundoff_floor)
 
-    def store(self, i: int, residual: Residual) -> None:
+    def store_residual(self, i: int, residual: Residual) -> None:
         """Store the residual of a world that a single call processed."""
         self._store_residual(i, residual)
         self._nothing_to_do[i] = residual.nothing_to_do
         self._worlds.numbers[NUMBER["rhs_energy"], i] = residual.energy_rhs
 
-    def _get(self, i: int) -> Residual:
-        return residual(self.problems[i], self._impulse[self._rows(i)], self.precision[i], self.threshold)
+    def _get_result(self, i: int) -> Residual:
+        return residual(self.problems[i], self._impulse[self._get_rows(i)], self.precision[i], self.threshold)
 
     def __repr__(self) -> str:
         verdicts, counts = np.unique(self.verdict, return_counts=True)
@@ -313,7 +313,7 @@ def residual_many(
     threshold = check_float("threshold", threshold, low=0.0)
     threads = check_int("threads", threads, 1, None)
     if isinstance(worlds, Batch):
-        starts: Any = worlds.impulses("impulses", impulses)
+        starts: Any = worlds.flatten_impulses("impulses", impulses)
         precisions = len(worlds) * [worlds.precision if precision is None else precision]
     else:
         starts = check_impulses(worlds, impulses)
@@ -327,10 +327,12 @@ def residual_many(
     is_single_precision = isinstance(worlds, Batch) and "float32" in precisions
 
     def judge_single(i: int) -> None:
-        impulse = residuals._impulse[residuals._rows(i)]
-        residuals.store(i, residual(worlds[i], impulse, precisions[i], threshold))
+        impulse = residuals._impulse[residuals._get_rows(i)]
+        residuals.store_residual(i, residual(worlds[i], impulse, precisions[i], threshold))
 
-    residuals._run(lambda hand: int(hand.judge(TOL, is_single_precision)), judge_single, threads, errors)
+    residuals._process_worlds(
+        lambda hand: int(hand.judge(TOL, is_single_precision)), judge_single, threads, errors
+    )
     for i, precision in enumerate(precisions):  # The compiled loop judges the problems of a list for float64.
         if precision == "float32" and not is_single_precision and i not in residuals.faults:
             judge_single(i)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float, check_int, read_only
+from lavender.base.arrays import FloatArray, check_float, check_int, mark_read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import Many, check_impulses, check_problems, residual_many
-from lavender.judge.residuals import judge_impulse, reading_time, residual
-from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
+from lavender.judge.residuals import estimate_pass_time, judge_impulse, residual
+from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.loop import MIN_TIME_LIMIT
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from lavender.solvers.registry import SolverOptions
 
     class ManyOptions(SolverOptions, total=False):
-        """Options of `solve_many`: those of `solve` that it passes on."""
+        """Options of `solve` that `solve_many` passes on."""
 
         history: bool
         callback: Callback | None
@@ -54,9 +54,9 @@ if TYPE_CHECKING:
 __all__ = ["Solutions", "solve_many"]
 
 # Worlds that are not started before the deadline are late: their start is judged.
-JUDGE_TIME_OF_LATE_WORLD = 4e-6  # s to judge a late world with J and M in the compiled loop, ...
-JUDGE_TIME_PER_PRODUCT = 5e-9  # ... and for each multiply-add.
-LATE_WORLD_TIME = 4e-5  # s to store a late world of a list that is judged when its numbers are read.
+JUDGE_TIME_OF_LATE_WORLD = 4e-6  # [s] Time to judge a late world with J and M in the compiled loop.
+JUDGE_TIME_PER_PRODUCT = 5e-9  # [s] Additional time for each multiply-add.
+LATE_WORLD_TIME = 4e-5  # [s] Time to store a late world of a list, which is judged when its numbers are read.
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
@@ -75,7 +75,7 @@ class Solutions(Many, Sequence[Solution]):
     status : (n,) of Status
         INVALID_PROBLEM for a world with invalid data.
     relative, energy, velocity_error, impulse_error, roundoff_floor : (n,)
-        Numbers of the judge [-, sqrt J, m/s, N s, -]; the errors are those of the worst row.
+        Numbers of the judge [-, sqrt J, m/s, N s, -]; the errors are errors of the worst row.
     worst_row, iterations : (n,) int
     tol : float, -
     velocity_tol : float or None, m/s
@@ -101,7 +101,7 @@ class Solutions(Many, Sequence[Solution]):
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
         self._late_worlds: list[int] = []  # worlds with a start that is not judged yet
-        self._time_per_world = 0.0  # s, mean
+        self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
         # For a batch, the loop overwrites the starts.
         self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()
 
@@ -115,20 +115,20 @@ class Solutions(Many, Sequence[Solution]):
     def impulse(self) -> FloatArray:
         """Impulses [N s], see the class."""
         shape = self.problems.shape if isinstance(self.problems, Batch) else self._impulse.shape
-        return read_only(self._impulse.reshape(shape))
+        return mark_read_only(self._impulse.reshape(shape))
 
     @cached_property
     def velocity(self) -> FloatArray:
         """v+ [m/s, rad/s]: (n, nv) for a stacked batch, else concatenated; problems given as a matrix have none."""
         if isinstance(self.problems, Batch):
             self._judge_late_worlds()
-            return read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
+            return mark_read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
         velocities = [np.zeros(0)]
         for i, p in enumerate(self.problems):
             if p.matrix is None:
-                v = p.velocity(p._start if i in self.faults else self._impulse[self._rows(i)]).ravel()
+                v = p.velocity(p._start if i in self.faults else self._impulse[self._get_rows(i)]).ravel()
                 velocities.append(np.full_like(v, np.nan) if i in self.faults else v)
-        return read_only(np.concatenate(velocities))
+        return mark_read_only(np.concatenate(velocities))
 
     @cached_property
     def status(self) -> np.ndarray:
@@ -141,12 +141,12 @@ class Solutions(Many, Sequence[Solution]):
             out[i] = INDEX_OF_STATUS[solution.status]
         for i in self.faults:
             out[i] = INDEX_OF_STATUS[Status.INVALID_PROBLEM]
-        return read_only(STATUS_OF_INDEX[out])
+        return mark_read_only(STATUS_OF_INDEX[out])
 
     @property
     def iterations(self) -> np.ndarray:
         """Iterations (n,) in the solver's own unit."""
-        return read_only(self._worlds.counts[:-1, 0])
+        return mark_read_only(self._worlds.counts[:-1, 0])
 
     @property
     def success(self) -> np.ndarray:
@@ -163,22 +163,22 @@ class Solutions(Many, Sequence[Solution]):
     @property
     def flat_impulses(self) -> tuple[FloatArray, np.ndarray, np.ndarray]:
         """Flat array of all impulses [N s], and offset and number of rows of each world (n,)."""
-        return read_only(self._impulse.view()), self._first, self._sizes
+        return mark_read_only(self._impulse.view()), self._first, self._sizes
 
-    def start(self, i: int) -> Any:
+    def get_start(self, i: int) -> Any:
         """Return the start (m,) [N s] of world i, or None if none was given."""
         if isinstance(self.problems, Batch):
-            return None if self._given_starts is None else self._given_starts[self._rows(i)]
+            return None if self._given_starts is None else self._given_starts[self._get_rows(i)]
         return self._starts[i]
 
-    def store_late(self, i: int, solution: Solution) -> None:
-        """Store a late world, whose start is judged when its numbers are read."""
+    def store_late_solution(self, i: int, solution: Solution) -> None:
+        """Store a late world. Its start is judged when its numbers are read."""
         self._solutions[i] = solution
-        self._impulse[self._rows(i)] = solution.impulse
+        self._impulse[self._get_rows(i)] = solution.impulse
         self._late_worlds.append(i)
 
-    def mark_late(self, i: int) -> None:
-        """Store the start of a late world of a batch, whose problem is built when its numbers are read."""
+    def mark_as_late(self, i: int) -> None:
+        """Store the start of a late world of a batch. Its problem is built when its numbers are read."""
         if self._cold:
             self._impulse[self._rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
         self._worlds.code[i] = CODE["late"]
@@ -189,7 +189,7 @@ class Solutions(Many, Sequence[Solution]):
         # Another thread may do the same at the same time, with the same numbers.
         for i in self._late_worlds:
             try:
-                self.store(i, self._get(i))
+                self.store_solution(i, self._get_result(i))
             except LavenderError as error:
                 if self._errors == "raise":
                     raise
@@ -197,10 +197,10 @@ class Solutions(Many, Sequence[Solution]):
                 self.clear_invalid()
         self._late_worlds = []
 
-    def store(self, i: int, solution: Solution) -> None:
+    def store_solution(self, i: int, solution: Solution) -> None:
         """Store the solution of a world that a single call solved."""
         self._solutions[i] = solution
-        self._impulse[self._rows(i)] = solution.impulse
+        self._impulse[self._get_rows(i)] = solution.impulse
         self._store_residual(i, solution.residual)
         self._worlds.counts[i, 0] = solution.iterations
         problem = solution.residual._problem
@@ -209,7 +209,7 @@ class Solutions(Many, Sequence[Solution]):
             first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
-    def _time_to_judge_starts(self) -> float:
+    def _estimate_late_judging_time(self) -> float:
         """Estimate the time [s] of the results if no world is started before the deadline."""
         if isinstance(self.problems, Batch):
             rows, columns = (
@@ -219,14 +219,14 @@ class Solutions(Many, Sequence[Solution]):
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
             return JUDGE_TIME_OF_LATE_WORLD * len(rows) + JUDGE_TIME_PER_PRODUCT * products
         return sum(
-            JUDGE_TIME_OF_LATE_WORLD + reading_time(p) if data and p.generalized else LATE_WORLD_TIME
+            JUDGE_TIME_OF_LATE_WORLD + estimate_pass_time(p) if data and p.generalized else LATE_WORLD_TIME
             for p, data in zip(self.problems, self._data, strict=True)
         )
 
     def clear_invalid(self) -> None:
         """Set the numbers of worlds with the status INVALID_PROBLEM to NaN and their counts to 0."""
         for i in self.faults:
-            self._impulse[self._rows(i)] = np.nan
+            self._impulse[self._get_rows(i)] = np.nan
             self._worlds.counts[i], self._worlds.worst[i] = 0, -1
             if isinstance(self.problems, Batch) and self._velocity is not None and self._velocity.size:
                 first, n = (int(self.problems.at[i, PLACE[name]]) for name in ("velocity", "velocities"))
@@ -239,7 +239,7 @@ class Solutions(Many, Sequence[Solution]):
     def __getitem__(self, i: Any) -> Any:
         return super().__getitem__(i)
 
-    def _get(self, i: int) -> Solution:
+    def _get_result(self, i: int) -> Solution:
         if i not in self._solutions:
             make = self._make_late_solution if i in self._late_worlds else self._make_solution
             self._solutions[i] = make(i)
@@ -253,7 +253,7 @@ class Solutions(Many, Sequence[Solution]):
             problem = self.problems[i]
         except LavenderError as error:
             raise self._make_fault(i, error) from None
-        start = self._impulse[self._rows(i)]
+        start = self._impulse[self._get_rows(i)]
         return create_unjudged(
             problem, self._spec, self._options, start, self.tol, f"{NO_STAGE_MESSAGE}, unjudged"
         )
@@ -262,7 +262,7 @@ class Solutions(Many, Sequence[Solution]):
         """Build the solution of a world that the compiled loop processed."""
         if not self._sizes[i]:
             return solve(self.problems[i], self._spec.name, tol=self.tol)
-        impulse, late = self._impulse[self._rows(i)].copy(), self._worlds.code[i] == CODE["late"]
+        impulse, late = self._impulse[self._get_rows(i)].copy(), self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
         return Solution.late(
@@ -278,8 +278,8 @@ class Solutions(Many, Sequence[Solution]):
         problem = self.problems[i]
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
-        counts = None if is_start else self._counts(problem, i)
-        fields = compute_late_fields(problem, self._spec, judgement, counts, self.start(i), status)
+        counts = None if is_start else self._get_counts(problem, i)
+        fields = compute_late_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
         # Equal data have bit-identical residuals.
         if status is Status.CONVERGED and judgement.relative != solved_relative:
@@ -290,7 +290,7 @@ class Solutions(Many, Sequence[Solution]):
             )
         return fields
 
-    def _counts(self, problem: Problem, i: int) -> tuple[int, ...]:
+    def _get_counts(self, problem: Problem, i: int) -> tuple[int, ...]:
         """Return the counts of the compiled loop for world i."""
         counts = tuple(self._worlds.counts[i].tolist())
         return counts if problem.generalized is None else counts[:4]
@@ -364,7 +364,7 @@ def solve_many(
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     if deadline.is_set:
-        deadline.reserve(solutions._time_to_judge_starts())
+        deadline.reserve(solutions._estimate_late_judging_time())
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
@@ -389,9 +389,9 @@ def solve_many(
             isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
         )
         if is_further_world and deadline.passed():
-            solutions.mark_late(i)
+            solutions.mark_as_late(i)
             return
-        problem, start = worlds[i], solutions.start(i)
+        problem, start = worlds[i], solutions.get_start(i)
         has_failed = solutions._worlds.code[i] == CODE["tried"]
         if deadline.is_set:
             if not isinstance(worlds, Batch):
@@ -399,21 +399,21 @@ def solve_many(
             if deadline.passed():
                 check_accepted(problem, spec, deadline)
                 unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")
-                solutions.store_late(i, unsolved)
+                solutions.store_late_solution(i, unsolved)
                 return
         if has_failed:
             own = Deadline(deadline.remaining(MIN_TIME_LIMIT))
-            counts = solutions._counts(problem, i)
+            counts = solutions._get_counts(problem, i)
             solution = solve_prepared(problem, spec, named, start, tol, max_iter, own, failed_call=counts)
         else:
             left = deadline.remaining(MIN_TIME_LIMIT)
             solution = solve(problem, solver, impulse=start, time_limit=left, **more)
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
-        store = solutions.store if is_judged else solutions.store_late
-        store(i, solution if "callback" in options else uninterrupted(solution))
+        store = solutions.store_solution if is_judged else solutions.store_late_solution
+        store(i, solution if "callback" in options else raise_if_interrupted(solution))
 
     begin = perf_counter()
-    solutions._run(process_next, solve_single, threads, errors)
+    solutions._process_worlds(process_next, solve_single, threads, errors)
     solutions.clear_invalid()
     solutions._time_per_world = (perf_counter() - begin) / max(1, len(worlds))
     if not isinstance(worlds, Batch):
@@ -465,7 +465,7 @@ def _check_starts(
             )
         if impulse is None:
             return None, invalid
-        flat = worlds.impulses("impulse", impulse)
+        flat = worlds.flatten_impulses("impulse", impulse)
         if not all_finite(flat):
             for i in range(len(worlds)):
                 rows = worlds.rows_of(i)

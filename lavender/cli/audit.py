@@ -8,16 +8,16 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import progress, show_page
+from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
     EXIT_UNMET,
     FILE,
     FOLDER,
-    one_thread,
+    add_worlds_options,
+    is_option_set,
+    limit_to_one_thread,
     precision_option,
     threshold_option,
-    was_given,
-    worlds_options,
 )
 from lavender.io.stored import lock_output
 
@@ -26,7 +26,7 @@ DEFAULT_CLAIM_WORLDS = 8  # Worlds of engines whose claims are compared: they st
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
-@worlds_options(worlds=None, steps=200)
+@add_worlds_options(worlds=None, steps=200)
 @click.option(
     "--engine",
     default="mujoco",
@@ -67,26 +67,26 @@ def audit(
         raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
     if options["engine"] != "mujoco":
         for name in ("workers", "backend", "precision"):
-            if was_given(context, name):
+            if is_option_set(context, name):
                 raise InputError(f"--{name} needs --engine mujoco: leave it out")
     if options["engine"] in CLAIM_ENGINES:
         for name in ("spread", "controls", "seed", "states"):
-            if was_given(context, name) or was_given(context, name.removesuffix("s")):
+            if is_option_set(context, name) or is_option_set(context, name.removesuffix("s")):
                 raise InputError(
                     f"--{name} is for models of MuJoCo; the scene of {options['engine']} sets its own"
                 )
         _audit_claims(context, model, out, max_velocity_error, options)
         return
     context.with_resource(lock_output(out, folder=True))
-    one_thread()
-    with progress() as watch:
+    limit_to_one_thread()
+    with show_progress() as watch:
         result = run(model, watch=watch, **options)
     result.write(out)
     show_page(result.summary_page, out)
     if (
-        result.diverged
-        or result.unjudged
-        or (max_velocity_error is not None and result.largest > max_velocity_error)
+        result.n_diverged
+        or result.n_unjudged
+        or (max_velocity_error is not None and result.max_velocity_error > max_velocity_error)
     ):
         raise click.exceptions.Exit(EXIT_UNMET)
 
@@ -101,8 +101,8 @@ def _audit_claims(
     worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
     stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps)
     context.with_resource(lock_output(out, folder=True))
-    one_thread()
-    with progress() as watch:
+    limit_to_one_thread()
+    with show_progress() as watch:
         result = compare_claims(
             stepped,
             engine=options["engine"],

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_UNMET, PATH, echo, one_thread
+from lavender.cli.options import EXIT_UNMET, PATH, limit_to_one_thread, print_escaped
 from lavender.io.stored import check_writable, write_text
 
 
@@ -47,40 +47,40 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
 
     The problems are steps of your own models (MJCF files). Exit code 1: a model is left out of all numbers.
     """
-    one_thread()
+    limit_to_one_thread()
     if out is not None:
         check_writable(out)
-    from lavender.io.mujoco import package
-    from lavender.lab.bench.machine import cpu_name, versions
-    from lavender.lab.bench.simulators import Step, WarmStep, measure, measure_warm
-    from lavender.lab.report.simulators import table, warm_table
+    from lavender.io.mujoco import import_mujoco
+    from lavender.lab.bench.machine import get_cpu_name, get_versions
+    from lavender.lab.bench.simulators import Step, WarmStep, measure_model, measure_model_warm
+    from lavender.lab.report.simulators import format_time_ratio_table, format_warm_time_ratio_table
 
-    mj = package()
+    mj = import_mujoco()
     measured: list[Step] = []
     consecutive: list[WarmStep] = []
     left_out: list[str] = []
     for path in models:
         try:
-            new = measure(mj, path, steps, every)
-            after = measure_warm(mj, path, warm)
+            new = measure_model(mj, path, steps, every)
+            after = measure_model_warm(mj, path, warm)
         except (ValueError, LavenderError) as error:  # MuJoCo reports an invalid file as ValueError.
             left_out.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
-            echo(left_out[-1], err=True)
+            print_escaped(left_out[-1], err=True)
             continue
         measured += new
         consecutive += after
-        echo(f"{path.name}: {len(new)} problems", err=True)
+        print_escaped(f"{path.name}: {len(new)} problems", err=True)
     if out is not None:
-        lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
+        lines = [json.dumps({"cpu": get_cpu_name(), **get_versions(("mujoco", "numpy"))})]
         lines += [json.dumps(asdict(s)) for s in measured]
         lines += [json.dumps(asdict(w)) for w in consecutive]
         write_text(out, "\n".join(lines) + "\n")
     if not measured and not consecutive:
         raise InputError("no step of these models had a problem to solve: more steps, or other models")
     if measured:
-        echo(table(measured))
+        print_escaped(format_time_ratio_table(measured))
     if consecutive:
-        echo(f"\n{warm_table(consecutive)}")
+        print_escaped(f"\n{format_warm_time_ratio_table(consecutive)}")
     if left_out:
-        echo("\n".join(left_out))
+        print_escaped("\n".join(left_out))
         raise click.exceptions.Exit(EXIT_UNMET)

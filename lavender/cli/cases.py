@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import echo
+from lavender.cli.options import print_escaped
 
 
 @click.command()
@@ -12,11 +12,11 @@ from lavender.cli.options import echo
 def cases(pattern: str) -> None:
     """List the families of the built-in suite.
 
-    The list shows parameters, defaults and purpose. PATTERN selects families whose name or description contains it.
+    The list shows parameters, defaults and purpose. PATTERN selects families by a part of their name or description.
     A case is a family with parameters: "pyramid(k=20)".
     """
     from lavender.base.errors import UnknownName
-    from lavender.lab.suite.case import FAMILIES, spell
+    from lavender.lab.suite.case import FAMILIES, format_parameter_value
 
     families = {
         name: f
@@ -27,7 +27,7 @@ def cases(pattern: str) -> None:
         raise UnknownName("family of cases", pattern, FAMILIES)
     for name, f in families.items():
         values = {n: f.preset.get(n, p.default) for n, p in f.signature.parameters.items()}
-        words = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
+        words = ", ".join(n if v is p.empty else f"{n}={format_parameter_value(v)}" for (n, v), p in
                           zip(values.items(), f.signature.parameters.values(), strict=True))  # fmt: skip
-        echo(f"{name}({words})", style="bold")
-        echo(f"    {f.summary}")
+        print_escaped(f"{name}({words})", style="bold")
+        print_escaped(f"    {f.summary}")

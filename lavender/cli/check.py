@@ -11,11 +11,11 @@ from lavender.cli.options import (
     ErrorReporter,
     ListType,
     MultiValueCommand,
-    echo,
-    one_thread,
+    is_option_set,
+    limit_to_one_thread,
     precision_option,
+    print_escaped,
     threshold_option,
-    was_given,
 )
 
 
@@ -55,41 +55,41 @@ def check(
     from lavender.lab.check import cross_check
     from lavender.solving.solve import check_time_limit
 
-    one_thread()
+    limit_to_one_thread()
     for name in files:
         if name.endswith(".jsonl"):
             raise InputError(
                 f"{name}: problems are checked, not records; `lavender report {name}` shows them again"
             )
     contradicted = unaccepted = solutions = above = unmet = 0
-    errors = ErrorReporter(partial(echo, style="yellow"))
-    judges_stored = precision is not None or was_given(context, "threshold")
-    bench.solver_names([*(solvers or ()), reference])
+    errors = ErrorReporter(partial(print_escaped, style="yellow"))
+    judges_stored = precision is not None or is_option_set(context, "threshold")
+    bench.select_solver_names([*(solvers or ()), reference])
     check_float("tol", tol, low=0.0)
     check_float("threshold", threshold, low=0.0)
     check_time_limit(time_limit)
-    for item in bench.resolve(files):
+    for item in bench.resolve_sources(files):
         with errors(item):
             comparison = cross_check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
             stored = item.judge_stored(precision, threshold)
-            echo(item.name, style="bold")
-            echo(str(comparison))
+            print_escaped(item.name, style="bold")
+            print_escaped(str(comparison))
             if stored is not None:
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                echo(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
+                print_escaped(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
     if contradicted:
-        echo(f"{contradicted} claims are contradicted", style="bold red")
+        print_escaped(f"{contradicted} claims are contradicted", style="bold red")
     if unaccepted:
-        echo(f"{unaccepted} problems are accepted by none of these solvers", style="bold red")
+        print_escaped(f"{unaccepted} problems are accepted by none of these solvers", style="bold red")
     if judges_stored and not solutions:
         raise InputError("--precision, --threshold: no file has a solution to judge (an entry `impulse`)")
     if solutions:
         shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
-        echo(f"stored solutions: {shares}")
+        print_escaped(f"stored solutions: {shares}")
     errors.exit(contradicted or unaccepted or (judges_stored and unmet))

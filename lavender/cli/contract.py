@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import echo, one_thread
+from lavender.cli.options import limit_to_one_thread, print_escaped
 
 
 @click.command()
@@ -25,25 +25,25 @@ def contract(context: click.Context, name: str, list_only: bool) -> None:
     from lavender.contract import CHECKS, check_solver, list_checks
     from lavender.solvers import registry
 
-    one_thread()
+    limit_to_one_thread()
     spec = registry.get(name)
     if list_only:
         for check in list_checks(spec):
-            echo(f"{check.requirement}\n    {check.name}, {check.applies_to}")
+            print_escaped(f"{check.requirement}\n    {check.name}, {check.applies_to}")
         return
     unmet = total = 0
     for outcome in check_solver(name):
         total += 1
-        echo(
+        print_escaped(
             f"{'met    ' if outcome.met else 'NOT MET'}  {outcome.check.requirement}",
             style="" if outcome.met else "bold red",
         )
         if not outcome.met:
             unmet += 1
-            echo(f"         {outcome.failure}")
+            print_escaped(f"         {outcome.failure}")
     skipped = [check.name for check in CHECKS.values() if not check.applies(spec)]
-    echo(f"{name} meets {total - unmet} of {total} requirements")
+    print_escaped(f"{name} meets {total - unmet} of {total} requirements")
     if skipped:
-        echo(f"not required, because the spec does not list the capability: {', '.join(skipped)}")
+        print_escaped(f"not required, because the spec does not list the capability: {', '.join(skipped)}")
     if unmet:
         context.exit(1)

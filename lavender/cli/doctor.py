@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import click
 
-from lavender.cli.options import ErrorReporter, echo
+from lavender.cli.options import ErrorReporter, print_escaped
 
 
 @click.command()
@@ -26,9 +26,9 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     if files:
         _diagnose_problems(files, as_json)
         return
-    from lavender.lab.bench.doctor import examine
+    from lavender.lab.bench.doctor import collect_installation_facts
 
-    results = examine()
+    results = collect_installation_facts()
     if as_json:
         click.echo(json.dumps(results, indent=2, ensure_ascii=True))
     else:
@@ -52,11 +52,11 @@ def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
     from lavender.lab.diagnostics import diagnose
 
     diagnostics, errors = {}, ErrorReporter()
-    for item in bench.resolve(files):
+    for item in bench.resolve_sources(files):
         with errors(item):
             diagnostics[item.name] = diagnose(item.problem)
             for diagnostic in () if as_json else diagnostics[item.name]:
-                echo(f"{item.name}: {diagnostic}")
+                print_escaped(f"{item.name}: {diagnostic}")
     suspect = sum(map(bool, diagnostics.values()))
     if as_json:
         click.echo(

@@ -17,7 +17,13 @@ import click
 from lavender._version import __version__
 from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, discard_output, echo, suggest_new_option
+from lavender.cli.options import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    discard_output,
+    print_escaped,
+    suggest_new_option,
+)
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
@@ -92,7 +98,7 @@ def main(args: Sequence[str] | None = None) -> None:
         except Exception as error:
             if not received:
                 raise
-            echo(f"lavender: {type(error).__name__}: {error}", err=True)
+            print_escaped(f"lavender: {type(error).__name__}: {error}", err=True)
             code = EXIT_BAD_INPUT
     if received and code not in (0, EXIT_INTERRUPTED):
         click.echo("lavender: stopped", err=True)
@@ -147,7 +153,7 @@ def _run_command(args: Sequence[str] | None) -> int:
         )
         sys.stdout.flush()
     except LavenderError as error:
-        echo(f"lavender: {error}", err=True)
+        print_escaped(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
     except click.exceptions.ClickException as error:
         if isinstance(error, click.NoSuchOption):

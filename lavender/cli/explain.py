@@ -6,7 +6,7 @@ import json
 
 import click
 
-from lavender.cli.options import ErrorReporter, echo
+from lavender.cli.options import ErrorReporter, print_escaped
 
 
 @click.command()
@@ -22,16 +22,16 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
     from lavender.base.arrays import check_float
-    from lavender.lab.bench.cases import resolve
+    from lavender.lab.bench.cases import resolve_sources
     from lavender.solving.plan import explain as explain_problem
 
     check_float("tol", tol, above=0.0)
     errors = ErrorReporter()
-    for item in resolve(list(files)):
+    for item in resolve_sources(list(files)):
         with errors(item):
             plan = explain_problem(item.problem, tol)
             if as_data:
                 click.echo(json.dumps(plan.data()))
             else:
-                echo(f"{item.name}: {plan}\n")
+                print_escaped(f"{item.name}: {plan}\n")
     errors.exit()

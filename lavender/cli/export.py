@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import FOLDER, echo, reject_unused_options
+from lavender.cli.options import FOLDER, print_escaped, reject_unused_options
 from lavender.io.stored import lock_output
 
 MAX_TEST_PROBLEMS = 4  # Largest number of problems in the test vectors.
@@ -39,6 +39,6 @@ def export(
     if records is None:
         reject_unused_options(context, ["solver"], "without --records")
     context.with_resource(lock_output(folder, folder=True))  # Locked before the test vectors are solved.
-    more = vectors.make_files(records, solver, MAX_TEST_PROBLEMS) if records is not None else {}
+    more = vectors.make_export_files(records, solver, MAX_TEST_PROBLEMS) if records is not None else {}
     written = library.write(folder, more=more, replace=replace)
-    echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")
+    print_escaped(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

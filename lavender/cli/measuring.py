@@ -13,14 +13,14 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    console,
     convert_to_bytes,
-    echo,
     exit_stopped,
     ignore_closed_output,
-    one_thread,
+    is_option_set,
+    limit_to_one_thread,
+    make_console,
+    print_escaped,
     reject_unused_options,
-    was_given,
 )
 
 if TYPE_CHECKING:
@@ -51,14 +51,14 @@ class Measured:
     since: str = ""
 
     @property
-    def note(self) -> str:
+    def reuse_note(self) -> str:
         """Sentence on reused records; empty if all were measured now."""
         if not self.reused:
             return ""
         return f"{self.reused} of {len(self.records)} runs of {self.since} reused; --no-reuse measures again"
 
     @property
-    def lost(self) -> int:
+    def n_cases_not_loaded(self) -> int:
         """Number of cases in folders that did not load."""
         return sum(not skip.solver for skip in self.records.skips)
 
@@ -79,7 +79,7 @@ def check_named_problems(items: Sequence[Item]) -> None:
                 _ = item.problem
             except Exception as error:
                 raise InputError(describe_load_error(item.source, error)) from None
-            item.forget()
+            item.release_problem()
 
 
 def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
@@ -96,10 +96,12 @@ def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
 
 def is_campaign(context: click.Context) -> bool:
     """Return whether workers measure error and robustness without times."""
-    return was_given(context, "workers") or was_given(context, "backend")
+    return is_option_set(context, "workers") or is_option_set(context, "backend")
 
 
-def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
+def measure_files(
+    context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]
+) -> Measured:
     """Measure solvers on files with a progress bar, and time the calls that a report would print.
 
     With workers nothing is timed. `path` is the records file.
@@ -112,14 +114,14 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
     from lavender.lab import bench
     from lavender.lab.bench.candidates import time_candidates
 
-    one_thread()
+    limit_to_one_thread()
     options = context.params
-    bench.solver_names(options["solvers"])  # An unknown name is an error before a problem is loaded.
+    bench.select_solver_names(options["solvers"])  # An unknown name is an error before a problem is loaded.
     campaign, names = is_campaign(context), list(files)
     more: dict[str, Any] = {}
     plan: Plan
     if campaign:
-        workers = options["workers"] if was_given(context, "workers") else -1
+        workers = options["workers"] if is_option_set(context, "workers") else -1
         more = {"workers": workers, "backend": options["backend"]}
         names = bench.expand_seeds(files, len(options["seeds"]), options["seeds"].start)
         if names == list(files):
@@ -129,13 +131,13 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         plan = _make_timed_plan(options, files, sweeps)
     reused = 0
     with bench.Store(path) as store:
-        items = bench.resolve(names, options["sequence"])
-        if was_given(context, "sequence_time_limit") and not any(item.sequence for item in items):
+        items = bench.resolve_sources(names, options["sequence"])
+        if is_option_set(context, "sequence_time_limit") and not any(item.sequence for item in items):
             raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
         check_named_problems(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         measured: list[Records] = []
-        with progress() as bar:
+        with show_progress() as bar:
 
             def show_event(event: Event) -> None:
                 nonlocal reused
@@ -187,16 +189,16 @@ def show_page(page: SummaryPage, folder: Path) -> None:
     """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
     with ignore_closed_output():
-        page.print_short(console())
-        echo(f"\npage: {path}")
+        page.print_short(make_console())
+        print_escaped(f"\npage: {path}")
     if page.stopped:
         exit_stopped()
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Callable[[Event], None]]:
+def show_progress() -> Iterator[Callable[[Event], None]]:
     """Yield a callback that shows progress: a bar on a terminal, otherwise a line of stderr now and then."""
-    to = console(stderr=True)
+    to = make_console(stderr=True)
     if not to.is_terminal:
         yield _print_progress_lines()
         return

@@ -153,13 +153,13 @@ class SeedRange(_ParamType):
         return range(int(first), int(last))
 
 
-def one_thread() -> None:
+def limit_to_one_thread() -> None:
     """Limit libraries that are loaded later to one thread; loaded ones are limited during timing."""
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
 
 
-def console(stderr: bool = False) -> Console:
+def make_console(stderr: bool = False) -> Console:
     """Return a console that never cuts names; in a file or pipe, lines are as long as the tables need."""
     from rich.console import Console
 
@@ -182,7 +182,7 @@ def ignore_closed_output() -> Iterator[None]:
         discard_output()
 
 
-def was_given(context: click.Context, name: str) -> bool:
+def is_option_set(context: click.Context, name: str) -> bool:
     """Return whether an option is set on the command line or in the environment, with any value."""
     return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
@@ -200,7 +200,7 @@ def add_options(
     return decorate
 
 
-def worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def add_worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
     options: list[Option] = [
         (("--worlds",), {"default": worlds, "type": int, "help": "Number of worlds; the first is the one of `lavender "
@@ -234,7 +234,7 @@ def reject_unused_options(context: click.Context, names: Sequence[str], conditio
     """
     options = {p.name: p.opts[0] for p in context.command.params}
     for name in names:
-        if was_given(context, name):
+        if is_option_set(context, name):
             raise InputError(f"{options[name]} has no effect {condition}: leave it out")
 
 
@@ -333,24 +333,24 @@ def escape_markup(text: str) -> str:
     """Return text with rich's markup escaped and control characters written as their codes."""
     from rich.markup import escape
 
-    from lavender.lab.bench.record import printable
+    from lavender.lab.bench.record import escape_unprintable
 
-    return escape(printable(text, lines=True))
+    return escape(escape_unprintable(text, lines=True))
 
 
-def echo(text: str, err: bool = False, style: str = "") -> None:
+def print_escaped(text: str, err: bool = False, style: str = "") -> None:
     """Print text that may contain names of files and problems; control characters are written as their codes."""
-    from lavender.lab.bench.record import printable
+    from lavender.lab.bench.record import escape_unprintable
 
     if style:
-        console(err).print(escape_markup(text), style=style, highlight=False, soft_wrap=True)
+        make_console(err).print(escape_markup(text), style=style, highlight=False, soft_wrap=True)
     else:
-        click.echo(printable(text, lines=True), err=err)
+        click.echo(escape_unprintable(text, lines=True), err=err)
 
 
 def exit_stopped() -> NoReturn:
     """Exit a command after Ctrl-C, once the completed part is written."""
-    echo("Stopped: the results are those of the completed part.", style="yellow")
+    print_escaped("Stopped: the results are those of the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
@@ -358,7 +358,7 @@ class ErrorReporter:
     """Context manager of each problem of a command: it prints the errors of a problem and sets the exit code."""
 
     def __init__(self, report: Callable[[str], Any] | None = None) -> None:
-        self.report = report or partial(echo, err=True)
+        self.report = report or partial(print_escaped, err=True)
         self.code = 0
 
     @contextlib.contextmanager
@@ -371,7 +371,7 @@ class ErrorReporter:
             is_bad_argument = isinstance(error, InputError) and item.named
             self.code = max(self.code, EXIT_BAD_INPUT if is_bad_argument else EXIT_UNMET)
         finally:
-            item.forget()
+            item.release_problem()
 
     def exit(self, unmet: Any = False) -> None:
         """Exit with 2 if a named problem could not be read, with 1 after another error or if `unmet`."""

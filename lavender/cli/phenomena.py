@@ -91,12 +91,12 @@ def phenomena(
         show=show,
     )
     for heading, lines in (
-        ("Steppers of lavender out of bounds", tables.out_of_bound_cases(records)),
-        ("Without values", tables.notes(records)),
+        ("Steppers of lavender out of bounds", tables.list_out_of_bound_cases(records)),
+        ("Without values", tables.list_notes(records)),
     ):
         if lines:
             click.echo(f"{heading}:\n" + "\n".join(f"- {x}" for x in lines) + "\n")
-    click.echo(tables.table(records))
+    click.echo(tables.format_markdown_table(records))
     ran = {r.engine for r in records}
     click.echo(
         "\n"
@@ -108,11 +108,11 @@ def phenomena(
 
 def _collect_results(records: list[Record]) -> dict[str, object]:
     """Return the content of the file of --out: processor, versions and records."""
-    from lavender.lab.bench.machine import cpu_name, versions
-    from lavender.lab.phenomena.engines import versions_of_node
+    from lavender.lab.bench.machine import get_cpu_name, get_versions
+    from lavender.lab.phenomena.engines import get_npm_versions
 
     return {
-        "cpu": cpu_name(),
-        "versions": versions(ENGINE_PACKAGES) | versions_of_node(),
+        "cpu": get_cpu_name(),
+        "versions": get_versions(ENGINE_PACKAGES) | get_npm_versions(),
         "records": [asdict(r) for r in records],
     }

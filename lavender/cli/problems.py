@@ -7,7 +7,14 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, echo, one_thread, reject_unused_options
+from lavender.cli.options import (
+    EXIT_UNMET,
+    FILE,
+    FOLDER,
+    limit_to_one_thread,
+    print_escaped,
+    reject_unused_options,
+)
 from lavender.io.stored import check_writable, lock_output, write_text
 
 
@@ -40,9 +47,9 @@ def problems(
     """
     from lavender.lab import collection, suite
     from lavender.lab.bench.cases import is_path
-    from lavender.lab.bench.record import file_name
+    from lavender.lab.bench.record import make_file_name
 
-    one_thread()
+    limit_to_one_thread()
     if certify is not None:
         reject_unused_options(context, ["out", "check", "page"], "with --certify")
     elif check:
@@ -62,14 +69,14 @@ def problems(
             )
     if certify is not None:
         certified = []
-        for entry in collection.entries(names):
+        for entry in collection.certify_groups(names):
             click.echo(f"{entry.name}: {entry.known}{'; ' if entry.reason else ''}{entry.reason}")
             certified.append(entry)
-        collection.save(certified, certify)
+        collection.save_manifest(certified, certify)
         return
-    entries = [e for e in collection.load() if not names or e.group in names]
+    entries = [e for e in collection.load_manifest() if not names or e.group in names]
     if page is not None:
-        write_text(page, collection.page(entries, collection.load(collection.RECORDED)))
+        write_text(page, collection.format_catalogue(entries, collection.load_manifest(collection.RECORDED)))
     here, missing = collection.select_buildable(entries)
     for line in missing if check or out is not None else ():
         click.echo(f"left out: {line}", err=True)
@@ -84,8 +91,8 @@ def problems(
     if out is not None:
         for entry in here:
             (case,) = suite.cases(entry.name)
-            case.problem.save(out / f"{file_name(entry.name)}.npz")
-        echo(f"{len(here)} problems in {out}")
+            case.problem.save(out / f"{make_file_name(entry.name)}.npz")
+        print_escaped(f"{len(here)} problems in {out}")
     elif page is None:
         for e in entries:
-            echo(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.describe(e)}")
+            print_escaped(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.describe_properties(e)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import ErrorReporter, echo, one_thread
+from lavender.cli.options import ErrorReporter, limit_to_one_thread, print_escaped
 
 
 @click.command()
@@ -26,23 +26,23 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     be read.
     """
     from lavender.base.arrays import check_float
-    from lavender.lab.bench.cases import resolve
+    from lavender.lab.bench.cases import resolve_sources
     from lavender.lab.bench.running.worker import Worker, solve_isolated
     from lavender.lab.proof import prove as enclose
     from lavender.lab.proof import require_python_flint
     from lavender.solvers.registry import get
 
-    one_thread()
+    limit_to_one_thread()
     # Check the arguments before any file is read.
     check_float("tol", tol, low=0.0)
     get(solver)
     require_python_flint()
     unmet, errors = False, ErrorReporter()
-    for item in resolve(list(files)):
+    for item in resolve_sources(list(files)):
         with errors(item), Worker() as worker:
             solution = solve_isolated(worker, item.problem, solver, tol=tol)
             proof = enclose(item.problem, solution)
             failure = "" if solution.success else f"; {solver}: {solution.status.name}"
-            echo(f"{item.name}: {proof}{failure}")
+            print_escaped(f"{item.name}: {proof}{failure}")
             unmet |= not (proof.proven or proof.infeasible)
     errors.exit(unmet)

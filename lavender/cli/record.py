@@ -10,8 +10,8 @@ import click
 from lavender.cli.options import (
     FILE,
     FOLDER,
-    echo,
     precision_option,
+    print_escaped,
     recording_options,
     reject_unused_recording_options,
 )
@@ -36,4 +36,4 @@ def record(
     from lavender.io.recording import record_file
 
     reject_unused_recording_options(context, True)
-    echo(str(record_file(model, out, steps, precision=precision or "float64", **options)))
+    print_escaped(str(record_file(model, out, steps, precision=precision or "float64", **options)))

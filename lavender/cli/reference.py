@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import ErrorReporter, echo, ignore_closed_output, one_thread
+from lavender.cli.options import ErrorReporter, ignore_closed_output, limit_to_one_thread, print_escaped
 
 
 @click.command()
@@ -29,25 +29,25 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     from lavender.lab import bench, motion
     from lavender.lab.proof import enclose_reference, require_python_flint
 
-    one_thread()
+    limit_to_one_thread()
     if proven:
         require_python_flint()
 
     def print_line(text: str, style: str = "") -> None:
         with ignore_closed_output():
-            echo(text, style=style)
+            print_escaped(text, style=style)
 
     unmet, errors = False, ErrorReporter(partial(print_line, style="yellow"))
-    for item in bench.resolve(files):
+    for item in bench.resolve_sources(files):
         with errors(item):
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is not a file; a reference is written next to a file")
             proof = enclose_reference(item.problem) if proven else None
-            reference = motion.reference(item.problem.disk)
+            reference = motion.get_reference(item.problem.disk)
             if proof is not None and not proof.proven:
                 errors.report(f"{item.name}: {proof}")
                 unmet = True
-            elif not reference.accepted:
+            elif not reference.is_accepted:
                 errors.report(
                     f"{item.name}: no solver reached the floor ({reference}); no reference is written"
                 )

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import Measured, is_campaign, measure
+from lavender.cli.measuring import Measured, is_campaign, measure_files
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
@@ -22,14 +22,14 @@ from lavender.cli.options import (
     ListType,
     MultiValueCommand,
     SeedRange,
-    console,
-    echo,
+    is_option_set,
+    make_console,
     plan_options,
+    print_escaped,
     recording_options,
     reject_options_without_effect,
     reject_unused_options,
     reject_unused_recording_options,
-    was_given,
 )
 from lavender.io.stored import lock_output, write_text
 
@@ -112,21 +112,21 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
     files = tuple(_record_model(f, out, used_folders, not options["no_reuse"], recording) for f in files)
-    old = None if options["compare"] is None else bench.read(options["compare"])
-    sweeps = options["budgets"] if was_given(context, "budgets") else ()
+    old = None if options["compare"] is None else bench.read_records(options["compare"])
+    sweeps = options["budgets"] if is_option_set(context, "budgets") else ()
     path = out / "records.jsonl"
     records_files = [f for f in files if f.endswith(".jsonl")]
     if records_files:
         if len(files) > 1:
             raise InputError("a records.jsonl is shown alone: give one file, without problems")
-        measured = Measured(bench.read(records_files[0]), False)
+        measured = Measured(bench.read_records(records_files[0]), False)
         if not (measured.records.records or measured.records.skips):
             raise InputError(f"{records_files[0]} has no records")
         if options["solvers"]:
             measured = replace(measured, records=measured.records.of_solvers(options["solvers"]))
     else:
-        measured = measure(context, files, path, sweeps)
-    engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.latest())
+        measured = measure_files(context, files, path, sweeps)
+    engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.select_latest_run())
     shown = Report(measured.records, old, options["time_budgets"], sweeps, engines)
     # The files are written first: a closed pipe can end the command while it prints.
     index = write(shown, out, figures=not options["no_figures"])
@@ -135,20 +135,25 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
         from lavender.lab.report.latex_export import write_paper
 
         paper = write_paper(shown, out / "paper")
-    print_report(shown, console(), complete=options["tables"])
+    print_report(shown, make_console(), complete=options["tables"])
     if paper is not None:
-        echo(f"figures, tables and method of a paper: {paper}")
-    echo(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
-    if measured.note:
-        echo(measured.note)
+        print_escaped(f"figures, tables and method of a paper: {paper}")
+    print_escaped(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
+    if measured.reuse_note:
+        print_escaped(measured.reuse_note)
     if measured.stopped:
-        echo("Stopped; the same command continues from here.", style="yellow")
+        print_escaped("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (records_files or measured.records.records):
-        echo(f"nothing was measured: {'; '.join(list_reasons(measured.records.skips))}", style="yellow")
+        print_escaped(
+            f"nothing was measured: {'; '.join(list_reasons(measured.records.skips))}", style="yellow"
+        )
         raise click.exceptions.Exit(EXIT_UNMET)
-    if measured.lost and not records_files:
-        echo(f"{format_count(measured.lost, 'case')} of a folder left out of all numbers", style="yellow")
+    if measured.n_cases_not_loaded and not records_files:
+        print_escaped(
+            f"{format_count(measured.n_cases_not_loaded, 'case')} of a folder left out of all numbers",
+            style="yellow",
+        )
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
@@ -196,10 +201,10 @@ def _record_model(
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recording import record_file
-    from lavender.lab.bench.record import file_name
+    from lavender.lab.bench.record import make_file_name
 
     model, n = str(path.resolve()), 1
-    first = out / "recorded" / file_name(f"{path.resolve().parent.name}-{path.stem}")
+    first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")
     folder = first
     while folder in used_folders or _read_recorded_model(folder) not in ("", model):
         n += 1
@@ -215,13 +220,13 @@ def _record_model(
     )
     if not reuse or not settings_file.is_file() or settings_file.read_text(encoding="utf-8") != settings:
         settings_file.unlink(missing_ok=True)  # An interrupted recording is not reused.
-        echo(str(record_file(path, folder, **recording, replace=True)))
+        print_escaped(str(record_file(path, folder, **recording, replace=True)))
         write_text(settings_file, settings)
     return str(folder)
 
 
 def _read_recorded_model(folder: Path) -> str:
-    """Return the model whose steps a folder contains; empty if it contains none."""
+    """Return the path of the model from which the steps in a folder were recorded, or an empty text."""
     try:
         return str(json.loads((folder / "how.json").read_text(encoding="utf-8"))["model"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -13,13 +13,13 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     PATH,
-    echo,
     exit_stopped,
     ignore_closed_output,
     parse_parameters,
+    print_escaped,
     reject_unused_options,
 )
-from lavender.io.stored import check_figure_path, check_writable, destination
+from lavender.io.stored import check_figure_path, check_writable, resolve_destination
 
 
 @click.command()
@@ -87,7 +87,7 @@ def run(
     """
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
-    from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
+    from lavender.sim.engine.picture import PICTURES, get_picture_suffix, save_picture
     from lavender.sim.engine.run import format_step
     from lavender.sim.scene import Scene
 
@@ -98,13 +98,13 @@ def run(
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
-    if len({destination(path) for path in files.values()}) < len(files):
+    if len({resolve_destination(path) for path in files.values()}) < len(files):
         raise InputError(f"{', '.join(map(str, files.values()))}: each needs a file of its own")
     for path in files.values():
         check_writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
     if film is not None and drawn:
-        picture_suffix(film)
+        get_picture_suffix(film)
     live, writes = sys.stdout.isatty(), bool(files) or record is not None
 
     def show(text: str) -> None:
@@ -146,9 +146,9 @@ def run(
         click.echo()
     for name, path in files.items():
         shown_by = f": lavender view {path}" if name == "film" and not drawn else ""
-        echo(f"{name}: {path}{shown_by}")
+        print_escaped(f"{name}: {path}{shown_by}")
     if record is not None:
-        echo(f"{result.recorded} problems in {record}: lavender report {record}")
+        print_escaped(f"{result.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * result.cost.min()
     click.echo(
         f"{result.scene}: {len(result)} steps, {result.time[-1]:.3f} s, {result.method}, {best:.3g} ms per step at best"

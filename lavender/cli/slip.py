@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import EXIT_UNMET, FILE, console, echo, one_thread
+from lavender.cli.options import EXIT_UNMET, FILE, limit_to_one_thread, make_console, print_escaped
 
 
 @click.command()
@@ -35,11 +35,13 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
     from lavender.lab.slip import explain_mujoco_slip, summarize_slip
 
     steps = check_int("--steps", steps, 1)
-    one_thread()
+    limit_to_one_thread()
     explanations = explain_mujoco_slip(load_model(model)[1], states, contacts=contacts or None, steps=steps)
     if not explanations:
-        echo(f"{model}: no contact with friction in these states; give other --states, or more --steps")
+        print_escaped(
+            f"{model}: no contact with friction in these states; give other --states, or more --steps"
+        )
         raise click.exceptions.Exit(EXIT_UNMET)
-    print_table(console(), summarize_slip(explanations))
+    print_table(make_console(), summarize_slip(explanations))
     worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
-    echo(worst.sentence)
+    print_escaped(worst.sentence)

@@ -8,7 +8,14 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, one_thread
+from lavender.cli.options import (
+    EXIT_INFEASIBLE,
+    EXIT_INTERRUPTED,
+    EXIT_UNMET,
+    PATH,
+    limit_to_one_thread,
+    print_escaped,
+)
 from lavender.io.stored import check_writable, write_atomically
 
 #: Fields of the residual that --output writes.
@@ -55,10 +62,10 @@ def solve(
     from lavender.lab import bench
     from lavender.lab.bench.running.worker import Worker, solve_isolated
 
-    one_thread()
+    limit_to_one_thread()
     if output is not None:
         check_writable(output)
-    (item, *more) = bench.resolve([file])
+    (item, *more) = bench.resolve_sources([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
@@ -87,10 +94,10 @@ def solve(
                 )
 
         write_atomically(output, write)
-    echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    echo(str(solution))
+    print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    print_escaped(str(solution))
     if output is not None:
-        echo(f"written: {output}")
+        print_escaped(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed":

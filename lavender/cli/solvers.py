@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import console, escape_markup
+from lavender.cli.options import escape_markup, make_console
 
 
 @click.command()
@@ -49,4 +49,4 @@ def solvers() -> None:
             description,
             style="" if reason is None else "dim",
         )
-    console().print(table)
+    make_console().print(table)

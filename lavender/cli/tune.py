@@ -7,14 +7,14 @@ from typing import Any
 
 import click
 
-from lavender.cli.measuring import progress, show_page
-from lavender.cli.options import FILE, FOLDER, one_thread, threshold_option, worlds_options
+from lavender.cli.measuring import show_page, show_progress
+from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output
 
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
-@worlds_options(worlds=16, steps=200)
+@add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
 @threshold_option
@@ -34,7 +34,7 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     from lavender.lab.tune import tune as run
 
     context.with_resource(lock_output(out, folder=True))
-    one_thread()
-    with progress() as watch:
+    limit_to_one_thread()
+    with show_progress() as watch:
         tuning = run(model, watch=watch, **options)
     show_page(tuning.summary_page, out)

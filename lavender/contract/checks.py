@@ -507,7 +507,7 @@ def require_a_solution_as_start_is_kept(spec: SolverSpec) -> None:
     lambda spec: spec.impulse and not spec.external and "cone" in spec.laws,
 )
 def require_a_normal_without_inverse_mass_bears_friction(spec: SolverSpec) -> None:
-    """Require that a normal row whose row of A is zero may bear the friction of the relaxed law.
+    """Require that a normal with a zero row of A may bear the friction of the relaxed law.
 
     There w_n = mu |w_t| > 0 beside lambda_n > 0.
     """

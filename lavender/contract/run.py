@@ -77,7 +77,7 @@ def _run_in_process(process: ProcessBackend, name: str, check: Check, timeout: f
     """Run a check in another process, and return its failure."""
     try:
         process.start()
-        answer, _ = process.call(name, check.name, timeout=timeout, max_bytes=0)
+        answer, _ = process.call_function(name, check.name, timeout=timeout, max_bytes=0)
         return str(answer.get("failure", "the process of the solver sent no answer"))
     except TimeoutError:
         return f"the check did not end within {timeout:g} s; its process was killed"

@@ -14,7 +14,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "extract_c.py"))
 ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
-#: Modules of lavender_ext whose functions the library uses.
+#: Modules of lavender_ext with functions that the library uses.
 MODULES = (
     "core.assemble",
     "core.blocks",
@@ -48,12 +48,12 @@ FRONT = [
 ]
 
 
-def source_hash(root: Path) -> str:
+def hash_sources(root: Path) -> str:
     """Return a hash of all files from which the library is built."""
-    return str(EXTRACT_C["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
+    return str(EXTRACT_C["hash_sources"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
 
 
-def name_functions(header: str) -> str:
+def generate_name_functions(header: str) -> str:
     """Return C code of `lav_text`, `lav_name` and `lav_outcome` from the header's enums and its comments on errors."""
     errors, methods, outcomes = re.findall(r"enum \{ /\*[^*]*\*/\n(.*?)\n\};", header, re.DOTALL)
     texts = re.findall(r"(LAV_\w+) = -?\d+,?\s*/\* (.*?) \*/", errors)
@@ -85,12 +85,12 @@ def amalgamate(root: Path, cache: Path | None = None) -> str:
         The kernels cannot be translated, or need Python.
     """
     front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
-    front += name_functions(HEADER.read_text(encoding="utf-8"))
+    front += generate_name_functions(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
     with tempfile.TemporaryDirectory() as work:
         kernels = EXTRACT_C["extract_c"](EXTRACT_C["translate"](root, MODULES, Path(work), cache), front)
     return (
         f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
-        f" * This file is generated: change the kernels instead. Sources {source_hash(root)}\n */\n"
+        f" * This file is generated: change the kernels instead. Sources {hash_sources(root)}\n */\n"
         f'#include "lavender.h"\n\n{kernels}'
     )

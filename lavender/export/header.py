@@ -10,7 +10,7 @@ def strip_comments(header: str) -> str:
     return re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
 
 
-def constants(header: str) -> dict[str, int]:
+def parse_enum_constants(header: str) -> dict[str, int]:
     """Return the numbers of all enums by name."""
     numbers: dict[str, int] = {}
     for body in re.findall(r"enum \{(.*?)\};", strip_comments(header), re.DOTALL):
@@ -18,7 +18,7 @@ def constants(header: str) -> dict[str, int]:
     return numbers
 
 
-def struct_fields(header: str, name: str) -> list[tuple[str, str]]:
+def parse_struct_fields(header: str, name: str) -> list[tuple[str, str]]:
     """Return (type, name) of the fields of a struct in order.
 
     Examples are ("int32_t", "n_rows"), ("const double *", "b"), and ("(*)", "clock") for a pointer to a function.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.export.amalgamate import ExtractionError, amalgamate, source_hash
+from lavender.export.amalgamate import ExtractionError, amalgamate, hash_sources
 from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes
 
 HERE = Path(__file__).resolve().parent
@@ -27,7 +27,7 @@ def source() -> str:
     LavenderError
         There is no current file, and it cannot be built, for example because Cython is not installed.
     """
-    current_hash = source_hash(ROOT).encode()
+    current_hash = hash_sources(ROOT).encode()
 
     def make() -> bytes:
         try:
@@ -41,7 +41,7 @@ def source() -> str:
     return load_or_make(HERE / "c" / "lavender.c", lambda text: current_hash in text[:1000], make).decode()
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _collect_existing_files(folder: Path) -> Iterator[Path]:
     return (
         p for p in sorted(folder.rglob("*")) if p.suffix in TEXTS and p.name != "lavender.c" and p.is_file()
     )
@@ -73,7 +73,10 @@ def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: 
     """
     check_writable(out, folder=True)
     folder = HERE / "c"
-    contents = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
+    contents = {
+        p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8")
+        for p in _collect_existing_files(folder)
+    }
     contents["lavender.c"] = source()
     sums = "".join(
         f"{hashlib.sha256(contents[name].encode()).hexdigest()}  {name}\n" for name in sorted(contents)

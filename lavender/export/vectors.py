@@ -20,12 +20,19 @@ import lavender as lv
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.export.library import HERE
-from lavender.export.view import METHODS, OTHER_BITS, NotSupported, accepts, option_numbers, problem_view
+from lavender.export.view import (
+    METHODS,
+    OTHER_BITS,
+    NotSupported,
+    encode_options,
+    is_accepted_by_library,
+    make_problem_view,
+)
 from lavender.lab import bench
 from lavender.lab.bench import statistics
-from lavender.lab.bench.cases import fingerprint
+from lavender.lab.bench.cases import hash_problem
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.store import Records, read
+from lavender.lab.bench.store import Records, read_records
 from lavender.lab.report.verdict import build_verdict
 from lavender.solvers import registry
 from lavender.solvers.steps import METHODS as CANDIDATES
@@ -72,27 +79,27 @@ class Step:
     tol: float
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def integers(self) -> tuple[int, ...]:
+    def option_integers(self) -> tuple[int, ...]:
         """Return the integers of `lav_options` without the seed: method, order, memory, sweep, convex, keeps."""
-        return (METHODS[self.solver], *option_numbers(self.solver, self.options)[0])
+        return (METHODS[self.solver], *encode_options(self.solver, self.options)[0])
 
-    def pack(self) -> bytes:
+    def to_bytes(self) -> bytes:
         """Return the step in the format of check.c."""
-        omega = option_numbers(self.solver, self.options)[1]
-        return struct.pack("<7qdqd", *self.integers(), 0, omega, self.iterations, self.tol)
+        omega = encode_options(self.solver, self.options)[1]
+        return struct.pack("<7qdqd", *self.option_integers(), 0, omega, self.iterations, self.tol)
 
-    def text(self) -> str:
+    def as_c_initialiser(self) -> str:
         """Return options and budget as a C initialiser."""
         integers, omega = (
-            ", ".join(map(str, self.integers()[1:])),
-            option_numbers(self.solver, self.options)[1],
+            ", ".join(map(str, self.option_integers()[1:])),
+            encode_options(self.solver, self.options)[1],
         )
         options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {integers}, 0, {omega!r}"
         budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0"
         return f"{{{{{options}}}, {{{budget}}}}}"
 
 
-def steps_of(solution: lv.Solution, step: Step) -> list[Step]:
+def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
     """Return the steps of a solve: the step itself, or one step per solver of the stages of `auto`.
 
     The iterations of a stage's solver are twice its total work.
@@ -113,7 +120,7 @@ def steps_of(solution: lv.Solution, step: Step) -> list[Step]:
     return steps
 
 
-def make_files(path: Path, solver: str | None, max_problems: int) -> dict[str, str | bytes]:
+def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict[str, str | bytes]:
     """Return the files `vectors.bin`, `check.c` and `chosen.h` (the settings in C) by name, for the library's folder.
 
     Parameters
@@ -130,7 +137,9 @@ def make_files(path: Path, solver: str | None, max_problems: int) -> dict[str, s
     InputError
         The records or the library do not have the solver, or none of the problems can be loaded.
     """
-    records = statistics.drop_idle_cases(read(path).latest())  # The records by which the report recommends.
+    records = statistics.drop_idle_cases(
+        read_records(path).select_latest_run()
+    )  # The records by which the report recommends.
     measured = _select_records(records, solver)
     packed: list[bytes] = []
     failures: list[str] = []
@@ -141,13 +150,15 @@ def make_files(path: Path, solver: str | None, max_problems: int) -> dict[str, s
             break
         try:
             problem = _load_problem(records, record)
-            vector, ran = pack(problem, record.solver, record.tol, record.max_iter, record.options)
+            vector, ran = make_test_vector(
+                problem, record.solver, record.tol, record.max_iter, record.options
+            )
         except (NotSupported, lv.LavenderError) as error:
             failures.append(f"{record.case}: {error}")
             continue
         packed.append(vector)
         for step in ran:
-            key = step.integers()
+            key = step.option_integers()
             count = step.iterations if record.solver == "auto" else min(step.iterations, longest)
             steps[key] = replace(step, iterations=max(count, steps[key].iterations if key in steps else 1))
     if not packed:
@@ -155,7 +166,7 @@ def make_files(path: Path, solver: str | None, max_problems: int) -> dict[str, s
             f"no problem of {measured[0].solver} in {path} makes a test vector: {'; '.join(failures[:3])}"
         )
     check = (HERE / "capi" / "check.c").read_text(encoding="utf-8")
-    lines = ",\n".join(f"  {step.text()}" for step in steps.values())
+    lines = ",\n".join(f"  {step.as_c_initialiser()}" for step in steps.values())
     header = CHOSEN_TEMPLATE.format(
         solver=measured[0].solver, tol=measured[0].tol, count=len(steps), lines=lines
     )
@@ -192,19 +203,19 @@ def _load_problem(records: Records, record: Record) -> lv.Problem:
     if record.case not in records.cases:
         raise InputError("the records do not name its source")
     source = records.cases[record.case].source
-    problem = bench.resolve([source])[0].problem
-    present_hash = fingerprint(problem)
+    problem = bench.resolve_sources([source])[0].problem
+    present_hash = hash_problem(problem)
     if present_hash != record.sha:
         raise InputError(f"{source} is another problem here, hash {present_hash}; measured was {record.sha}")
     return problem
 
 
 def join_vectors(packed: Sequence[bytes]) -> bytes:
-    """Return the content of `vectors.bin` from vectors of `pack`."""
+    """Return the content of `vectors.bin` from vectors of `make_test_vector`."""
     return MAGIC + struct.pack("<q", len(packed)) + b"".join(packed)
 
 
-def pack(
+def make_test_vector(
     problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]
 ) -> tuple[bytes, list[Step]]:
     """Return one test vector and its steps.
@@ -225,7 +236,9 @@ def pack(
     ):
         raise NotSupported(f"{solver} formed A, which the library does not: give it the matrix, problem.csr")
     steps = [
-        s for s in steps_of(solution, Step(solver, max_iter, tol, options)) if accepts(problem, s.solver)
+        s
+        for s in split_into_steps(solution, Step(solver, max_iter, tol, options))
+        if is_accepted_by_library(problem, s.solver)
     ]
     packed_problem = pack_problem(problem)
     if not steps:
@@ -234,16 +247,16 @@ def pack(
         )
     impulse, relative = solution.impulse, solution.residual.relative
     if solver == "newton" and (problem.generalized is None or form == "velocity"):
-        impulse = run_driver(problem, tol, max_iter)[0]
+        impulse = run_compiled_newton(problem, tol, max_iter)[0]
         relative = lv.residual(problem, impulse, tol=tol).relative
     is_met = solver in OTHER_BITS
-    out = struct.pack("<q", len(steps)) + b"".join(step.pack() for step in steps) + packed_problem
+    out = struct.pack("<q", len(steps)) + b"".join(step.to_bytes() for step in steps) + packed_problem
     return out + struct.pack("<qd", is_met, tol if is_met else relative) + (
         b"" if is_met else impulse.tobytes()
     ), steps
 
 
-def run_driver(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, int]:
+def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, int]:
     """Return the impulse (m,) [N s] and the factorisations of the compiled driver of `newton`, as in the library.
 
     `lavender.solve` differs: it first tries warm-started sweeps and a solve of the joints, searches for certificates
@@ -267,7 +280,7 @@ def run_driver(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray
 
 def pack_problem(problem: Any) -> bytes:
     """Return the bytes of a problem: counts, then arrays in the order of `lav_problem`."""
-    fields = problem_view(problem)
+    fields = make_problem_view(problem)
     out = struct.pack("<9q", *fields.counts)
     for values in fields.arrays.values():
         data = b"" if values is None else np.ascontiguousarray(values).tobytes()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.export.header import constants, struct_fields
+from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.export.library import HEADER
 from lavender.problem import Problem
 from lavender.sim.engine.simulation import Simulation
@@ -19,16 +19,17 @@ _HEADER = HEADER.read_text(encoding="utf-8")
 #: Arrays of `lav_problem` in the order of the struct, with their types.
 ARRAYS: dict[str, Any] = {
     name: np.dtype({"double": "f8", "int32_t": "i4", "uint64_t": "u8"}[kind.split()[1]])
-    for kind, name in struct_fields(_HEADER, "lav_problem")
+    for kind, name in parse_struct_fields(_HEADER, "lav_problem")
     if "*" in kind
 }
 #: Solvers by their numbers in the library.
 METHODS = {
-    name: constants(_HEADER)[f"LAV_{name.upper()}"]
+    name: parse_enum_constants(_HEADER)[f"LAV_{name.upper()}"]
     for name, spec in registry.specs().items()
     if spec.builtin and not spec.external and not spec.delegates
 }
-#: Solvers whose bits differ: the package uses another factorisation, or the solver is a sequence of others.
+#: Solvers with other bits in the library: the package uses another factorisation, or the solver is a sequence of
+#: others.
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
@@ -58,7 +59,7 @@ class ProblemView:
     arrays: dict[str, Any]
 
 
-def problem_view(problem: Problem) -> ProblemView:
+def make_problem_view(problem: Problem) -> ProblemView:
     """Return the contents of the `lav_problem` of a problem; its start is the problem's guess, if there is one.
 
     Raises
@@ -102,7 +103,7 @@ def problem_view(problem: Problem) -> ProblemView:
     )
 
 
-def accepts(problem: Problem, solver: str) -> bool:
+def is_accepted_by_library(problem: Problem, solver: str) -> bool:
     """Return whether the library's method accepts a problem that the package's solver accepts, as `lav_takes` does."""
     form = 2 if problem.rows is not None else 3 if problem.generalized is not None else 1
     c = problem.cones
@@ -110,10 +111,10 @@ def accepts(problem: Problem, solver: str) -> bool:
         return False
     if solver in ("direct", "lemke"):
         return not np.any(c.is_contact & (np.diff(c.ptr) > 1))
-    return solver != "newton" or form == 3 or not (c.has_round or c.has_more_parts)
+    return solver != "newton" or form == 3 or not (c.has_round or c.has_more_components)
 
 
-def option_numbers(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
+def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
     """Return (order, memory, sweep, convex, keeps) and omega for the options of a solver.
 
     Raises

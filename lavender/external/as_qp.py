@@ -16,7 +16,7 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
 
     free row                w = 0                          r = 0
     only a lower bound      w >= 0                         r = l
-    both bounds             w + t >= 0, t >= 0             r = l, the multiplier is at most u - l
+    both bounds             w + t >= 0, t >= 0             r = l, the multiplier does not exceed u - l
     only an upper bound     -w >= 0                        r = u
     disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|;  a second disk likewise, t >= a_r |w_r|
 
@@ -29,7 +29,7 @@ r_i the largest entry of row i of (5); sigma is the root mean square of r^-1/2 t
 zero.
 
 sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes the first two forms free of units, with unknowns near 1 also at
-large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known are removed:
+large mass ratios; a residual of x times sigma is a residual of the judge. Rows with a known impulse are removed:
 lower = upper, friction with mu = 0, rows of A that are zero. Rows and contacts that b pushes to a bound by more than
 MAX_SCALED_RHS times the size of the unknowns (for example at placeholder bounds) are also removed, because the
 tolerance of a backend is relative to its largest number. `QPSolver` checks them at the solution.
@@ -54,7 +54,7 @@ from lavender.problem import Problem
 PROGRAM_FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat numbers from here on as infinite, or fail.
-# A row whose scaled |b| is larger is assumed to stay at its bound: backends lose as many digits as the largest b has,
+# A row with a larger scaled |b| is assumed to stay at its bound: backends lose as many digits as the largest b has,
 # and active rows have b near 1. If the assumption fails, the backend is called once more with all rows.
 MAX_SCALED_RHS = 1e2
 MAX_SCALED_PROGRAM_RHS = (
@@ -96,12 +96,12 @@ class _FrictionRows:
     disks: list[_Disk]
 
     @property
-    def cones(self) -> tuple[int, ...]:
+    def cone_sizes(self) -> tuple[int, ...]:
         """Size of the second-order cone of each disk."""
         return tuple(1 + len(disk.tangents) for disk in self.disks)
 
     @property
-    def members(self) -> list[int]:
+    def all_rows(self) -> list[int]:
         """All rows of all components."""
         return [i for p in self.pairs for i in p[:2]] + [
             i for d in self.disks for i in (d.normal, *d.tangents)
@@ -116,7 +116,7 @@ class _ScaledProblem:
     ----------
     problem : Problem
     unknown_rows : (k,) int
-        Rows of the problem whose impulses are unknowns of the program.
+        Rows of the problem with impulses that are unknowns of the program.
     fixed : (m,), N s
         Impulses of the other rows; 0 for unknown rows.
     assumed : (n,) int
@@ -142,13 +142,13 @@ class _ScaledProblem:
         size = np.diff(c.ptr)
         has_own_bound = np.repeat(~c.is_contact | (size == 1), size)
         for i in np.asarray(problem.metric.empty, int):
-            # The row of A is zero: the sign of b determines the bound. Without a finite bound there is no solution,
+            # The row of A is zero: the sign of b determines the bound. Without a finite bound no solution exists,
             # which the validation of the input reports.
             if has_own_bound[i]:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
-        known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
+        known[c.friction_rows] = c.friction_coefficient[c.friction_rows] == 0.0
         sigma, assumed = _compute_scale(problem), np.zeros(0, np.intp)
         if assume:
             threshold = MAX_SCALED_PROGRAM_RHS if problem.has_singular_program else MAX_SCALED_RHS
@@ -161,15 +161,15 @@ class _ScaledProblem:
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
         return cls(problem, unknown, fixed, assumed, 1.0 / np.sqrt(d), sigma)
 
-    def friction_rows(self) -> _FrictionRows:
+    def map_friction_rows(self) -> _FrictionRows:
         """Return the friction components with indices of unknown rows."""
         c = self.problem.cones
-        coefficient = c.reach
+        coefficient = c.friction_coefficient
         unknown_of_row = np.full(self.problem.m, -1)
         unknown_of_row[self.unknown_rows] = np.arange(len(self.unknown_rows))
         pairs: list[tuple[int, int, float]] = []
         disks: list[_Disk] = []
-        for block, rows in c.parts():
+        for block, rows in c.friction_components():
             if unknown_of_row[rows[0]] < 0:
                 continue
             normal = int(unknown_of_row[c.ptr[block]])
@@ -229,7 +229,7 @@ class QP(_ScaledProblem):
 
     @property
     def n(self) -> int:
-        """Number of unknowns."""
+        """Number n of unknowns x of the program."""
         return len(self.q)
 
     @property
@@ -268,7 +268,7 @@ class QP(_ScaledProblem):
         """Whether P is positive definite: the velocity form without unknowns t."""
         return self.form == "velocity" and self.n == self.velocity_map.shape[1]
 
-    def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+    def recover_impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
         """Compute lambda (m,) [N s] from a solution, clipped to constant bounds; only the program form uses xi."""
         lam = self.fixed.copy()
         z = x if self.form == "impulse" else self.shift + self.multiplier_map @ zeta
@@ -276,7 +276,7 @@ class QP(_ScaledProblem):
         c = self.problem.cones
         return np.clip(lam, c.lower, c.upper, out=lam)
 
-    def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
+    def recover_certificate(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
         """Compute a certificate (m,) of infeasibility from a backend's certificate; None without a valid one.
 
         In the impulse form x is a direction in which the objective is unbounded, in the velocity form zeta are
@@ -297,11 +297,11 @@ class QP(_ScaledProblem):
         size = np.abs(y).max(initial=0.0)
         return y / size if 0.0 < size < np.inf else None
 
-    def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
-        """Compute the backend's multiplier of the bounds of lambda, z (m,) [m/s] with A lambda - b + z = 0.
+    def recover_bound_multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
+        """Compute the multipliers z (m,) [m/s] of the bounds of lambda that the backend's answer implies.
 
-        In the impulse form it is xi, in the velocity form -w of the backend's velocities. Rows that were removed have
-        their slack.
+        An exact answer has A lambda - b + z = 0. In the impulse form, z is xi in units of the problem; in the velocity
+        form, it is -w of the backend's velocities. Rows that were removed from the program have z = -w.
         """
         if self.form == "impulse":
             lam = self.fixed.copy()
@@ -318,7 +318,7 @@ class QP(_ScaledProblem):
         )
         return z
 
-    def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def make_start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Compute (x, zeta, xi) from a start (m,) [N s], for programs without second-order cones."""
         z = impulse[self.unknown_rows] / (self.sigma * self.root)
         xi = np.zeros(self.n)
@@ -378,8 +378,8 @@ def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
     )
 
 
-def residual_target(problem: Problem, tol: float) -> float:
-    """Compute the largest residual eps of one unknown [-] with which the judge's relative residual is at most `tol`.
+def compute_backend_tolerance(problem: Problem, tol: float) -> float:
+    """Compute the largest residual eps of one unknown [-] that keeps the judge's relative residual within `tol`.
 
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
@@ -396,7 +396,7 @@ def residual_target(problem: Problem, tol: float) -> float:
     return tol * min([1.0, *limits])
 
 
-def impulse_form(
+def build_impulse_form(
     problem: Problem, *, unit_diagonal: bool = True, equality: bool = False, assume: bool = False
 ) -> QP:
     """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
@@ -418,14 +418,14 @@ def impulse_form(
     p = sp.csc_matrix(scale @ a[unknown][:, unknown] @ scale)
     b = problem.b - (a @ scaled.fixed if scaled.fixed.any() else 0.0)
     q = -root * b[unknown] / sigma
-    rows, k = scaled.friction_rows(), len(unknown)
+    rows, k = scaled.map_friction_rows(), len(unknown)
     lb = ub = None
     if not problem.cones.is_free:
         lb, ub = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
     matrix, rhs, n_zero = sp.csc_matrix((0, k)), np.zeros(0), 0
     if equality:
         matrix, rhs, n_zero, q = p, -q, k, np.zeros(k)
-    elif rows.members:
+    elif rows.all_rows:
         # pairs: s = a x_n - x_t >= 0 and s = a x_n + x_t >= 0; disks: s = (a x_n, x_t) in a second-order cone
         builder = _RowBuilder()
         for n, t, ratio in rows.pairs:
@@ -435,7 +435,7 @@ def impulse_form(
             builder.add_row([(disk.normal, -disk.ratios[0])])
             for t, ratio in zip(disk.tangents, disk.ratios, strict=True):
                 builder.add_row([(t, -disk.ratios[0] / ratio)])
-        matrix = builder.matrix(k)
+        matrix = builder.build_matrix(k)
         rhs = np.zeros(matrix.shape[0])
     return QP(
         **vars(scaled),
@@ -446,7 +446,7 @@ def impulse_form(
         b=rhs,
         n_zero=n_zero,
         n_nonneg=2 * len(rows.pairs),
-        soc=rows.cones,
+        soc=rows.cone_sizes,
         lb=lb,
         ub=ub,
         multiplier_map=sp.csr_matrix((k, len(rhs))),
@@ -455,8 +455,8 @@ def impulse_form(
     )
 
 
-def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
-    """Build the mass-scaled velocity form of a problem with rows; `assume` as for `impulse_form`."""
+def build_velocity_form(problem: Problem, *, assume: bool = False) -> QP:
+    """Build the mass-scaled velocity form of a problem with rows; `assume` as for `build_impulse_form`."""
     form = problem.velocity_form()
     scaled = _ScaledProblem.from_problem(problem, True, assume)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
@@ -471,9 +471,9 @@ def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
     g = form.rhs[unknown] / sigma
     # kinds of bounded rows
     low, high = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
-    rows = scaled.friction_rows()
+    rows = scaled.map_friction_rows()
     is_bounded_row = np.ones(k, bool)
-    is_bounded_row[rows.members] = False
+    is_bounded_row[rows.all_rows] = False
     has_low, has_high = np.isfinite(low), np.isfinite(high)
     free = np.flatnonzero(is_bounded_row & ~has_low & ~has_high)
     lower = np.flatnonzero(is_bounded_row & has_low)
@@ -483,11 +483,11 @@ def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
     shift[lower], shift[upper] = low[lower], high[upper]
     # rows A = -T^T K~ and entries of t
     columns_of_t, t_entries, n, n_normals = _build_velocity_rows(rows, free, lower, both, upper, ny)
-    multiplier_map = sp.csr_matrix(columns_of_t.matrix(k).T)
+    multiplier_map = sp.csr_matrix(columns_of_t.build_matrix(k).T)
     velocities = sp.hstack(
         [-(multiplier_map.T @ velocity_map), sp.csc_matrix((multiplier_map.shape[1], n - ny))]
     )
-    matrix = sp.csc_matrix(velocities + t_entries.matrix(n))
+    matrix = sp.csc_matrix(velocities + t_entries.build_matrix(n))
     q = np.zeros(n)
     known = np.zeros(ny)
     known[: jac.shape[1]] = jac.T @ (scaled.fixed / (form.scale * sigma))
@@ -509,7 +509,7 @@ def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
         b=-(multiplier_map.T @ g),
         n_zero=len(free),
         n_nonneg=n_nonneg,
-        soc=rows.cones,
+        soc=rows.cone_sizes,
         lb=lb,
         ub=ub,
         multiplier_map=multiplier_map,
@@ -538,14 +538,14 @@ class ProgramQP(QP):
     signs: FloatArray
     bounds: tuple[tuple[float, IntpArray, IntpArray], ...]
 
-    def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+    def recover_impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
         """Return x and the multipliers (m,), clipped to constant bounds."""
         c, lam = self.problem.cones, self.fixed.copy()
         lam[self.unknown_rows[: self.n_x]] = self.sigma * self.root[: self.n_x] * x
-        lam += self.sigma * self._multipliers(zeta, xi)
+        lam += self.sigma * self._recover_row_multipliers(zeta, xi)
         return np.clip(lam, c.lower, c.upper, out=lam)
 
-    def _multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+    def _recover_row_multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
         """Return multipliers over sigma (m,); 0 for variables, and for bounds with a multiplier of the wrong sign."""
         lam, scale = np.zeros(self.problem.m), np.zeros(self.problem.m)
         scale[self.unknown_rows] = self.root
@@ -555,12 +555,12 @@ class ProgramQP(QP):
             lam[rows] = -force if sign == 0.0 else np.maximum(sign * force, 0.0)
         return lam
 
-    def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
+    def recover_certificate(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
         """Compute a certificate (m,) of infeasibility: contradicting rows, or a direction of unlimited decrease."""
         candidates = []
         if zeta is not None and len(zeta) == len(self.b):
             # Backends return the multipliers of rows only; the multipliers of bounds balance them.
-            candidates.append(self._multipliers(zeta, -(self.A.T @ zeta)))
+            candidates.append(self._recover_row_multipliers(zeta, -(self.A.T @ zeta)))
         if x is not None and len(x) == self.n:
             y = np.zeros(self.problem.m)
             y[self.unknown_rows[: self.n_x]] = self.root[: self.n_x] * x
@@ -571,11 +571,11 @@ class ProgramQP(QP):
         proofs = (y for y in candidates if check_certificate(self.problem, y) is None)
         return next(proofs, candidates[0] if candidates else None)
 
-    def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
-        """Return NaN (m,): this multiplier is not defined for x and multipliers together."""
+    def recover_bound_multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
+        """Return NaN (m,), because the program form has no multipliers of the bounds of lambda."""
         return np.full(self.problem.m, np.nan)
 
-    def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def make_start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Compute (x, zeta, xi) from a start (m,)."""
         scaled = np.zeros(self.problem.m)
         scaled[self.unknown_rows] = impulse[self.unknown_rows] / (self.sigma * self.root)
@@ -585,8 +585,8 @@ class ProgramQP(QP):
         return scaled[self.unknown_rows[: self.n_x]], self.signs * scaled[self.general], xi
 
 
-def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
-    """Write a quadratic program with a singular P in the units of its problem; `assume` as in `impulse_form`."""
+def build_program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
+    """Write a quadratic program with a singular P in the units of its problem; `assume` as in `build_impulse_form`."""
     scaled, qp = _ScaledProblem.from_problem(problem, True, assume), problem.qp
     unknown, n = scaled.unknown_rows, len(qp.q)
     n_x = int(np.searchsorted(unknown, n))
@@ -722,7 +722,7 @@ def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[In
     c, push = problem.cones, problem.b / (np.sqrt(problem.d) * sigma)
     bound = np.where(push < 0.0, c.lower, c.upper)
     is_far = (np.abs(push) > threshold) & np.isfinite(bound) & ~c.friction_rows
-    # All rows of a contact whose normal row is far; a contact with only far friction rows is not included.
+    # All rows of a contact with a far normal row; a contact with only far friction rows is not included.
     first = np.repeat(c.ptr[:-1], np.diff(c.ptr))
     is_far_friction = c.friction_rows & is_far[first]
     rows = np.flatnonzero(is_far | is_far_friction)
@@ -757,7 +757,7 @@ class _RowBuilder:
             self.value.append(value)
         self.ptr.append(len(self.column))
 
-    def matrix(self, columns: int) -> sp.csc_matrix:
+    def build_matrix(self, columns: int) -> sp.csc_matrix:
         """Return the matrix with this number of columns."""
         shape = (len(self.ptr) - 1, columns)
         return sp.csc_matrix(
@@ -765,13 +765,13 @@ class _RowBuilder:
         )
 
 
-def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
+def make_bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
     """Return finite bounds as rows sign x[indices] <= h.
 
     Returns
     -------
     list of (sign, rows of the identity, h, indices)
-        For upper bounds, then for lower bounds; empty if there are none.
+        For upper bounds, then for lower bounds; else empty.
     """
     if qp.lb is None or qp.ub is None:
         return []
@@ -783,16 +783,16 @@ def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
     return groups
 
 
-def bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
-    """Compute xi (n,) from the multipliers of `bound_rows`, the first entries of z."""
+def merge_bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
+    """Compute xi (n,) from the multipliers of `make_bound_rows`, the first entries of z."""
     xi, first = np.zeros(qp.n), 0
-    for sign, _, _, indices in bound_rows(qp):
+    for sign, _, _, indices in make_bound_rows(qp):
         xi[indices] += sign * z[first : first + len(indices)]
         first += len(indices)
     return xi
 
 
-def two_sided_rows(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
+def make_two_sided_rows(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
     """Return C, l and u of the rows l <= C x <= u; with `identity` the bounds of x are further rows."""
     low = np.full(len(qp.b), -np.inf)
     low[: qp.n_zero] = qp.b[: qp.n_zero]

@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, bound_multipliers, bound_rows
+from lavender.external.as_qp import QP, make_bound_rows, merge_bound_multipliers
 from lavender.external.running import Answer, Call, Limits, capture_output, check_iterate, clamp_tolerance
 from lavender.judge.solution import Status
 
@@ -80,10 +80,10 @@ class Backend:
         """Run the backend once, in this process."""
         if self.call is not None:
             return self.call(qp, impulse, limit, settings)
-        return _through_qpsolvers(self, qp, impulse, limit, settings)
+        return _call_through_qpsolvers(self, qp, impulse, limit, settings)
 
 
-def _through_qpsolvers(
+def _call_through_qpsolvers(
     backend: Backend, qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
 ) -> Answer:
     """Call a backend through qpsolvers."""
@@ -94,7 +94,7 @@ def _through_qpsolvers(
     options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
     settings = {name: x for name, x in options.items() if x is not None}  # The time limit can be None.
     if backend.warm:
-        settings.update(_warm_settings(backend.name, qp, impulse))
+        settings.update(_make_warm_start_settings(backend.name, qp, impulse))
     settings.update(extra)
     # equality rows, then inequality rows
     z = qp.n_zero
@@ -103,7 +103,7 @@ def _through_qpsolvers(
     rows = qp.A.toarray() if dense else qp.A
     lb, ub = qp.lb, qp.ub
     inequality, rhs = rows[z:], qp.b[z:]
-    bounds = bound_rows(qp) if backend.finite else []
+    bounds = make_bound_rows(qp) if backend.finite else []
     if bounds:
         lb = ub = None
         inequality = sp.csc_matrix(sp.vstack([inequality, *(s * m for s, m, _, _ in bounds)]))
@@ -137,7 +137,7 @@ def _through_qpsolvers(
         x = None  # The solution of the velocity form consists of multipliers.
     xi = np.asarray(solution.z_box, float) if _has_size(solution.z_box, qp.n) else None
     if bounds and _has_size(solution.z, len(rhs)):
-        xi = bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
+        xi = merge_bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
     iterations = _get_iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
     message = status_text or warning or _describe_result(solution.found, x)
@@ -207,9 +207,9 @@ def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
     return Status.NUMERICAL_ERROR, text
 
 
-def _warm_settings(name: str, qp: QP, impulse: FloatArray) -> dict[str, Any]:
+def _make_warm_start_settings(name: str, qp: QP, impulse: FloatArray) -> dict[str, Any]:
     """Return the settings that start a backend from an impulse (m,) [N s]."""
-    x, zeta, xi = qp.start(impulse)
+    x, zeta, xi = qp.make_start(impulse)
     if name == "proxqp":
         from proxsuite import proxqp
 

@@ -18,7 +18,7 @@ from functools import partial
 
 from lavender.external import native
 from lavender.external.backend import Backend
-from lavender.external.qp_solver import OPTION_HELP, QPSolver, refusal
+from lavender.external.qp_solver import OPTION_HELP, QPSolver, explain_refusal
 from lavender.solvers.registry import SolverSpec
 
 #: Options of backends that qpsolvers calls: a str is a field of `Limits`, other values are fixed.
@@ -127,7 +127,7 @@ def _make_spec(backend: Backend) -> SolverSpec:
         install=backend.install,
         summary=backend.summary if backend.cones else f"{backend.summary} (QP backend)",
         reference=backend.reference,
-        refusal=refusal,
+        refusal=explain_refusal,
     )
 
 

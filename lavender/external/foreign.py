@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float, read_only
+from lavender.base.arrays import FloatArray, check_float, mark_read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.judge.residuals import get_reference, residual
@@ -36,7 +36,7 @@ class Foreign(Solver):
                 "prepare and run are needed (lavender.registry.Solver)"
             )
 
-    def _call(self, method: str, *arguments: Any) -> Any:
+    def _call_method(self, method: str, *arguments: Any) -> Any:
         """Call a method of the solver; raise RuntimeError instead of SystemExit, which would end the process."""
         try:
             return getattr(self.solver, method)(*arguments)
@@ -46,11 +46,11 @@ class Foreign(Solver):
                 "with a message, is needed"
             ) from error
 
-    def _has(self, method: str) -> bool:
+    def _has_method(self, method: str) -> bool:
         return getattr(self.solver, method, None) is not None
 
     def _call_optional(self, method: str, *arguments: Any) -> Any:
-        return self._call(method, *arguments) if self._has(method) else None
+        return self._call_method(method, *arguments) if self._has_method(method) else None
 
     def setup_time(self, problem: Problem) -> float:
         """Return the solver's estimate of the time [s] of `prepare`, 0 if it has none."""
@@ -69,13 +69,13 @@ class Foreign(Solver):
 
     def prepare(self, problem: Problem) -> State:
         """Prepare a copy of the problem: factor, colour, allocate."""
-        return State(problem, self._call("prepare", _copy_problem(problem)))
+        return State(problem, self._call_method("prepare", _copy_problem(problem)))
 
     def update(self, state: State, problem: Problem) -> State:
         """Update the state to a problem of the same structure; a solver without `update` prepares it again."""
-        if not self._has("update"):
+        if not self._has_method("update"):
             return self.prepare(problem)
-        return State(problem, self._call("update", state.state, _copy_problem(problem)))
+        return State(problem, self._call_method("update", state.state, _copy_problem(problem)))
 
     def run(
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
@@ -83,7 +83,7 @@ class Foreign(Solver):
         """Run up to `max_iter` more iterations on a copy of the impulse, and copy the result to `impulse`."""
         iterate = impulse.copy()
         try:
-            claim = self._call("run", state.state, iterate, max_iter, tol, time_limit)
+            claim = self._call_method("run", state.state, iterate, max_iter, tol, time_limit)
         except KeyboardInterrupt:
             _copy_back(iterate, impulse)
             raise
@@ -125,7 +125,7 @@ class Foreign(Solver):
             )
         if certificate is not None:
             try:
-                certificate = read_only(np.array(certificate).astype(np.float64, casting="same_kind"))
+                certificate = mark_read_only(np.array(certificate).astype(np.float64, casting="same_kind"))
             except (TypeError, ValueError):
                 error = (
                     error or f"gives a certificate that is not an array of {m} numbers ({certificate!r:.60})"
@@ -136,7 +136,7 @@ class Foreign(Solver):
             claim,
             iterations=iterations,
             work={_join_lines(k): int(n) for k, n in work.items()},
-            dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
+            dual=mark_read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
             certificate=certificate,
             message=_join_lines(claim.message),
             form=_join_lines(claim.form),

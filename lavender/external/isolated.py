@@ -18,7 +18,7 @@ from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
-from lavender.external.as_qp import QP, impulse_form
+from lavender.external.as_qp import QP, build_impulse_form
 from lavender.external.backend import Backend
 from lavender.external.running import Answer, Failed, Limits, capture_output
 from lavender.judge.solution import Status
@@ -26,10 +26,10 @@ from lavender.problem import Problem
 
 #: Fields of `running.Answer`, in the order in which they are sent.
 ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
-MAX_BACKEND_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
+MAX_BACKEND_MESSAGE_LENGTH = 500  # [characters] Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
-TRANSFER_RATE = 3e8  # bytes/s. Programs that would take longer to send than the limit time out.
+TRANSFER_RATE = 3e8  # [bytes/s] Programs that would take longer to send than the limit time out.
 
 #: Running processes that have no call. A thread that takes one is its only user.
 idle_processes: list[ProcessBackend] = []
@@ -37,11 +37,11 @@ idle_processes: list[ProcessBackend] = []
 
 def start_process(backend: Backend) -> None:
     """Start a process that has imported the backend's code, before the clock of a time limit starts."""
-    process = _take_idle() or ProcessBackend(run_backend)
+    process = _take_idle_process() or ProcessBackend(run_backend)
     with suppress(ProcessEnded):  # If the system starts no process, the backend runs in this one.
         process.start()
         with suppress(TimeoutError, InvalidAnswer, RemoteError):  # The call itself reports them.
-            process.call(backend, timeout=subprocesses.START_TIMEOUT, max_bytes=0)
+            process.call_function(backend, timeout=subprocesses.START_TIMEOUT, max_bytes=0)
         idle_processes.append(process)
 
 
@@ -77,11 +77,11 @@ def call_backend(
         return Answer(
             Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
         )
-    process = _take_idle()
+    process = _take_idle_process()
     if process is None:
         return None
     try:
-        fields, arrays = process.call(
+        fields, arrays = process.call_function(
             backend,
             qp,
             impulse,
@@ -115,20 +115,20 @@ def call_backend(
         raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
 
 
-def _take_idle() -> ProcessBackend | None:
+def _take_idle_process() -> ProcessBackend | None:
     """Return a running process without a call, or None."""
     while True:
         try:
             process = idle_processes.pop()
         except IndexError:
             return None
-        if process.alive:
+        if process.is_alive:
             return process
         process.close()
 
 
 @atexit.register
-def _close_idle() -> None:
+def _close_idle_processes() -> None:
     while idle_processes:
         idle_processes.pop().close()
 
@@ -154,7 +154,7 @@ def run_backend(
         if backend.name not in _warmed_up:
             _warmed_up.add(backend.name)
             with suppress(Exception), capture_output(backend.noisy):
-                tiny = impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
+                tiny = build_impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
                 backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
         return {}, ()
     with capture_output(backend.noisy) as printed:

@@ -14,7 +14,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, bound_multipliers, bound_rows, two_sided_rows
+from lavender.external.as_qp import QP, make_bound_rows, make_two_sided_rows, merge_bound_multipliers
 from lavender.external.running import (
     MIN_TOLERANCE,
     Answer,
@@ -36,7 +36,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     import clarabel
 
     first = qp.n_zero + qp.n_nonneg
-    bounds = bound_rows(qp)
+    bounds = make_bound_rows(qp)
     n_bounds = sum(len(at) for *_, at in bounds)
     stacked = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
     rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
@@ -76,7 +76,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     }.get(name, Status.NUMERICAL_ERROR)
     x, z = np.array(result.x), np.array(result.z)
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
-    xi = bound_multipliers(qp, z[first:])
+    xi = merge_bound_multipliers(qp, z[first:])
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     if almost and any(part is not None for part in check_iterate(qp, x, zeta)):
         status = Status.INFEASIBLE  # its own test is stricter than the certificate needs
@@ -91,13 +91,13 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     """Call DAQP: dual active set, dense (Arnström, Bemporad, Axehill 2022)."""
     import daqp
 
-    _, low, high = two_sided_rows(qp, False)
+    _, low, high = make_two_sided_rows(qp, False)
     lb = np.zeros(0) if qp.lb is None else qp.lb
     ub = np.zeros(0) if qp.ub is None else qp.ub
     low, high = (np.clip(np.concatenate(p), -1e30, 1e30) for p in ((lb, low), (ub, high)))
     sense = np.zeros(len(low), np.int32)
     sense[len(lb) : len(lb) + qp.n_zero] = 5
-    x0, _, _ = qp.start(impulse)
+    x0, _, _ = qp.make_start(impulse)
     settings: dict[str, Any] = {
         "iter_limit": limit.max_iter,
         "primal_tol": clamp_tolerance(limit.eps, 1e-11),
@@ -159,7 +159,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     """Call HiGHS: null-space active set (Huangfu, Hall 2018)."""
     import highspy
 
-    rows, low, high = two_sided_rows(qp, False)
+    rows, low, high = make_two_sided_rows(qp, False)
     model = highspy.HighsModel()
     lower = sp.csc_matrix(sp.tril(qp.P))
     model.hessian_.dim_ = qp.n
@@ -237,7 +237,7 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     """Call OSQP: operator splitting with polishing (Stellato et al. 2020)."""
     import osqp
 
-    rows, low, high = two_sided_rows(qp, True)
+    rows, low, high = make_two_sided_rows(qp, True)
     solver = osqp.OSQP(algebra=_get_algebra())
     settings = {
         "eps_abs": limit.eps,
@@ -267,7 +267,7 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
         message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
         return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {message}")
-    x, zeta, xi = qp.start(impulse)
+    x, zeta, xi = qp.make_start(impulse)
     solver.warm_start(x=x, y=np.concatenate([zeta, xi])[: len(low)])
     with _OSQP_LOCK:
         result = solver.solve(raise_error=False)
@@ -302,7 +302,7 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     """Call QPALM: proximal augmented Lagrangian, semismooth Newton (Hermans, Themelis, Patrinos 2022)."""
     import qpalm
 
-    rows, low, high = two_sided_rows(qp, True)
+    rows, low, high = make_two_sided_rows(qp, True)
     data = qpalm.Data(qp.n, len(low))
     data.Q, data.q = qp.P, qp.q
     if len(low):
@@ -317,7 +317,7 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         settings.time_limit = limit.time_limit
     set_options(settings, extra, "qpalm")
     solver = qpalm.Solver(data, settings)
-    x, zeta, xi = qp.start(impulse)
+    x, zeta, xi = qp.make_start(impulse)
     solver.warm_start(x, np.concatenate([zeta, xi])[: len(low)])
     solver.solve()
     name = str(solver.info.status)

@@ -12,18 +12,24 @@ from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerics
-from lavender.external.as_qp import QP, choose_form, impulse_form, program_form, velocity_form
+from lavender.external.as_qp import (
+    QP,
+    build_impulse_form,
+    build_program_form,
+    build_velocity_form,
+    choose_form,
+)
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import call_until_accepted
 from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, summed
+from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 
-MAX_DENSE_SIZE = 2**30  # bytes. A backend for dense matrices rejects a problem with a larger matrix.
-FORM_TIME = 1e-3  # s. Forming any program takes up to this, 1.5 times the measured time.
-FORM_TIME_PER_ENTRY = 1.2e-7  # s. Additional time for each entry of A, 1.5 times the measured time.
+MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
+FORM_TIME = 1e-3  # [s] Forming any program takes up to this, 1.5 times the measured time.
+FORM_TIME_PER_ENTRY = 1.2e-7  # [s] Additional time for each entry of A, 1.5 times the measured time.
 OPTION_HELP = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend; not of programs",
@@ -56,20 +62,20 @@ class QPSolver(Solver):
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:
-        return self._form(problem, True)
+        return self._build_program(problem, True)
 
-    def _form(self, problem: Problem, assume: bool) -> QP:
+    def _build_program(self, problem: Problem, assume: bool) -> QP:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
         b = self.backend
         qp: QP | None = None
         if problem.has_singular_program:
-            qp = program_form(problem, assume=assume)
+            qp = build_program_form(problem, assume=assume)
         elif choose_form(problem, self.form, b.definite) == "velocity":
-            qp = velocity_form(problem, assume=assume)
+            qp = build_velocity_form(problem, assume=assume)
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
             qp = None
         if qp is None:
-            qp = impulse_form(
+            qp = build_impulse_form(
                 problem,
                 unit_diagonal=self.unit_diagonal,
                 equality=b.linear == "equality" and problem.cones.is_free,
@@ -110,12 +116,12 @@ class QPSolver(Solver):
         if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
             first_claim, impulse[:] = claim, start
             remaining = max(1, max_iter - first_claim.iterations)
-            qp = self._form(qp.problem, False)
+            qp = self._build_program(qp.problem, False)
             call = isolated or b.run
             claim = call_until_accepted(
                 qp, impulse, call, remaining, tol, deadline.remaining(), self.settings, b.noisy
             )
-            work = summed((first_claim.work, claim.work))
+            work = sum_work((first_claim.work, claim.work))
             claim = replace(claim, work=work, iterations=first_claim.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
@@ -139,7 +145,7 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
     return bool(np.any(error[qp.assumed] != 0.0))
 
 
-def refusal(problem: Problem) -> str | None:
+def explain_refusal(problem: Problem) -> str | None:
     """Return why no QP backend accepts this problem, before any conversion; a factorisation finds other causes."""
     if problem.has_singular_program:
         return None

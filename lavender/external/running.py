@@ -17,10 +17,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.external.as_qp import QP, residual_target
+from lavender.external.as_qp import QP, compute_backend_tolerance
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, summed
+from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
 
@@ -104,7 +104,7 @@ def check_iterate(
 
     Some backends return a certificate as their iterate.
     """
-    y = qp.direction(x, zeta)
+    y = qp.recover_certificate(x, zeta)
     return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
@@ -144,11 +144,11 @@ def call_until_accepted(
     """Run the backend until the judge accepts its iterate, and write the best iterate to `impulse`.
 
     The stopping tests of backends differ from the judge's. If a backend claims convergence and the judge's residual is
-    above `tol`, it is called again with 100 times smaller tolerances, at most three times in all. The answer with the
-    smallest residual and its claim are returned, unless a later call proves that there is no solution. If no call
+    above `tol`, it is called again with 100 times smaller tolerances, up to three times in all. The answer with the
+    smallest residual and its claim are returned, unless a later call proves that no solution exists. If no call
     returns an iterate, `impulse` is the start point.
 
-    An interior-point method leaves an error sqrt(x w) on a row whose impulse and slack both vanish, so the tolerance of
+    An interior-point method leaves an error sqrt(x w) on a row with vanishing impulse and slack, so the tolerance of
     its gap decreases towards eps^2.
 
     Parameters
@@ -177,7 +177,7 @@ def call_until_accepted(
     limits = _make_limits(problem, tol, max_iter, time_limit)
     while limits:
         last = _call_once(qp, impulse, call, limits.pop(0), settings, noisy)
-        work = summed((work, last.work))
+        work = sum_work((work, last.work))
         relative, above = compute_relative(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy(), above)
@@ -228,7 +228,7 @@ def call_until_accepted(
 
 def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
     """Return the limits of the first call and of the stricter ones."""
-    eps = max(0.5 * residual_target(problem, tol), MIN_TOLERANCE)
+    eps = max(0.5 * compute_backend_tolerance(problem, tol), MIN_TOLERANCE)
     # Unknowns are near 1, so objectives are between 1 and m, and rounding of their sums often exceeds a gap of 1e-13.
     levels = [
         (eps, 1e-2 * eps, MAX_RELATIVE_GAP),
@@ -257,7 +257,7 @@ def _call_once(
     work = {"backend_calls": 1, **{k: int(v) for k, v in answer.work.items()}}
     certificate = None
     if status is Status.INFEASIBLE:
-        certificate = qp.direction(answer.direction, answer.contradiction)
+        certificate = qp.recover_certificate(answer.direction, answer.contradiction)
     x, zeta = answer.x, answer.zeta
     unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
     xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
@@ -267,12 +267,12 @@ def _call_once(
     dual, lam = None, impulse
     if is_valid:
         assert x is not None
-        lam = qp.impulse(x, np.zeros(0) if zeta is None else zeta, xi)
+        lam = qp.recover_impulse(x, np.zeros(0) if zeta is None else zeta, xi)
         is_valid = bool(np.isfinite(lam).all())
     if is_valid and status is not Status.INFEASIBLE:
         assert x is not None
         impulse[:] = lam
-        dual = qp.multiplier(x, xi)
+        dual = qp.recover_bound_multiplier(x, xi)
     elif status is not Status.INFEASIBLE:
         if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):
             status = Status.NUMERICAL_ERROR
@@ -357,7 +357,7 @@ class _SharedContext:
 
 
 @contextlib.contextmanager
-def _streams_by_thread() -> Iterator[None]:
+def _redirect_streams_by_thread() -> Iterator[None]:
     """Redirect warnings, sys.stdout and sys.stderr of threads that run a backend."""
     with (
         warnings.catch_warnings(),
@@ -378,7 +378,7 @@ def _streams_by_thread() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _descriptors_to_null() -> Iterator[None]:
+def _redirect_descriptors_to_null() -> Iterator[None]:
     """Redirect the file descriptors of standard output and error to the null device."""
     for stream in (sys.__stdout__, sys.__stderr__):
         if stream is not None:
@@ -397,6 +397,6 @@ def _descriptors_to_null() -> Iterator[None]:
 
 
 _redirect_streams, _discard_descriptors = (
-    _SharedContext(_streams_by_thread),
-    _SharedContext(_descriptors_to_null),
+    _SharedContext(_redirect_streams_by_thread),
+    _SharedContext(_redirect_descriptors_to_null),
 )

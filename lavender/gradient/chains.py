@@ -33,16 +33,16 @@ class CoefficientRows:
         self.mu, self.radius = c.mu, c.patch_radius
         self.first = np.where(c.n_tangents > 0, c.ptr[:-1] + 1, -1)
         self.ellipse = c.is_ellipse
-        self.second = np.where(self.ellipse, c.ptr[:-1] + 2, c.apart_rows)
+        self.second = np.where(self.ellipse, c.ptr[:-1] + 2, c.separate_rows)
         self.has_pair = self.ellipse | c.is_box
         self.rolling = c.rolling_rows
         self.m = c.n_rows
 
-    def gather(self, x: FloatArray, rows: Any) -> FloatArray:
+    def select_rows_or_zero(self, x: FloatArray, rows: Any) -> FloatArray:
         """Return x (m,) at the rows (k,), 0 for row -1."""
         return np.where(rows >= 0, x[np.maximum(rows, 0)], 0.0) if len(x) else np.zeros(len(rows))
 
-    def change_of_rows(
+    def compute_row_coefficient_changes(
         self, mu: FloatArray | None, radius: FloatArray | None, rolling: FloatArray | None
     ) -> FloatArray:
         """Compute the change de (m,) of the rows' coefficients caused by changes of the contacts' coefficients."""
@@ -110,7 +110,7 @@ class BodyChain:
         self.columns = (6 * np.maximum(body, 0)[:, :, None] + np.arange(6)).reshape(-1, 12)
         self.is_moving = np.repeat(body >= 0, 6, axis=1)
 
-    def pull_back(self, g: Gradient) -> dict[str, FloatArray]:
+    def convert_to_body_gradients(self, g: Gradient) -> dict[str, FloatArray]:
         """Compute the gradients by every array from those by J and M^-1."""
         derivative, r, columns = self.derivative, self.rows, self.columns
         entries = np.zeros(columns.shape)
@@ -139,7 +139,7 @@ class BodyChain:
         out["inv_inertia"] = 0.5 * (tensor + tensor.transpose(0, 2, 1))
         return out
 
-    def change_of_jacobian(self, changes: dict[str, Any]) -> sp.csr_array | None:
+    def compute_jacobian_change(self, changes: dict[str, Any]) -> sp.csr_array | None:
         """Compute the change of J (m, 6 n) caused by changes of the arrays; None if J does not change."""
         r = self.rows
         if not any(name in changes for name in BODIES[:5]):
@@ -162,7 +162,7 @@ class BodyChain:
             (entries[stored], self.columns[stored], indptr), shape=self.derivative.problem.jacobian.shape
         )
 
-    def apply_change_of_inverse_mass(self, changes: dict[str, Any], force: FloatArray) -> FloatArray:
+    def apply_inverse_mass_change(self, changes: dict[str, Any], force: FloatArray) -> FloatArray:
         """Compute dM^-1 f (6 n,) for forces and torques f (6 n,)."""
         f = force.reshape(-1, 6)
         out = np.zeros(f.shape)

@@ -15,7 +15,7 @@ from lavender.gradient.chains import BodyChain, CoefficientRows
 from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
 from lavender.judge.residuals import residual
-from lavender.judge.states import States, linear_of, states_of
+from lavender.judge.states import States, compute_states, linearise_at
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
@@ -24,7 +24,7 @@ from lavender_ext.derivative.linear import CASES, Linear, wrench
 # Solutions with a larger relative residual (without the part that rounding explains) are not differentiated.
 MAX_ACCEPTED_RESIDUAL = 1e-8
 MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of the largest are rounding.
-MAX_NULL_COSINE = 1e-3  # A right-hand side whose cosine with a null vector of G^T is larger has no solution.
+MAX_NULL_COSINE = 1e-3  # A right-hand side has no solution if its cosine with a null vector of G^T is larger.
 # Blocks within this many estimated errors of another state are reported by `switching`; the estimate is of first order.
 SWITCHING_ERRORS = 10.0
 UNIT_ROUNDOFF = 2.0**-53
@@ -228,7 +228,7 @@ class Derivative:
         """Friction rows of ellipses, and derivatives of z and y by e_j, because D_j^1/2 is proportional to 1 / e_j."""
         rows = np.flatnonzero(np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr)))
         rows = rows[self.problem.cones.friction_rows[rows]]
-        root, e = self._root[rows], self.problem.cones.reach[rows]
+        root, e = self._root[rows], self.problem.cones.friction_coefficient[rows]
         lam, w = self._impulse[rows], self._slack[rows]
         has_friction = e > 0.0
         e = np.where(has_friction, e, 1.0)
@@ -240,7 +240,7 @@ class Derivative:
         return BodyChain(self)
 
     def _solve(self, r: FloatArray, check: bool = False) -> FloatArray:
-        """Solve G x = r on all rows; with `check` raise CapabilityError if there is no solution."""
+        """Solve G x = r on all rows; with `check` raise CapabilityError without a solution."""
         x, rows = r.copy(), self._system_rows
         # On the other rows G is the identity: move their contribution to the right-hand side.
         x[rows] = 0.0
@@ -255,7 +255,8 @@ class Derivative:
         """Return whether G x = rhs has no solution."""
         size = MAX_NULL_COSINE * float(np.linalg.norm(rhs))
         return any(
-            abs(float(q @ rhs)) > size * float(np.linalg.norm(q)) for q in self._system.null_vectors(True)
+            abs(float(q @ rhs)) > size * float(np.linalg.norm(q))
+            for q in self._system.draw_null_vectors(True)
         )
 
     def _check_row_changes(self, message: str) -> None:
@@ -281,11 +282,13 @@ class Derivative:
         cones, rows = self.problem.cones, self._system_rows
         ones = np.ones(cones.n_blocks)
         changes = (ones if name == key else None for key in COEFFICIENT_INPUTS)
-        r = self._apply_coefficient_change(self._coefficient_rows.change_of_rows(*changes))[rows]
+        r = self._apply_coefficient_change(self._coefficient_rows.compute_row_coefficient_changes(*changes))[
+            rows
+        ]
         # Entries of r depend on the coefficient of their own block only.
         block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[rows]
         size = MAX_NULL_COSINE * np.sqrt(np.bincount(block, r * r))
-        for q in self._system.null_vectors(True):
+        for q in self._system.draw_null_vectors(True):
             if (np.abs(np.bincount(block, q * r)) > size * float(np.linalg.norm(q))).any():
                 self._check_row_changes(
                     f"no derivative by {name} of one contact exists here (jvp: of several)"
@@ -390,13 +393,15 @@ class Derivative:
             r += weight * self._root * data.get(name, 0.0)
         coefficients = [data.get(name) for name in COEFFICIENT_INPUTS]
         if any(x is not None for x in coefficients):
-            r += self._apply_coefficient_change(self._coefficient_rows.change_of_rows(*coefficients))
+            r += self._apply_coefficient_change(
+                self._coefficient_rows.compute_row_coefficient_changes(*coefficients)
+            )
         dv: Any = None if p.matrix is not None else np.zeros(self._velocity.shape)
         if "A" in data:
             dw += data["A"] @ self._impulse
         if "compliance" in data:
             dw += data["compliance"] * self._impulse
-        dj = self._body_chain.change_of_jacobian(data) if p.rows is not None else data.get("J")
+        dj = self._body_chain.compute_jacobian_change(data) if p.rows is not None else data.get("J")
         if p.rows is not None and "J" in data:
             dj = data["J"] if dj is None else dj + data["J"]
         momentum = None  # dJ^T lambda - dM v'
@@ -409,7 +414,7 @@ class Derivative:
             dv += self._apply_inverse_mass(momentum)
         if "inv_mass" in data or "inv_inertia" in data:
             force = self._apply_jacobian_transposed(self._impulse)
-            dv += self._body_chain.apply_change_of_inverse_mass(data, force)
+            dv += self._body_chain.apply_inverse_mass_change(data, force)
         if dv is not None and dv.any():
             dw += self._apply_jacobian(dv)
         if "v_free" in data:
@@ -467,11 +472,11 @@ class Derivative:
 
     @cached_property
     def _null_space(self) -> FloatArray:
-        return self._system.null_vectors(False)
+        return self._system.draw_null_vectors(False)
 
     @cached_property
     def unique(self) -> Unique:
-        """Uniqueness of the solution by rows; linearly dependent rows can share a load in many ways."""
+        """Which rows of impulse, slack and target are unique; linearly dependent rows can share a load in many ways."""
         p, m = self.problem, self.problem.m
         impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
         rows = self._system_rows
@@ -483,7 +488,7 @@ class Derivative:
             impulse &= np.abs(x) <= limit
             slack &= slack_change <= limit
             velocity = velocity and bool(slack_change.max() <= limit)
-        for q in self._system.null_vectors(True):
+        for q in self._system.draw_null_vectors(True):
             x = np.zeros(m)
             x[rows] = q
             target &= np.abs(self._linear.times(x, True)) <= MAX_NULL_ENTRY * np.abs(x).max()
@@ -492,7 +497,7 @@ class Derivative:
     @cached_property
     def states(self) -> States:
         """State of each block, as `solution.states`, with a bound of the error that `distance_in_errors` estimates."""
-        return states_of(self.problem, self._impulse, self._linear)
+        return compute_states(self.problem, self._impulse, self._linear)
 
     @cached_property
     def _estimated_error(self) -> FloatArray:
@@ -548,7 +553,7 @@ class Derivative:
     def motions(self) -> Any:
         """The `SolutionSet` of this problem, computed by `lavender.find_solutions` at the first use.
 
-        Under Coulomb's law there may be several. The derivative is that of the given solution; it does not include a
+        Under Coulomb's law there may be several. The derivative belongs to the given solution; it does not include a
         change of the solver's choice.
         """
         return lazy_module("lavender.lab.motion").get_solutions(self.problem.disk)
@@ -607,7 +612,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     """
     check_problem(problem)
     impulse = problem.impulse_array(getattr(solution, "impulse", solution))
-    linear = linear_of(problem, impulse, MAX_KERNEL_ROWS)
+    linear = linearise_at(problem, impulse, MAX_KERNEL_ROWS)
     if not linear.above_floor <= MAX_ACCEPTED_RESIDUAL:
         error = residual(problem, impulse, "float64")
         if not (error.nothing_to_do and error.rounds):

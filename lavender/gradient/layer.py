@@ -45,7 +45,7 @@ class Step:
     solver: str
     tol: float
 
-    def problems(self, arrays: Sequence[FloatArray]) -> Iterator[Problem]:
+    def iterate_problems(self, arrays: Sequence[FloatArray]) -> Iterator[Problem]:
         """Yield the problem of each member of the batch, in C order."""
         is_contact = self.cones.is_contact
         for jac, mass, free, mu, target, compliance in zip(*arrays, strict=True):
@@ -61,7 +61,7 @@ class Step:
     def forward(self, *arrays: Any) -> tuple[FloatArray, FloatArray]:
         """Compute velocities (..., nv) and impulses (..., m)."""
         flat, batch = _flatten_batch(arrays)
-        problems = list(self.problems(flat))
+        problems = list(self.iterate_problems(flat))
         solutions = [s.raise_for_status() for s in solve_many(problems, self.solver, tol=self.tol)]
         impulse = np.array([s.impulse for s in solutions]).reshape(*batch, self.cones.n_rows)
         velocity = [p.velocity(s.impulse) for p, s in zip(problems, solutions, strict=True)]
@@ -84,7 +84,7 @@ class Step:
             np.broadcast_to(x, (*batch, x.shape[-1])).reshape(prod(batch), x.shape[-1])
             for x in arrays[len(arguments) :]
         ]
-        problems, (impulses, y, c) = list(self.problems(flat)), others
+        problems, (impulses, y, c) = list(self.iterate_problems(flat)), others
         for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
             for out, name, is_needed, like in zip(gradients, ARGUMENTS, needed, flat, strict=True):
                 if not is_needed:
@@ -118,7 +118,7 @@ def _sum_to_shape(x: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     return x.sum(axis=ones, keepdims=True) if ones else x
 
 
-def result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the shapes of velocities and impulses; raise InputError if the shapes of the arguments disagree."""
     shapes = [tuple(x.shape) for x in arrays]
     for name, shape, n in zip(ARGUMENTS, shapes, ARGUMENT_AXES, strict=True):

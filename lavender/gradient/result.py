@@ -52,7 +52,7 @@ class _Input:
         if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
             derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
         if self.compute is None:
-            gradient.__dict__.update(derivative._body_chain.pull_back(gradient))
+            gradient.__dict__.update(derivative._body_chain.convert_to_body_gradients(gradient))
             return gradient.__dict__[name]
         value = gradient.__dict__[name] = self.compute(gradient)
         return value
@@ -176,21 +176,23 @@ class Gradient:
 
     def _by_mu(self) -> FloatArray:
         rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
-        return rows.gather(gradient, rows.first) + rows.radius * rows.gather(gradient, rows.second)
+        return rows.select_rows_or_zero(gradient, rows.first) + rows.radius * rows.select_rows_or_zero(
+            gradient, rows.second
+        )
 
     def _by_coefficients(self) -> FloatArray:
         rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
-        second = np.where(rows.has_pair, rows.gather(gradient, rows.second), 0.0)
-        first = np.where(rows.has_pair, rows.gather(gradient, rows.first), self.mu)
+        second = np.where(rows.has_pair, rows.select_rows_or_zero(gradient, rows.second), 0.0)
+        first = np.where(rows.has_pair, rows.select_rows_or_zero(gradient, rows.first), self.mu)
         return np.stack([first, second], axis=1)
 
     def _by_patch_radius(self) -> FloatArray:
         rows = self._derivative._coefficient_rows
-        return rows.mu * rows.gather(self._by_row_coefficient, rows.second)
+        return rows.mu * rows.select_rows_or_zero(self._by_row_coefficient, rows.second)
 
     def _by_rolling(self) -> FloatArray:
         rows = self._derivative._coefficient_rows
-        return rows.gather(self._by_row_coefficient, rows.rolling)
+        return rows.select_rows_or_zero(self._by_row_coefficient, rows.rolling)
 
     def _by_compliance(self) -> FloatArray:
         return -self._s * self._derivative._impulse

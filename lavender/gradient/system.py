@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.factors import USE_WIDE_LANES
 from lavender.solvers.newton_systems.systems import is_dense_faster
@@ -19,9 +19,10 @@ from lavender_ext.factor.sparse import SparsePanels, free_part
 
 MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
 SHIFT_OF_SINGULAR = 1e-11  # eps of (6), relative to the diagonal
-# Steps of (6). Components whose pivot is 1e-11 of the diagonal then have an error of 2^-8, with 1e-9 an error of 1e-16.
+# Steps of (6). Components with a pivot of 1e-11 of the diagonal then have an error of 2^-8, with 1e-9 an error of
+# 1e-16.
 MAX_PROXIMAL_STEPS = 8
-MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by at most this fraction of its largest entry.
+MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by up to this fraction of its largest entry.
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
 MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
 # Systems of up to this many rows are also dense if A is not symmetric and sparse, or if a contact slides.
@@ -105,7 +106,7 @@ class System:
     def _factor_lu(self, shift: float) -> Solve | None:
         """Factor G + shift P by SuperLU; None if it is singular."""
         try:
-            lu = sparse_lu(self._form_matrix(shift))
+            lu = factor_sparse_lu(self._form_matrix(shift))
         except RuntimeError:
             return None
         pivots = np.abs(lu.U.diagonal())
@@ -125,7 +126,7 @@ class System:
                     break
         return x
 
-    def null_vectors(self, transpose: bool) -> FloatArray:
+    def draw_null_vectors(self, transpose: bool) -> FloatArray:
         """Return random unit vectors (NULL_VECTORS, n) in the null space of G or G^T; none if G is regular."""
         if not self.singular:
             return np.zeros((0, self.n))

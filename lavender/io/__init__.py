@@ -9,7 +9,7 @@
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
 from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
 `from_kamino`, `from_newton_mujoco` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo
-simulation to a folder, `Recorder` those of any loop.
+simulation to a folder, `Recorder` writes problems from any loop.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lavender.io.newton_mujoco import from_newton_mujoco
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
-from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, first_bytes
+from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, read_first_bytes
 from lavender.problem import Problem
 
 __all__ = [
@@ -83,7 +83,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     InputError
         The file does not exist, is truncated, inconsistent or of another format; or h5py is needed and not installed.
     """
-    start = first_bytes(path)
+    start = read_first_bytes(path)
     if start[:2] == b"PK":
         return npz.read(path, max_bytes=max_bytes)
     if start == b"\x89HDF\r\n\x1a\n":

@@ -1,4 +1,4 @@
-"""Condense A = J M^-1 J^T for a file whose M is not a mass matrix; sizes are bounded before any allocation."""
+"""Condense A = J M^-1 J^T of a file in which M is not a mass matrix; sizes are bounded before any allocation."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.io.stored import Budget
 
 DENSE_CHUNK_NUMBERS = 2**23  # Numbers of M^-1 J^T or of A that are stored densely at a time: 64 MiB.
 SPARSE_ENTRY_BYTES = 16  # Bytes of one entry of a sparse matrix: value and index.
 
 
-def condense(
+def form_dense_a(
     mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, budget: Budget
 ) -> tuple[sp.csr_array, FloatArray]:
     """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,).
@@ -27,7 +27,7 @@ def condense(
         M is singular, or the matrices may need more memory than the budget allows.
     """
     label = sp.csgraph.connected_components(mass, directed=False)[1]
-    budget.spend(SPARSE_ENTRY_BYTES * max_condensed_entries(label, jt), "A = H^T M^-1 H")
+    budget.reserve_bytes(SPARSE_ENTRY_BYTES * max_condensed_entries(label, jt), "A = H^T M^-1 H")
     solve = _factor(mass, label, budget)
     m = jt.shape[1]
     step = max(1, DENSE_CHUNK_NUMBERS // max(1, *jt.shape))
@@ -55,24 +55,24 @@ def max_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
 
 
 def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function y -> M^-1 y that uses LU factors whose size is bounded in advance.
+    """Return a function y -> M^-1 y that uses LU factors of a size that is bounded in advance.
 
-    The factors of a component of n unknowns have at most n^2 entries. If that exceeds the budget, the unknowns are
+    The factors of a component of n unknowns have up to n^2 entries. If that exceeds the budget, the unknowns are
     ordered for a small bandwidth: with l diagonals below and u above the main diagonal, L and U with row exchanges
-    have at most n (2 l + u + 1) entries.
+    have up to n (2 l + u + 1) entries.
     """
     n = matrix.shape[0]
     size = np.bincount(label).astype(float)
     dense = SPARSE_ENTRY_BYTES * int(size @ size)
     try:
         if dense <= budget.remaining:
-            return sparse_lu(matrix).solve
+            return factor_sparse_lu(matrix).solve
         order = sp.csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
         permuted = sp.coo_array(matrix[order][:, order])
         offset = permuted.row.astype(np.int64) - permuted.col
         width = 2 * int(offset.max(initial=0)) - int(offset.min(initial=0)) + 1
-        budget.spend(SPARSE_ENTRY_BYTES * n * min(width, n), "the factors of M")
-        factor = sparse_lu(permuted, permc_spec="NATURAL")
+        budget.reserve_bytes(SPARSE_ENTRY_BYTES * n * min(width, n), "the factors of M")
+        factor = factor_sparse_lu(permuted, permc_spec="NATURAL")
     except RuntimeError as error:
         raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
     inverse_order = np.argsort(order)

@@ -26,7 +26,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.pinocchio import closing_speed, wrap_engine_errors
+from lavender.io.pinocchio import compute_target_velocity, wrap_engine_errors
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
@@ -120,14 +120,14 @@ def _build_problem(
             f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); joints, "
             "contacts at points and joint limits are known here"
         )
-    _refuse_locked(plant, context)
-    dynamics, v_free = free_motion(plant, context, dt)
-    contacts = _contacts(plant, context)
-    limits = _limits(plant, context)
+    _check_no_locked_joints(plant, context)
+    dynamics, v_free = compute_free_motion(plant, context, dt)
+    contacts = _read_contacts(plant, context)
+    limits = _read_joint_limits(plant, context)
     nv = int(plant.num_velocities())
     jac = np.concatenate([np.zeros((0, nv)), *(c.jac for c in contacts), *(x.jac for x in limits)])
-    gaps = [closing_speed(np.array([-c.depth, 0.0, 0.0]), dt, correction) for c in contacts]
-    gaps += [closing_speed(np.array([x.gap]), dt, correction) for x in limits]
+    gaps = [compute_target_velocity(np.array([-c.depth, 0.0, 0.0]), dt, correction) for c in contacts]
+    gaps += [compute_target_velocity(np.array([x.gap]), dt, correction) for x in limits]
     cones = Cones.contacts(np.array([c.mu for c in contacts])) if contacts else Cones.free(0)
     if limits:
         cones = cones + Cones.bounded(np.zeros(len(limits)), np.full(len(limits), np.inf))
@@ -148,7 +148,7 @@ def _build_problem(
     return problem, impulses
 
 
-def _refuse_locked(plant: Any, context: Any) -> None:
+def _check_no_locked_joints(plant: Any, context: Any) -> None:
     """Raise CapabilityError for locked joints.
 
     Drake removes their velocities from its step, and the process is killed by a signal if they carry contacts.
@@ -206,7 +206,7 @@ class _Limit:
     sign: float
 
 
-def free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
+def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
     """Return A (nv, nv) and v* (nv,) of SAP's discretisation (see the module).
 
     Raises
@@ -254,7 +254,7 @@ def free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatA
     return dynamics, np.array(plant.GetVelocities(context)) + dt * np.linalg.solve(dynamics, force)
 
 
-def _contacts(plant: Any, context: Any) -> list[_Contact]:
+def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
     """Return the point contacts of the plant; raise CapabilityError for sampled ports or hydroelastic contacts."""
     from pydrake.multibody.tree import JacobianWrtVariable
 
@@ -279,7 +279,7 @@ def _contacts(plant: Any, context: Any) -> list[_Contact]:
         pair = info.point_pair()
         bodies = [plant.get_body(x) for x in (info.bodyA_index(), info.bodyB_index())]
         normal = -np.array(pair.nhat_BA_W)
-        axes = np.stack([normal, *_tangents(normal)])
+        axes = np.stack([normal, *_make_tangents(normal)])
         jac = [
             plant.CalcJacobianTranslationalVelocity(
                 context, JacobianWrtVariable.kV, body.body_frame(),
@@ -303,7 +303,7 @@ def _contacts(plant: Any, context: Any) -> list[_Contact]:
     return contacts
 
 
-def _tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _make_tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return two unit vectors (3,) orthogonal to the unit vector `normal` and to each other."""
     axis = np.zeros(3)
     axis[int(np.argmin(np.abs(normal)))] = 1.0
@@ -312,7 +312,7 @@ def _tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     return first_axis, np.cross(normal, first_axis)
 
 
-def _limits(plant: Any, context: Any) -> list[_Limit]:
+def _read_joint_limits(plant: Any, context: Any) -> list[_Limit]:
     """Return the finite limits of joints with one velocity, the only ones that SAP supports."""
     from pydrake.multibody.tree import JointIndex
 
@@ -373,6 +373,6 @@ def _complete_impulses(
         worst = int(np.argmax(weight * np.abs(momentum_error)))
         raise CapabilityError(
             f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {momentum_error[worst]:.3g} of "
-            f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; something acts "
-            "on the plant that is not known here"
+            f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; a force "
+            "acts on the plant that this import does not read"
         )

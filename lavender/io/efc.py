@@ -21,19 +21,19 @@ import numpy as np
 from lavender.base.arrays import (
     FloatArray,
     as_array,
-    as_floats,
+    as_float_array,
     check_choice,
     check_float,
     check_int,
-    precision_of,
-    shape_of,
+    get_common_precision,
+    get_shape,
 )
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import run_on_threads
-from lavender.batch.data import ERRORS, Batch, check_counts, check_triangle
+from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
 from lavender.problem import FRICTION_LAWS
-from lavender.problem.cones import Cones, kinds_of
+from lavender.problem.cones import Cones, get_kinds
 from lavender_ext.judge.measure import all_finite
 
 # Values of mjtConstraint: an equality, friction loss of a joint and of a tendon, an elliptic contact (the largest
@@ -129,9 +129,9 @@ def from_efc(
         contact with torsional or rolling friction, or with different coefficients of its tangents.
     """
     friction = check_choice("friction", friction, FRICTION_LAWS)
-    jac, before = as_floats("efc_J", efc_J), as_floats("qvel", qvel)
+    jac, before = as_float_array("efc_J", efc_J), as_float_array("qvel", qvel)
     # MJX and Warp store the time step as an array of one number.
-    is_one = np.prod(shape_of("timestep", timestep)) == 1
+    is_one = np.prod(get_shape("timestep", timestep)) == 1
     dt = check_float("timestep", np.asarray(timestep).item() if is_one else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
@@ -140,10 +140,10 @@ def from_efc(
     target = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
     smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
     row_type, loss = (
-        _per_row("efc_type", efc_type, n, m),
-        _per_row("efc_frictionloss", efc_frictionloss, n, m),
+        _broadcast_to_rows("efc_type", efc_type, n, m),
+        _broadcast_to_rows("efc_frictionloss", efc_frictionloss, n, m),
     )
-    count = np.full(n, m) if nefc is None else check_counts("nefc", nefc, n, m)
+    count = np.full(n, m) if nefc is None else check_row_counts("nefc", nefc, n, m)
     used_rows = np.arange(m) < count[:, None]
     _check_rows(
         "efc_type",
@@ -156,8 +156,8 @@ def from_efc(
     _check_rows(
         "efc_frictionloss", loss, has_loss & ~((loss >= 0.0) & (loss < np.inf)), "a finite number from 0"
     )
-    mass = _mass(M, n, nv)
-    precision = precision_of(jac, mass, before)
+    mass = _convert_mass(M, n, nv)
+    precision = get_common_precision(jac, mass, before)
     before = as_array("qvel", before, (n, nv), finite=False)
     if qfrc_smooth is not None:
         _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False), precision)
@@ -166,7 +166,7 @@ def from_efc(
     for i in range(0, n, step):
         target[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
     compliance = np.where(used_rows, 1.0 / inv_compliance, 0.0)
-    cones, scale = _blocks(row_type, loss, used_rows, contacts, dt)
+    cones, scale = _make_blocks(row_type, loss, used_rows, contacts, dt)
     if friction == "coulomb" and (scale is not None or cones.has_round):
         raise CapabilityError(
             "friction='coulomb' is for contacts of three rows with one coefficient; a contact with torsional or "
@@ -194,13 +194,13 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         Its options (solver, tolerance, iterations, jacobian, ...) determine the answers.
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
         The result of `mj_getState`. MuJoCo's answer depends on its warm start and its controls, which only
-        mjSTATE_INTEGRATION contains; without them the answer is the one of a start at zero, whose errors differ.
+        mjSTATE_INTEGRATION contains; without them the answer is the one of a start at zero, which has other errors.
         A row of qpos and qvel is accepted, too.
     threads : int
         Number of threads; the results do not depend on it.
     errors : {"raise", "status"}
-        Treatment of a state that is not finite: raise an error, or convert it to a world without rows whose v_free is
-        NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with errors="status".
+        Treatment of a state that is not finite: raise an error, or convert it to a world without rows and with a v_free
+        of NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with errors="status".
 
     Returns
     -------
@@ -282,7 +282,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         ints = np.concatenate(
             [*(x[own_rows] for x in row_arrays), *(x[own_contacts].ravel() for x in contact_arrays)]
         )
-        return single._block_names(mj, model, ints, int(ptr[i + 1] - ptr[i]), 1)
+        return single._make_block_names(mj, model, ints, int(ptr[i + 1] - ptr[i]), 1)
 
     imported.batch.names_of = block_names
     world = np.repeat(np.arange(n), np.diff(contact_ptr))
@@ -345,7 +345,7 @@ def _import_states(
         address = contact["efc_address"]
         address = np.where(address < 0, -1, address + np.repeat(ptr[:-1], np.diff(contact_ptr)))
         contacts = (np.zeros(len(address), int), address, contact["dim"], contact["friction"])
-    cones, scale = _blocks(
+    cones, scale = _make_blocks(
         row_type[None], rows["efc_frictionloss"][None], np.ones((1, len(row_type)), bool), contacts, dt
     )
     target = dt * rows["efc_aref"] + rows["efc_vel"]
@@ -367,9 +367,9 @@ def _import_states(
     return Imported(batch, lam)
 
 
-def _per_row(name: str, values: Any, n: int, m: int) -> FloatArray:
+def _broadcast_to_rows(name: str, values: Any, n: int, m: int) -> FloatArray:
     """Return the numbers of all rows (n, m), given as (n, m), (m,) or one number."""
-    if len(shape_of(name, values)) == 2:
+    if len(get_shape(name, values)) == 2:
         return as_array(name, values, (n, m), finite=False)
     return np.broadcast_to(as_array(name, values, (m,), finite=False), (n, m))
 
@@ -384,10 +384,10 @@ def _check_rows(name: str, numbers: FloatArray, wrong: Any, needed: str) -> None
         )
 
 
-def _mass(values: Any, n: int, nv: int) -> Any:
+def _convert_mass(values: Any, n: int, nv: int) -> Any:
     """Return M (n, nv, nv), given as full matrices or as lower triangles in compressed rows."""
     values, *pattern = values if isinstance(values, tuple) and values else (values,)
-    values = as_floats("M", values)
+    values = as_float_array("M", values)
     if not pattern:
         if values.ndim == 2:
             values = np.broadcast_to(values, (n, *values.shape))
@@ -396,7 +396,7 @@ def _mass(values: Any, n: int, nv: int) -> Any:
         return values
     if values.ndim != 2 or len(values) != n:
         raise InputError(f"values of M have shape {values.shape}; ({n}, entries) is needed")
-    ptr, col = check_triangle(pattern, np.full(n, nv), values)
+    ptr, col = check_shared_lower_triangles(pattern, np.full(n, nv), values)
     row, full = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
     full[:, row, col] = values
     full[:, col, row] = values
@@ -416,7 +416,7 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
         )
 
 
-def _elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
+def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     """Return world, first row, rows and coefficients of each contact that begins at a row of `elliptic` (n, m).
 
     Raises
@@ -427,7 +427,7 @@ def _elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     if not isinstance(contacts, (tuple, list)) or len(contacts) != 4:
         raise InputError(f"contacts is {contacts!r:.60}; (world, efc_address, dim, friction) is needed")
     names = [f"{name} of contacts" for name in ("world", "efc_address", "dim")]
-    size = (shape_of(names[0], contacts[0]) or (None,))[0]
+    size = (get_shape(names[0], contacts[0]) or (None,))[0]
     world, address, dim = (
         as_array(name, x, (size,), dtype=np.int32) for name, x in zip(names, contacts, strict=False)
     )
@@ -463,7 +463,7 @@ def _elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     return world, address, dim, rub
 
 
-def _blocks(
+def _make_blocks(
     row_type: Any, loss: Any, used_rows: Any, contacts: Any, dt: float
 ) -> tuple[Cones, FloatArray | None]:
     """Return the blocks of all used rows, world after world, and the factor of each row (n, m) or None if all are 1."""
@@ -474,7 +474,7 @@ def _blocks(
     if elliptic.any() and contacts is None:
         raise InputError("efc_type has rows of elliptic contacts; contacts= is needed, with their friction")
     if contacts is not None:
-        world, address, dim, rub = _elliptic_contacts(contacts, elliptic)
+        world, address, dim, rub = _find_elliptic_contacts(contacts, elliptic)
         tangents[world, address], mu[world, address] = dim - 1, rub[:, 0]
         factor = np.ones((n, m))
         for j in range(1, int(np.max(dim, initial=1))):
@@ -491,7 +491,7 @@ def _blocks(
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
     tangents = tangents[used_rows][first]
-    kinds = kinds_of(tangents > 0, tangents=tangents)
+    kinds = get_kinds(tangents > 0, tangents=tangents)
     return Cones(
         ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[used_rows][first], patch_radius=none
     ), scale

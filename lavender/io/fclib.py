@@ -23,8 +23,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_choice
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.condensed import SPARSE_ENTRY_BYTES, condense
-from lavender.io.npz import checked_csr
+from lavender.io.condensed import SPARSE_ENTRY_BYTES, form_dense_a
+from lavender.io.npz import build_checked_csr
 from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, write_bytes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -39,7 +39,7 @@ PARTS = {
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
 BOUNDS_ROW_BYTES = 64  # Bytes per row in `Cones` and b.
-MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A single number whose chunk holds more numbers than this is rejected.
+MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A single number in a chunk of more numbers than this is rejected.
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +102,11 @@ class Contents:
         return "local" if self.W is not None else "global"
 
     @property
-    def group(self) -> str:
+    def group_name(self) -> str:
         """Name of the problem's group in the file."""
         return (LOCAL if self.form == "local" else GLOBAL) + ("" if self.mu_r is None else ROLLING)
 
-    def problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
+    def build_problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
         """Return the problem.
 
         A global problem is returned in generalised coordinates (J = H^T); it is condensed if M is not a mass matrix.
@@ -116,11 +116,15 @@ class Contents:
         InputError
             M is singular, array sizes do not agree, or A may need more than `max_bytes`.
         """
-        general = self._general(max_bytes) if self.form == "global" else None
+        general = self._build_generalised_form(max_bytes) if self.form == "global" else None
         if general is not None:
             a, b = None, general.bias(-self._offset())
         else:
-            a, b = self._local() if self.form == "local" else self._condensed(Budget(max_bytes))
+            a, b = (
+                self._build_local_form()
+                if self.form == "local"
+                else self._build_condensed_form(Budget(max_bytes))
+            )
         c, d = len(self.mu), self.spacedim
         tangents = d - 1 if self.mu_r is None else 2
         cones = Cones.contacts(self.mu, tangents, rolling=self.mu_r) + Cones.free(len(b) - c * d)
@@ -128,7 +132,7 @@ class Contents:
         name = self.info.get("title", "") or name
         return Problem(b, cones, a, guess=guess, name=name, generalized=general)
 
-    def _local(self) -> tuple[sp.csr_array, FloatArray]:
+    def _build_local_form(self) -> tuple[sp.csr_array, FloatArray]:
         """Return A (m + p, m + p) and b (m + p,) of the local form."""
         assert self.q is not None
         if self.V is None or self.s is None:
@@ -144,7 +148,7 @@ class Contents:
         assert self.w is not None
         return self.w if self.b is None else np.concatenate([self.w, self.b])
 
-    def _general(self, max_bytes: int) -> Generalized | None:
+    def _build_generalised_form(self, max_bytes: int) -> Generalized | None:
         """Return the generalised form, or None if M is not a mass matrix of bodies.
 
         M is not one if it is asymmetric or not definite, or if a connected component is too large to factor.
@@ -162,23 +166,23 @@ class Contents:
         except InputError:
             return None
 
-    def _condensed(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
+    def _build_condensed_form(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
         """Return A and b of the global form with J = [H G]^T, which contains the contact rows and the equations."""
         assert self.M is not None
         jt, offset = self._columns(), self._offset()
         if self.M.shape[0] == 0:
             return sp.csr_array((len(offset), len(offset))), -offset
-        a, free_velocity = condense(self.M, jt, np.asarray(self.f), budget)
+        a, free_velocity = form_dense_a(self.M, jt, np.asarray(self.f), budget)
         return a, -(offset + free_velocity)
 
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
-    def impulse(self) -> FloatArray | None:
+    def get_stored_impulse(self) -> FloatArray | None:
         """Return the stored solution (m + p,) [N s], or None."""
         return self._impulse(self.solution) if "r" in self.solution else None
 
-    def slack(self) -> FloatArray | None:
+    def get_stored_slack(self) -> FloatArray | None:
         """Return the stored u (m + p,) [m/s], zero on equations, or None."""
         if "u" not in self.solution:
             return None
@@ -201,15 +205,15 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     """
     file = read_contents(path, max_bytes=max_bytes)
     try:
-        problem = file.problem(Path(path).stem, max_bytes=max_bytes)
+        problem = file.build_problem(Path(path).stem, max_bytes=max_bytes)
         guesses = tuple(problem.impulse_array(file._impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return Stored(
         problem,
-        file.group,
-        impulse=file.impulse(),
-        slack=file.slack(),
+        file.group_name,
+        impulse=file.get_stored_impulse(),
+        slack=file.get_stored_slack(),
         compare=file.compare,
         guesses=guesses,
         info=file.info,
@@ -236,7 +240,7 @@ class _Reader:
     def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
         self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
 
-    def node(self, path: str) -> Any:
+    def find_node(self, path: str) -> Any:
         """Return the group or dataset at a path, or None."""
         node = self.file
         for part in path.split("/"):
@@ -256,21 +260,21 @@ class _Reader:
             raise InputError(f"{path}: numbers are cut off; their chunk is shorter than its checksum")
         return node
 
-    def has(self, path: str) -> bool:
+    def has_path(self, path: str) -> bool:
         """Return whether the path exists."""
-        return self.node(path) is not None
+        return self.find_node(path) is not None
 
-    def spend(self, paths: Iterable[str]) -> None:
+    def reserve_memory(self, paths: Iterable[str]) -> None:
         """Subtract the memory that these datasets need, if they exist, from the budget."""
         for path in paths:
-            data = self.node(path)
+            data = self.find_node(path)
             if isinstance(data, self.h5py.Dataset) and data.shape is not None:
-                chunk = _chunk(data) * data.dtype.itemsize
-                self.budget.spend(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
+                chunk = _get_chunk_length(data) * data.dtype.itemsize
+                self.budget.reserve_bytes(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
 
-    def dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
+    def find_dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
         """Return a dataset of `count` numbers (None: any number) without reading it."""
-        data = self.node(path)
+        data = self.find_node(path)
         if not isinstance(data, self.h5py.Dataset):
             raise InputError(f"{path} is missing or not a dataset")
         if data.is_virtual or data.external:
@@ -282,66 +286,70 @@ class _Reader:
             raise InputError(f"{path} has {data.size} entries; {count} are needed")
         return data
 
-    def array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
+    def read_array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
         """Read a dataset as a flat array of `count` numbers (None: any number)."""
-        return np.asarray(self.dataset(path, kinds, count)[()]).reshape(-1)
+        return np.asarray(self.find_dataset(path, kinds, count)[()]).reshape(-1)
 
-    def integer(self, path: str) -> int:
+    def read_integer(self, path: str) -> int:
         """Read a single 32-bit integer."""
-        data = self.dataset(path, "iu", 1)
-        if _chunk(data) > MAX_SCALAR_CHUNK_NUMBERS:
-            raise InputError(f"{path} is one number in a chunk of {_chunk(data)}")
+        data = self.find_dataset(path, "iu", 1)
+        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
+            raise InputError(f"{path} is one number in a chunk of {_get_chunk_length(data)}")
         value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
             raise InputError(f"{path} is {value}, beyond 32 bits")
         return value
 
-    def vector(self, path: str, count: int) -> FloatArray:
+    def read_vector(self, path: str, count: int) -> FloatArray:
         """Read `count` finite numbers as float64."""
-        return as_array(path, self.array(path, "iuf", count), (count,))
+        return as_array(path, self.read_array(path, "iuf", count), (count,))
 
-    def text(self, path: str) -> str:
+    def read_text(self, path: str) -> str:
         """Read a text; return an empty one if the dataset does not exist or is not a short single text."""
-        data = self.node(path)
+        data = self.find_node(path)
         if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
             return ""
-        if _chunk(data) > MAX_SCALAR_CHUNK_NUMBERS:
+        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
             return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
         return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
 
-    def shape(self, path: str) -> tuple[int, int]:
+    def read_matrix_shape(self, path: str) -> tuple[int, int]:
         """Return the numbers of rows and columns that a matrix declares."""
-        m, n = (self.integer(f"{path}/{name}") for name in ("m", "n"))
+        m, n = (self.read_integer(f"{path}/{name}") for name in ("m", "n"))
         if min(m, n) < 0:
             raise InputError(f"{path}: m {m}, n {n}; sizes are not negative")
         return m, n
 
-    def matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
+    def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
         """nz = -2 compressed rows, -1 compressed columns, >= 0 triplets (p columns, i rows)."""
-        (m, n), nz, nzmax = self.shape(path), self.integer(f"{path}/nz"), self.integer(f"{path}/nzmax")
+        (m, n), nz, nzmax = (
+            self.read_matrix_shape(path),
+            self.read_integer(f"{path}/nz"),
+            self.read_integer(f"{path}/nzmax"),
+        )
         if nzmax < 0 or nz < -2 or nz > nzmax:
             raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz is -2, -1 or 0 to nzmax")
         if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
             raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
-        x = as_array(f"{path}/x", self.array(f"{path}/x", "iuf"), (None,), finite=False)
-        i, p = self.array(f"{path}/i", "iu"), self.array(f"{path}/p", "iu")
+        x = as_array(f"{path}/x", self.read_array(f"{path}/x", "iuf"), (None,), finite=False)
+        i, p = self.read_array(f"{path}/i", "iu"), self.read_array(f"{path}/p", "iu")
         try:
             if nz == -2:
-                a = checked_csr(p, i, x, m, n)
+                a = build_checked_csr(p, i, x, m, n)
             elif nz == -1:
-                a = sp.csr_array(checked_csr(p, i, x, n, m).T)
+                a = sp.csr_array(build_checked_csr(p, i, x, n, m).T)
             else:
-                a = _triplets(p, i, x, nz, m, n)
+                a = _build_from_triplets(p, i, x, nz, m, n)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         as_array(f"{path}/x", a.data, (None,), copy=False)
         return a
 
 
-def _chunk(data: Any) -> int:
+def _get_chunk_length(data: Any) -> int:
     """Return how many numbers HDF5 unpacks at a time, even if fewer are read."""
     return math.prod(data.chunks) if data.chunks else 0
 
@@ -354,7 +362,9 @@ def _stop_at_short_chunk(chunk: Any) -> bool | None:
     return True if chunk.size < 4 else None
 
 
-def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int) -> sp.csr_array:
+def _build_from_triplets(
+    p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int
+) -> sp.csr_array:
     """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
     if min(len(p), len(i), len(x)) < nz:
         raise InputError(f"{nz} triplets are announced; p has {len(p)}, i {len(i)}, x {len(x)}")
@@ -366,7 +376,7 @@ def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: i
 
 def _read_file(r: _Reader) -> Contents:
     """Read an open file; check all lengths and the memory limit before reading numbers."""
-    present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has(name)]
+    present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has_path(name)]
     if not present:
         found = ", ".join(list(r.file)[:8]) or "nothing"
         raise InputError(
@@ -378,16 +388,20 @@ def _read_file(r: _Reader) -> Contents:
         raise InputError(
             f"holds {' and '.join(present)}: one problem with rolling friction and one without; keep one of them"
         )
-    spacedim = r.integer(f"{group}/spacedim")
+    spacedim = r.read_integer(f"{group}/spacedim")
     if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
         needed = f"{ROLLING_ROWS}, as rolling friction has," if rolling else "2 or 3"
         raise InputError(f"{group}/spacedim is {spacedim}; {needed} is needed")
     vectors = f"{group}/vectors"
     local = group.startswith(LOCAL)
-    first_shape = r.shape(f"{group}/{'W' if local else 'H'}")
+    first_shape = r.read_matrix_shape(f"{group}/{'W' if local else 'H'}")
     more = f"{group}/{'V' if local else 'G'}"
-    has_equations = r.has(more) or (local and r.has(f"{group}/R"))
-    n, m, p = 0 if local else first_shape[0], first_shape[1], r.shape(more)[1] if has_equations else 0
+    has_equations = r.has_path(more) or (local and r.has_path(f"{group}/R"))
+    n, m, p = (
+        0 if local else first_shape[0],
+        first_shape[1],
+        r.read_matrix_shape(more)[1] if has_equations else 0,
+    )
     if local and first_shape != (m, m):
         raise InputError(f"{group}/W is {first_shape[0]} x {m}; a square matrix is needed")
     if m % spacedim:
@@ -399,44 +413,44 @@ def _read_file(r: _Reader) -> Contents:
     matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
     # Check lengths first, then the memory limit, then read the numbers.
     for name in names:
-        r.dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
-    r.budget.spend(BOUNDS_ROW_BYTES * (m + p), f"{m + p} rows")
+        r.find_dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
+    r.budget.reserve_bytes(BOUNDS_ROW_BYTES * (m + p), f"{m + p} rows")
     for name in matrices:
-        r.budget.spend(NUMBER_BYTES * (shapes[name][0] + 1), f"{group}/{name}")
-        r.spend(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
-    r.spend(f"{vectors}/{name}" for name in names)
-    guesses = _guesses(r)
-    r.spend(f"{point}/{name}" for point in ("solution", *guesses) for name in "ruvl")
-    values: dict[str, Any] = {name: r.matrix(f"{group}/{name}", shapes[name]) for name in matrices}
-    values |= {name: r.vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
+        r.budget.reserve_bytes(NUMBER_BYTES * (shapes[name][0] + 1), f"{group}/{name}")
+        r.reserve_memory(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
+    r.reserve_memory(f"{vectors}/{name}" for name in names)
+    guesses = _list_guess_groups(r)
+    r.reserve_memory(f"{point}/{name}" for point in ("solution", *guesses) for name in "ruvl")
+    values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
+    values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
         spacedim,
-        solution=_point(r, "solution", n, m, p) if r.has("solution") else {},
-        guesses=tuple(_point(r, guess, n, m, p) for guess in guesses),
-        info={name: r.text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
-        compare=r.text("reference/compare"),
+        solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
+        guesses=tuple(_read_point(r, guess, n, m, p) for guess in guesses),
+        info={name: r.read_text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
+        compare=r.read_text("reference/compare"),
         **values,
     )
 
 
-def _point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
+def _read_point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
     """Read a solution or guess: r, and u, v, l if present; l is required if there are equations."""
-    point = {"r": r.vector(f"{group}/r", m)}
+    point = {"r": r.read_vector(f"{group}/r", m)}
     for name, size in (("u", m), ("v", n), ("l", p)):
-        if size and r.has(f"{group}/{name}"):
-            point[name] = r.vector(f"{group}/{name}", size)
+        if size and r.has_path(f"{group}/{name}"):
+            point[name] = r.read_vector(f"{group}/{name}", size)
     if p and "l" not in point:
         raise InputError(f"{group} has no l, the multipliers of the {p} equations")
     return point
 
 
-def _guesses(r: _Reader) -> list[str]:
+def _list_guess_groups(r: _Reader) -> list[str]:
     """Return the names of the groups of the guesses."""
-    if not r.has("guesses"):
+    if not r.has_path("guesses"):
         return []
-    count = r.integer("guesses/number_of_guesses")
-    if count < 0 or count > len(r.node("guesses")):
-        raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.node('guesses')) - 1}")
+    count = r.read_integer("guesses/number_of_guesses")
+    if count < 0 or count > len(r.find_node("guesses")):
+        raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.find_node('guesses')) - 1}")
     return [f"guesses/{i + 1}" for i in range(count)]
 
 
@@ -458,10 +472,10 @@ def write(
     CapabilityError
         FCLIB cannot hold something of this problem; every such thing is named.
     """
-    write_contents(contents(problem, impulse=impulse, form=form, drop=drop), path)
+    write_contents(make_contents(problem, impulse=impulse, form=form, drop=drop), path)
 
 
-def contents(
+def make_contents(
     problem: Problem, *, impulse: Any = None, form: str | None = None, drop: Collection[str] = ()
 ) -> Contents:
     """Return the contents of an FCLIB file of this problem; raises the errors of `write`."""
@@ -476,7 +490,7 @@ def contents(
         raise InputError(
             f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
         )
-    obstacles = _cannot_hold(problem, form, drop)
+    obstacles = _list_unsupported_data(problem, form, drop)
     if obstacles:
         text = "; ".join(obstacles)
         raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
@@ -498,13 +512,13 @@ def contents(
     if form == "local":
         parts: dict[str, Any] = {"W": problem.csr, "q": -problem.b}
     else:
-        mass, v = _mass(problem)
+        mass, v = _get_mass_and_free_velocity(problem)
         jac = problem.jacobian
         parts = {"M": mass, "H": sp.csr_array(jac.T), "f": mass @ v, "w": -(problem.b + jac @ v)}
     return Contents(spacedim, mu, mu_r, solution=solution, guesses=guesses, info=info, **parts)
 
 
-def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
+def _get_mass_and_free_velocity(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
     """Return M (n, n) and v* (n,) of a problem in generalised coordinates or of bodies."""
     if problem.generalized is not None:
         return problem.generalized.mass, problem.generalized.v_free
@@ -519,7 +533,7 @@ def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
     return mass, rows.v_free.ravel()
 
 
-def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
+def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
     """Return everything of the problem that FCLIB's form cannot hold, each as a phrase for the error message."""
     c = problem.cones
     obstacles = []
@@ -558,11 +572,11 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
     if "\0" in problem.name:
         obstacles.append("a NUL character in its name, which ends a text there (give it another)")
     if form == "global":
-        obstacles += _no_global_form(problem)
+        obstacles += _list_reasons_against_global_form(problem)
     return obstacles
 
 
-def _no_global_form(problem: Problem) -> list[str]:
+def _list_reasons_against_global_form(problem: Problem) -> list[str]:
     """Return the reasons why the problem has no global form, each as a phrase for the error message."""
     if problem.matrix is not None:
         return ["a problem given as a matrix (form='local' holds it)"]
@@ -601,42 +615,44 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 
 def _write_file(out: Any, file: Contents) -> None:
     """Write all groups of the file."""
-    group = out.create_group(file.group)
-    _put(group, "spacedim", np.array([file.spacedim], np.int32))
+    group = out.create_group(file.group_name)
+    _write_array(group, "spacedim", np.array([file.spacedim], np.int32))
     vectors = group.create_group("vectors")
     for name, shape in PARTS[LOCAL if file.form == "local" else GLOBAL].items():
         part = getattr(file, name)
         if part is not None and len(shape) == 2:
             _write_matrix(group.create_group(name), part)
         elif part is not None:
-            _put(vectors, name, part)
+            _write_array(vectors, name, part)
     if any(file.info.values()):
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):
             text = file.info.get(name, "").encode()
-            _put(info, name, np.array(text, f"S{len(text) + 1}"))  # FCLIB reads strings up to the NUL.
+            _write_array(
+                info, name, np.array(text, f"S{len(text) + 1}")
+            )  # FCLIB reads strings up to the NUL.
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:
         guesses = out.create_group("guesses")
-        _put(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
+        _write_array(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
         for i, guess in enumerate(file.guesses):
             _write_point(guesses.create_group(str(i + 1)), guess)
 
 
 def _write_matrix(group: Any, a: sp.csr_array) -> None:
     for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
-        _put(group, name, np.array([value], np.int32))
+        _write_array(group, name, np.array([value], np.int32))
     for name, array in (("p", a.indptr.astype(np.int32)), ("i", a.indices.astype(np.int32)), ("x", a.data)):
-        _put(group, name, array)
+        _write_array(group, name, array)
 
 
 def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
     for name, value in point.items():
-        _put(group, name, value)
+        _write_array(group, name, value)
 
 
-def _put(group: Any, name: str, value: Any) -> None:
+def _write_array(group: Any, name: str, value: Any) -> None:
     """Write an array with a checksum, so that damage is detected; HDF5 has no checksum for scalars."""
     value = np.asarray(value)
     group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))

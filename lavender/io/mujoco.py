@@ -53,7 +53,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, as_array, read_only
+from lavender.base.arrays import FloatArray, IntArray, as_array, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Names, Problem
@@ -75,7 +75,7 @@ MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
 # Bytes of MuJoCo's memory for a row (12 numbers and more), a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED_ADVICE = "MjData was changed since its forward pass, or is of another model: run mj_forward"
-# Integrators whose constraint problem uses M itself.
+# Integrators with a constraint problem that uses M itself.
 MASS_MATRIX_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = "The model was changed, or MjData is of another one: give a model and data made from it"
@@ -134,25 +134,28 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         The arguments are not a model and its data; `mj_forward` was not called; the time step is not above 0; numbers
         are not finite; indices (`efc_id`, `contact.dim`, `efc_J_colind`, ...) are out of range.
     CapabilityError
-        The data belong to a problem other than that of J, M and R: the integrator adds damping to M
+        The data do not belong to the problem of J, M and R: the integrator adds damping to M
         (`integrator="discrete"`), `opt.jacobian` changed since the forward pass, a copy lacks needed arrays, or, after
         `mj_step`, joints of one body have dependent axes. It is not raised if MuJoCo's solver stopped before
         convergence: the problem does not depend on the answer.
     """
-    seen, m, contacts, smooth = _checked_model(model, data)
+    seen, m, contacts, smooth = _check_model(model, data)
     opt, like = model.opt, seen.first_operator
-    dt = _timestep(opt)
-    mass = _mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
-    cones, scale, key = _blocks(seen, data, contacts, dt)
-    jac = _rows(seen, model, data, m, scale)
+    dt = _get_timestep(opt)
+    mass = _read_mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
+    cones, scale, key = _make_blocks(seen, data, contacts, dt)
+    jac = _read_jacobian(seen, model, data, m, scale)
     rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.numbers(
-        *jac, scale, dt, _velocity_before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
-        _expected_velocity(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
+        *jac, scale, dt, _get_velocity_before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D,
+        data.efc_force,
+        _get_expected_velocity(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
     )  # fmt: skip
     _check_jacobian(*gaps)
     if not gap <= COMPLIANCE_TOLERANCE:
-        compliance, is_finite = _compliance(data) * scale * scale, False
-    names = Names(cones.n_blocks, lambda: _block_names(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m))
+        compliance, is_finite = _compute_compliance(data) * scale * scale, False
+    names = Names(
+        cones.n_blocks, lambda: _make_block_names(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m)
+    )
     general = Generalized.compressed(jac, mass, v_free, like=like)
     if like is None:
         seen.first_operator = general.operator
@@ -181,7 +184,7 @@ def impulse(model: Any, data: Any) -> FloatArray:
     With `noslip_iterations`, it is not a solution of the problem.
     """
     scale = scaling(model, data)
-    force = _timestep(model.opt) * data.efc_force
+    force = _get_timestep(model.opt) * data.efc_force
     return np.divide(force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
@@ -191,16 +194,16 @@ def scaling(model: Any, data: Any) -> FloatArray:
     The factor is friction[j] / friction[0] on tangents of an elliptic cone and 1 on all other rows. Impulses are
     MuJoCo's divided by the factor.
     """
-    seen, _, contacts, _ = _checked_model(model, data)
-    scale: FloatArray = _blocks(seen, data, contacts, _timestep(model.opt))[1]
+    seen, _, contacts, _ = _check_model(model, data)
+    scale: FloatArray = _make_blocks(seen, data, contacts, _get_timestep(model.opt))[1]
     return scale
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """Return MuJoCo's `qacc` (nv,) for impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
-    seen, m, _, smooth = _checked_model(model, data)
+    seen, m, _, smooth = _check_model(model, data)
     lam = as_array("impulse", impulse, (m,), unit="N s")
-    force = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
+    force = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _get_timestep(model.opt)
     change = np.zeros_like(force)
     seen.mj.mj_solveM(model, data, change, np.ascontiguousarray(force))
     return np.array(smooth, float) + change[0]
@@ -208,18 +211,18 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
 
 def jacobian(model: Any, data: Any) -> sp.csr_array:
     """Return J (m, nv) of all constraints, whether MuJoCo stores it densely or sparsely."""
-    seen, m, _, _ = _checked_model(model, data)
-    indptr, indices, values = _rows(seen, model, data, m, np.ones(m))
+    seen, m, _, _ = _check_model(model, data)
+    indptr, indices, values = _read_jacobian(seen, model, data, m, np.ones(m))
     return sp.csr_array((values, indices, indptr), shape=(m, seen.n))
 
 
-def _checked_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
+def _check_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
     """Check a model and its data; return the model's cache, the numbers of rows and contacts, and a0 (nv,)."""
     try:
         seen = _MODELS.get(model)
     except TypeError:  # The object does not support weak references, so it is not a model.
         seen = None
-    mj = package() if seen is None else seen.mj
+    mj = import_mujoco() if seen is None else seen.mj
     if (seen is None and not isinstance(model, mj.MjModel)) or not isinstance(data, mj.MjData):
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a mujoco.MjModel and its mujoco.MjData "
@@ -240,7 +243,7 @@ def _checked_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
     return seen, m, contacts, smooth
 
 
-def package() -> Any:
+def import_mujoco() -> Any:
     """Return the module mujoco.
 
     Raises
@@ -260,19 +263,19 @@ def package() -> Any:
 
 
 @cache
-def _codes(mj: Any) -> Any:
-    return read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
+def _get_type_codes(mj: Any) -> Any:
+    return mark_read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
 
 
-def _timestep(opt: Any) -> float:
+def _get_timestep(opt: Any) -> float:
     dt = float(opt.timestep)
     if not 0.0 < dt < np.inf:
         raise InputError(f"opt.timestep is {dt} s; a step above 0 is needed")
     return dt
 
 
-def _mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> Any:
-    """Return (indptr, indices, data) of M's lower triangle; the first two are those of `like` if they are equal.
+def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> Any:
+    """Return (indptr, indices, data) of M's lower triangle; the first two are the arrays of `like` if they are equal.
 
     Raises
     ------
@@ -295,7 +298,7 @@ def _mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> A
     return mass
 
 
-def _rows(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
+def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
     """Return (indptr, indices, data) of J, each row times `scale` (m,).
 
     Raises
@@ -334,7 +337,7 @@ def _rows(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _compliance(data: Any) -> FloatArray:
+def _compute_compliance(data: Any) -> FloatArray:
     """Return R (m,) [1/kg] if efc_R and 1 / efc_D differ: 1 / efc_D on rows that a copy of the data did not fill.
 
     Raises
@@ -352,7 +355,7 @@ def _compliance(data: Any) -> FloatArray:
     return np.where(empty, 1.0 / inverse, r)
 
 
-def _velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
+def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     """Return the velocities (nv,) of the forward pass.
 
     They are qvel, or after a step they are recovered from the velocities of bodies, which were computed before it.
@@ -382,7 +385,7 @@ def _velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     return v
 
 
-def _expected_velocity(model: Any, data: Any, m: int) -> FloatArray:
+def _get_expected_velocity(model: Any, data: Any, m: int) -> FloatArray:
     """Return efc_vel (m,), which J v must equal, or zeros (no check) if it contains velocities of moving surfaces."""
     speed: FloatArray = np.zeros(m) if getattr(model, "flg_surfacevel", False) else data.efc_vel
     return speed
@@ -414,7 +417,7 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
+def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
     """Return the cones, the factor of each row and the key of each block.
 
     Raises
@@ -426,7 +429,7 @@ def _blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Con
     """
     contact = data.contact if contacts else NO_CONTACT
     type_counts = (*seen.type_counts, contacts, contacts, contacts)
-    types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _codes(seen.mj)
+    types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _get_type_codes(seen.mj)
     result = mujoco_rows.blocks(
         types, ids, codes, type_counts, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
@@ -446,7 +449,7 @@ def _blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Con
     return Cones._from_blocks(blocks), scale, key
 
 
-def _block_names(
+def _make_block_names(
     mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
 ) -> list[str]:
     """Return the names of the blocks of m rows.
@@ -466,21 +469,23 @@ def _block_names(
         if row_type == kinds.mjCNSTR_EQUALITY:
             while i + size < len(types) and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
-            name = _name(mj, model, "EQUALITY", which, "equality")
+            name = _get_name(mj, model, "EQUALITY", which, "equality")
             names += [name] if size <= joined else [f"{name}, edge {edge}" for edge in range(size)]
         elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])
             is_rotational = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
             suffix = f", axis {axis}" if is_rotational else ""
-            names.append(f"friction of {_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
+            names.append(f"friction of {_get_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
         elif row_type == kinds.mjCNSTR_FRICTION_TENDON:
-            names.append(f"friction of {_name(mj, model, 'TENDON', which, 'tendon')}")
+            names.append(f"friction of {_get_name(mj, model, 'TENDON', which, 'tendon')}")
         elif row_type in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
             word = "joint" if row_type == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
-            names.append(f"limit of {_name(mj, model, word.upper(), which, word)}")
+            names.append(f"limit of {_get_name(mj, model, word.upper(), which, word)}")
         else:
-            sides = [_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex" for g in geom[which].tolist()]
+            sides = [
+                _get_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex" for g in geom[which].tolist()
+            ]
             name = f"contact {which} ({', '.join(side.removeprefix('geom ') for side in sides)})"
             if row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
                 size = 2 * (int(dim[which]) - 1)
@@ -492,6 +497,6 @@ def _block_names(
     return names
 
 
-def _name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
+def _get_name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
     own_name = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
     return f"{word} {own_name or which}"

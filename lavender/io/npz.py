@@ -1,6 +1,6 @@
 """Read and write problems in NumPy archives (.npz).
 
-Three formats are read: our own, the plain box format, and that of a benchmark generator. Nothing in an archive is
+Three formats are read: our own, the plain box format, and the format of a benchmark generator. Nothing in an archive is
 executed or unpickled. The memory for all entries is computed from their headers before the first entry is read, and
 the arrays are checked against each other before a kernel uses them. `docs/formats.md` describes each entry.
 """
@@ -28,14 +28,14 @@ from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.cones import Cones, kinds_of
+from lavender.problem.cones import Cones, get_kinds
 from lavender.problem.generalized import Generalized
-from lavender.problem.program import program_of_matrix
+from lavender.problem.program import recover_program
 from lavender.problem.rows import Rows
 
 FORMAT_VERSION = 1
 MAX_NPY_HEADER_BYTES = 10_000  # Longest accepted .npy header; 100 bytes are usual.
-MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has at most 30.
+MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has up to 30.
 # Upper bound of the bytes of Python objects per byte of JSON text; nested empty lists need 24.
 JSON_BYTES_PER_BYTE = 40
 # Compression methods that NumPy writes. With other methods, the archive determines how much memory they use.
@@ -77,13 +77,13 @@ class _Header:
     fortran: bool
 
     @property
-    def count(self) -> int:
+    def n_elements(self) -> int:
         """Number of elements."""
         return math.prod(self.shape)
 
-    def read(self) -> np.ndarray:
+    def read_array(self) -> np.ndarray:
         """Read the array; raise EOFError if the stream is too short or too long."""
-        size = self.count * self.dtype.itemsize
+        size = self.n_elements * self.dtype.itemsize
         raw = self.stream.read(size)
         if len(raw) != size or self.stream.read(1):
             raise EOFError(f"{len(raw)} of {size} bytes are there")
@@ -122,14 +122,14 @@ class Archive(Mapping[str, np.ndarray]):
             try:
                 if entry.compress_type not in ACCEPTED_COMPRESSION:
                     raise ValueError(f"it is packed by method {entry.compress_type}; deflate is read")
-                self._headers[name] = _npy_header(self._zip.open(entry), entry.file_size)
+                self._headers[name] = _read_npy_header(self._zip.open(entry), entry.file_size)
             except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         for name, header in self._headers.items():
             width = header.dtype.itemsize
             if header.dtype.kind in "buif":
                 width = JSON_BYTES_PER_BYTE if name == "meta" else max(width, NUMBER_BYTES)
-            budget.spend(header.count * width, f"{self.path}: entry {name!r}")
+            budget.reserve_bytes(header.n_elements * width, f"{self.path}: entry {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
@@ -140,7 +140,7 @@ class Archive(Mapping[str, np.ndarray]):
                 raise InputError(f"{self.path} has no entry {name!r}; it has {has}") from None
             try:
                 with header.stream:
-                    self._arrays[name] = header.read()
+                    self._arrays[name] = header.read_array()
             except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         return self._arrays[name]
@@ -160,7 +160,7 @@ class Archive(Mapping[str, np.ndarray]):
             header.stream.close()
         self._zip.close()
 
-    def scalar(self, name: str) -> Any:
+    def read_scalar(self, name: str) -> Any:
         """Return the single value of an entry."""
         value = self[name]
         if value.size != 1:
@@ -168,7 +168,7 @@ class Archive(Mapping[str, np.ndarray]):
         return value.reshape(()).item()
 
 
-def _npy_header(stream: IO[bytes], size: int) -> _Header:
+def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
     """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
     if npy.read_magic(stream) != (1, 0):  # Later versions are for long field names.
         raise ValueError("it is a record array, or none at all; plain numbers (.npy, version 1.0) are needed")
@@ -269,12 +269,12 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
 
 def _read_own(archive: Archive) -> Stored:
     """Read a problem in our own format."""
-    version = archive.scalar("lavender_format")
+    version = archive.read_scalar("lavender_format")
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise InputError(
             f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it, or save again"
         )
-    meta = _meta(archive)
+    meta = _read_meta(archive)
     operator = {
         "dense": ("A",),
         "csr": CSR,
@@ -299,10 +299,10 @@ def _read_own(archive: Archive) -> Stored:
         optional_parts["rows"] = Rows(**parts)
         optional_parts["compliance"] = archive["compliance"]
     elif meta["operator"] == "generalized":
-        optional_parts["generalized"] = _generalized(archive, meta["dof_names"])
+        optional_parts["generalized"] = _build_generalized(archive, meta["dof_names"])
         optional_parts["compliance"] = archive["compliance"]
     else:
-        optional_parts["matrix"] = _matrix(archive)
+        optional_parts["matrix"] = _read_matrix(archive)
     entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in entries})
     problem = Problem(
@@ -310,11 +310,11 @@ def _read_own(archive: Archive) -> Stored:
     )
     if "program" in meta:
         n = check_int("program", meta["program"], high=problem.m)
-        problem = replace(problem, qp=program_of_matrix(problem.csr, problem.b, problem.cones, n), copy=False)
-    return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
+        problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)
+    return Stored(problem, "lavender", impulse=_read_vector(archive, "impulse", problem))
 
 
-def _meta(archive: Archive) -> dict[str, Any]:
+def _read_meta(archive: Archive) -> dict[str, Any]:
     """Read and check the entry 'meta', a JSON object."""
     try:
         meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
@@ -340,12 +340,12 @@ def _meta(archive: Archive) -> dict[str, Any]:
     return meta
 
 
-def _generalized(archive: Archive, names: list[str] | None) -> Generalized:
+def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized:
     """Build the generalised form from its entries."""
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
     jac, mass = (
-        checked_csr(
+        build_checked_csr(
             archive[f"general_{name}_indptr"],
             archive[f"general_{name}_indices"],
             archive[f"general_{name}_data"],
@@ -379,19 +379,19 @@ def _read_box(archive: Archive) -> Stored:
     b = archive["b"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    cones = _box_cones(archive, len(b))
-    problem = Problem(b, cones, _matrix(archive), name=Path(archive.path).stem)
-    compare = archive.scalar("compare") if "compare" in archive else ""
+    cones = _build_box_cones(archive, len(b))
+    problem = Problem(b, cones, _read_matrix(archive), name=Path(archive.path).stem)
+    compare = archive.read_scalar("compare") if "compare" in archive else ""
     return Stored(
         problem,
         "box",
-        impulse=_vector(archive, "l_ref", problem),
-        slack=_vector(archive, "w_ref", problem),
+        impulse=_read_vector(archive, "l_ref", problem),
+        slack=_read_vector(archive, "w_ref", problem),
         compare=str(compare),
     )
 
 
-def _box_cones(archive: Archive, m: int) -> Cones:
+def _build_box_cones(archive: Archive, m: int) -> Cones:
     """Build the cones of the box format from bounds and, if given, contacts of 1 to 3 rows."""
     lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
@@ -419,7 +419,7 @@ def _box_cones(archive: Archive, m: int) -> Cones:
     contact[at], friction[at] = True, mu
     return Cones(
         ptr=np.append(first, m),
-        kind=kinds_of(contact),
+        kind=get_kinds(contact),
         lower=lower,
         upper=upper,
         mu=friction,
@@ -429,27 +429,27 @@ def _box_cones(archive: Archive, m: int) -> Cones:
 
 def _read_generated(archive: Archive) -> Stored:
     """Read the layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
-    kind = archive.scalar("kind")
+    kind = archive.read_scalar("kind")
     b = archive["b"]
     name = Path(archive.path).stem
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
     if kind == "lcp":
-        problem = Problem.lcp(_matrix(archive), b, name=name)
+        problem = Problem.lcp(_read_matrix(archive), b, name=name)
     elif kind == "free":
-        problem = Problem.linear(_matrix(archive), b, name=name)
+        problem = Problem.linear(_read_matrix(archive), b, name=name)
     elif kind == "cone":
-        problem = Problem.contact(_matrix(archive), b, archive["mu"], friction="cone", name=name)
+        problem = Problem.contact(_read_matrix(archive), b, archive["mu"], friction="cone", name=name)
     else:
         raise InputError(f"entry 'kind' is {kind!r}; 'lcp', 'free' or 'cone' is needed")
     return Stored(problem, "generated")
 
 
-def _vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
+def _read_vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
     return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
 
 
-def _matrix(archive: Archive) -> Any:
+def _read_matrix(archive: Archive) -> Any:
     """Return the dense `A`, or compressed rows with checked indices."""
     if "A" in archive:
         return archive["A"]
@@ -457,10 +457,12 @@ def _matrix(archive: Archive) -> Any:
     shape = tuple(archive["A_shape"].ravel().tolist())
     if shape != (m, m):
         raise InputError(f"A_shape is {shape}; ({m}, {m}) is needed, as b has {m} rows")
-    return checked_csr(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
+    return build_checked_csr(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
 
 
-def checked_csr(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
+def build_checked_csr(
+    indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int
+) -> sp.csr_array:
     """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed.
 
     Raises

@@ -96,13 +96,13 @@ def from_pinocchio(
         raise InputError(
             "q holds a rotation that is none: pinocchio.normalize(model, q) makes quaternions unit ones"
         )
-    mass, a = _mass_and_acceleration(pin, model, data, q, v, tau)
+    mass, a = _compute_mass_and_acceleration(pin, model, data, q, v, tau)
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
         data.q_in = q  # Joint limits are evaluated at q_in, and no algorithm sets it.
     pairs = zip(constraint_models, constraint_datas, strict=True)
-    rows, target, cones, names = _constraints(model, data, pairs, dt, correction)
+    rows, target, cones, names = _convert_constraints(model, data, pairs, dt, correction)
     return Problem.from_jacobian(
         rows,
         mass,
@@ -116,7 +116,7 @@ def from_pinocchio(
     )
 
 
-def _constraints(
+def _convert_constraints(
     model: Any, data: Any, pairs: Iterable[Any], dt: float, correction: float
 ) -> tuple[Any, Any, Cones, list[str]]:
     """Return J (m, nv), targets (m,), the blocks and their names of all constraints, one after the other."""
@@ -131,7 +131,7 @@ def _constraints(
             data_of = model_of.createData()  # New data have the sizes of this model.
             model_of.calc(model, data, data_of)
             jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
-        own_cones, target, order = _constraint(model_of, data_of, len(jac), dt, correction)
+        own_cones, target, order = _convert_constraint(model_of, data_of, len(jac), dt, correction)
         if hasattr(model_of, "desired_constraint_velocity"):
             target = target + np.array(model_of.desired_constraint_velocity)[order]
         rows.append(jac[order])
@@ -153,7 +153,9 @@ def _check_arguments(models: Any, datas: Any, dt: Any, correction: Any) -> tuple
     return check_float("dt", dt, above=0.0), check_float("correction", correction, low=0.0, high=1.0)
 
 
-def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any) -> tuple[Any, Any]:
+def _compute_mass_and_acceleration(
+    pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any
+) -> tuple[Any, Any]:
     """Return M (nv, nv) and the free acceleration (nv,); raise CapabilityError if they do not belong together."""
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         a = np.array(pin.aba(model, data, q, v, tau))
@@ -203,7 +205,9 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
     short = [name for name in lists if len(getattr(model, name)) != n]
     if short or n < 1:
-        raise InputError(f"{n} joints, and another number of {', '.join(short)}. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"the model has {n} joints, but {', '.join(short)} have other lengths. {OTHER_MODEL_ADVICE}"
+        )
     at_v = at_q = 0
     for i in range(1, n):
         joint = model.joints[i]
@@ -279,7 +283,9 @@ def _unwrap(constraint: Any) -> Any:
     return constraint.extract() if hasattr(constraint, "extract") else constraint
 
 
-def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> tuple[Cones, Any, list[int]]:
+def _convert_constraint(
+    model: Any, data: Any, n: int, dt: float, correction: float
+) -> tuple[Cones, Any, list[int]]:
     """Return the cones, the target (n,) [m/s, rad/s] and the order of the rows of one constraint.
 
     Raises
@@ -293,10 +299,18 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
         return Cones.free(n), -correction / dt * np.array(data.constraint_position_error), order
     if kind == "PointContactConstraintModel":
         gap = np.array([float(data.constraint_position_error[2]), 0.0, 0.0])
-        return Cones.contacts(float(model.getFriction())), closing_speed(gap, dt, correction), [2, 0, 1]
+        return (
+            Cones.contacts(float(model.getFriction())),
+            compute_target_velocity(gap, dt, correction),
+            [2, 0, 1],
+        )
     if kind == "JointLimitConstraintModel":
         gap = np.array(data.constraint_residual, float)
-        return Cones.bounded(np.zeros(n), np.full(n, np.inf)), closing_speed(gap, dt, correction), order
+        return (
+            Cones.bounded(np.zeros(n), np.full(n, np.inf)),
+            compute_target_velocity(gap, dt, correction),
+            order,
+        )
     if kind == "JointFrictionConstraintModel":
         low, high = np.array(model.getFrictionLowerLimit()), np.array(model.getFrictionUpperLimit())
         return Cones.bounded(dt * low, dt * high), np.zeros(n), order
@@ -305,7 +319,7 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
     )
 
 
-def closing_speed(gap: Any, dt: float, correction: float) -> Any:
+def compute_target_velocity(gap: Any, dt: float, correction: float) -> Any:
     """Return the target velocity for a gap: -gap / dt if it is open, -correction gap / dt if it is negative.
 
     An open gap may close within one step; a fraction `correction` of a penetration is removed.

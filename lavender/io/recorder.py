@@ -29,7 +29,7 @@ from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io import npz
 from lavender.io.engine_step import Claims, EngineStep
-from lavender.io.stored import ENGINE, folder_for_steps, make_folder, write_arrays, write_text
+from lavender.io.stored import ENGINE, make_folder, open_step_folder, write_arrays, write_text
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
 
@@ -115,10 +115,10 @@ class Recorder:
             raise InputError("nothing would be recorded: give every=, keep_worst= or when=")
         self.when, self.solver, self.n_steps = when, solver, 0
         self._stack = contextlib.ExitStack()
-        self.folder = self._stack.enter_context(folder_for_steps(folder, check_bool("replace", replace)))
+        self.folder = self._stack.enter_context(open_step_folder(folder, check_bool("replace", replace)))
         self._lines: dict[str, dict[str, Any]] = {}
         self._worst: list[tuple[float, str]] = []  # heap of (velocity error, file), the smallest first
-        self._unjudged: set[int] = set()  # worlds whose first invalid step has a line
+        self._unjudged: set[int] = set()  # worlds with a line for their first invalid step
 
     def __enter__(self) -> Recorder:
         return self

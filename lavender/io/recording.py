@@ -19,7 +19,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.states import read_states
-from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
+from lavender.io.stored import ENGINE, as_path, open_step_folder, read_first_bytes, write_text
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
@@ -41,7 +41,7 @@ class Recording:
     left_out : tuple of str
         Reasons why steps could not be exported, one line each.
     above_floor : int
-        MuJoCo's answers whose error exceeds the round-off floor.
+        MuJoCo's answers with an error above the round-off floor.
     stopped : int
         Of these, the answers with a velocity error above `threshold`.
     threshold : float, m/s
@@ -128,18 +128,18 @@ def record(
         The arguments are not a model and its data; `steps` or `every` is below 1; the control, precision or threshold
         is invalid; the folder holds a recording; MuJoCo raises an error (out of memory, an unsupported feature).
     """
-    mj = adapter._checked_model(model, data)[0].mj
+    mj = adapter._check_model(model, data)[0].mj
     steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
     precision = check_choice("precision", precision, PRECISIONS)
     threshold = check_float("threshold", threshold, low=0.0)
     control_at = make_controller(model, control, seed)
-    starts = None if states is None else read_states(mj, model, states).subset(steps)
+    starts = None if states is None else read_states(mj, model, states).select_evenly(steps)
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
     records: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     without = 0
     width = len(str(steps))
-    with folder_for_steps(folder, replace) as folder:
+    with open_step_folder(folder, replace) as folder:
         for step in range(steps):
             ctrl = control_at(data, step)
             if starts is not None and step in firsts:
@@ -237,7 +237,7 @@ def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
     InputError
         MuJoCo is not installed, or cannot read the file.
     """
-    mj, path = adapter.package(), str(as_path(path))
+    mj, path = adapter.import_mujoco(), str(as_path(path))
     try:
         return mj, mj.MjModel.from_xml_path(path)
     except ValueError as error:  # MuJoCo raises it for a file that it cannot read.
@@ -252,7 +252,7 @@ def load_controls(control: Control) -> Control:
 def _load_controls_npy(path: str) -> Any:
     """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
     try:
-        first_bytes(path)  # Checks that it is a regular file.
+        read_first_bytes(path)  # Checks that it is a regular file.
         # A memory map cannot be longer than the file, whatever size the header declares.
         result = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, BadZipFile) as error:

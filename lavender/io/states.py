@@ -21,7 +21,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.io.npz import Archive
-from lavender.io.stored import first_bytes
+from lavender.io.stored import read_first_bytes
 
 KEYFRAMES = "keyframes"
 VECTOR = "state"
@@ -51,7 +51,7 @@ class StartStates:
     def __len__(self) -> int:
         return len(self.vectors)
 
-    def subset(self, count: int) -> StartStates:
+    def select_evenly(self, count: int) -> StartStates:
         """Return at most `count` of the states, evenly spaced."""
         if len(self) <= count:
             return self
@@ -83,7 +83,7 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     if isinstance(source, str) and source == KEYFRAMES:
         return _read_keyframes(mj, model)
     if isinstance(source, (str, os.PathLike)):
-        first_bytes(source)  # Checks that it is a regular file.
+        read_first_bytes(source)  # Checks that it is a regular file.
         with closing(Archive(source)) as archive:
             return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
     arrays = source if isinstance(source, Mapping) else {VECTOR: source}

@@ -80,7 +80,7 @@ class Stored:
 
 
 @contextlib.contextmanager
-def folder_for_steps(
+def open_step_folder(
     path: str | os.PathLike[str], replace: bool = False, continued: bool = False
 ) -> Iterator[Path]:
     """Lock a folder for recorded problems, create it if necessary, and return its path until the block ends.
@@ -125,7 +125,9 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
     from filelock import FileLock, Timeout  # The import takes 30 ms; commands that write nothing skip it.
 
     path = check_writable(path, folder)
-    target = _resolve_links(path) if folder else destination(path)  # All names of an output share one lock.
+    target = (
+        _resolve_links(path) if folder else resolve_destination(path)
+    )  # All names of an output share one lock.
     is_new = folder and not target.exists()
     if folder:
         make_folder(target)
@@ -166,7 +168,7 @@ def _resolve_links(path: Path) -> Path:
         raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
 
 
-def destination(path: str | os.PathLike[str]) -> Path:
+def resolve_destination(path: str | os.PathLike[str]) -> Path:
     """Return the path at which a file is written: the target of symbolic links, a regular file or a new one.
 
     Raises
@@ -201,13 +203,13 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
         It cannot be written.
     """
     path = as_path(path)
-    parent = _resolve_links(path) if folder else destination(path).parent
+    parent = _resolve_links(path) if folder else resolve_destination(path).parent
     try:
         while folder and parent != parent.parent and not parent.exists():
             parent = parent.parent
         mode = parent.stat().st_mode
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_write_failure(error, parent)}") from None
+        raise InputError(f"cannot write {path}: {_explain_write_failure(error, parent)}") from None
     if not stat.S_ISDIR(mode):
         raise InputError(f"cannot write {path}: {parent} is no folder; give a path in one")
     existing = [path] if not folder and path.exists() else []
@@ -228,7 +230,7 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def _write_failure(error: OSError, folder: Path) -> str:
+def _explain_write_failure(error: OSError, folder: Path) -> str:
     """Return the reason why a file could not be written, and advice."""
     if isinstance(error, FileNotFoundError) and not folder.is_dir():
         return f"the folder {folder} is not there; make it first"
@@ -246,7 +248,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     InputError
         The file cannot be written.
     """
-    target = destination(path)
+    target = resolve_destination(path)
     short = target.name[:TEMPORARY_NAME_CHARACTERS]
     temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
     _remove_old_temporaries(target.parent)
@@ -256,7 +258,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_write_failure(error, target.parent)}") from None
+        raise InputError(f"cannot write {path}: {_explain_write_failure(error, target.parent)}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -366,7 +368,7 @@ def as_path(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
+def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
     """Return the first `count` bytes of a regular file, or all bytes if `count` is -1.
 
     Parameters
@@ -399,8 +401,8 @@ def first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") ->
 
 
 def read_whole_file(path: str | os.PathLike[str], role: str) -> bytes:
-    """Return all bytes of a regular file of at most 2 GiB; it raises the errors of `first_bytes`."""
-    return first_bytes(path, -1, role)
+    """Return all bytes of a regular file of up to 2 GiB; it raises the errors of `read_first_bytes`."""
+    return read_first_bytes(path, -1, role)
 
 
 def pack_header(magic: bytes, header: Mapping[str, Any]) -> bytes:
@@ -430,7 +432,7 @@ class Budget:
     def __init__(self, max_bytes: int) -> None:
         self.limit = self.remaining = check_int("max_bytes", max_bytes, high=None)
 
-    def spend(self, count: int, name: str) -> None:
+    def reserve_bytes(self, count: int, name: str) -> None:
         """Subtract `count` bytes for the object `name`; raise InputError if the limit is exceeded."""
         self.remaining -= count
         if self.remaining < 0:

@@ -6,8 +6,8 @@ normal only). Every solution then has w.y >= 0, so with z = A^T y
 
     0 <= w.y = z.lambda - b.y,    and no solution exists if   b.y > max z.lambda                  (1)
 
-over all lambda within the bounds, for any A and every law. If |z| is at most s in the directions in which lambda is
-unbounded, and the support S is the maximum of z.lambda over the bounded rows,
+over all lambda within the bounds, for any A and every law. If |z| <= s in the directions in which lambda is unbounded,
+and the support S is the maximum of z.lambda over the bounded rows,
 
     every solution has   sum |lambda| >= (b.y - S) / s                                            (2)
 
@@ -43,7 +43,13 @@ from lavender.base.deadline import NEVER, Deadline, TooLate
 from lavender.judge.residuals import divide_by_reference, get_reference
 from lavender.problem import Problem
 
-__all__ = ["Proof", "check_certificate", "format_lower_bound", "list_conflicting_blocks", "prove"]
+__all__ = [
+    "Proof",
+    "check_certificate",
+    "format_lower_bound",
+    "list_conflicting_blocks",
+    "prove_infeasibility",
+]
 
 UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
@@ -112,10 +118,12 @@ def check_certificate(
     problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
 ) -> str | None:
     """Return why y (m,) does not prove that no impulse meets `tol`; None if it does."""
-    return prove(problem, y, tol, deadline).reason or None
+    return prove_infeasibility(problem, y, tol, deadline).reason or None
 
 
-def prove(problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None) -> Proof:
+def prove_infeasibility(
+    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
+) -> Proof:
     """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
     If y fails only by a solver's rounding, it is replaced by the nearest direction on the same rows with A^T y = 0,
@@ -144,12 +152,12 @@ def prove(problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None 
         skipped_time = stored[1].skipped_time
         if not skipped_time or deadline is None or deadline.passed(skipped_time):
             return stored[1]
-    proof = _prove(problem, y, tol, deadline or NEVER)
+    proof = _prove_with_polished_directions(problem, y, tol, deadline or NEVER)
     problem.derived.cache[__name__] = key, proof
     return proof
 
 
-def _prove(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
+def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
     """Check y, then polished directions near y if y fails by rounding or if an exact proof may be found."""
     with np.errstate(all="ignore"):  # A number that overflows proves nothing.
         inner = problem.disk
@@ -159,7 +167,7 @@ def _prove(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> P
         proof = _check_direction(inner, problem.on_disk(y), tol)
         if 0.0 < proof.impulse_bound < math.inf and (proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS):
             try:
-                for polished in _polish(inner, proof.y, deadline):
+                for polished in _polish_direction(inner, proof.y, deadline):
                     candidate = _check_direction(inner, polished, tol)
                     if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
                         proof = candidate
@@ -220,7 +228,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     gain, gain_size = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
         return Proof(y, 0.0, f"b.y = {gain:.2e} is not positive")
-    violation = _recession_violation(problem, y)
+    violation = _explain_recession_violation(problem, y)
     if violation:
         return Proof(y, 0.0, violation)
     low, high, size = _bound_z(problem, y, rows)
@@ -248,7 +256,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
 
 
 def _bound_z(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return bounds of z (m,) from below and above, and the sizes (m,) whose rounding (3) or (4) allows.
+    """Return bounds of z (m,) from below and above, and the sizes (m,) of the terms in (3) or (4) that are rounded.
 
     The sums of z are exact. The sizes are 0 if R y is not exactly 0.
     """
@@ -298,7 +306,7 @@ def _power_of_two(x: FloatArray) -> float:
 def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
     """Return the normal row, the friction coefficient and |x| (m,) over the rows of each friction component."""
     c = problem.cones
-    components, coefficient_of_row = list(c.parts()), c.reach
+    components, coefficient_of_row = list(c.friction_components()), c.friction_coefficient
     normal = c.ptr[np.array([block for block, _ in components], int)]
     coefficient = np.array([coefficient_of_row[rows[0]] for _, rows in components])
     return normal, coefficient, np.array([np.hypot.reduce(x[rows]) for _, rows in components])
@@ -310,7 +318,7 @@ def _compute_support(
     """Compute support, slack and rounding of the slack, all (m,), for low <= z <= high.
 
     The support is the maximum of z_i lambda_i on bounded rows. The slack is |z_i| on rows where lambda_i is unbounded,
-    and on bounded rows with |z_i| within rounding, whose support counts as 0. A contact has one value for all of its
+    and on bounded rows with |z_i| within rounding; their support counts as 0. A contact has one value for all of its
     rows, at its normal row.
     """
     c, size = problem.cones, np.maximum(-low, high)
@@ -336,7 +344,7 @@ def _compute_support(
 def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> tuple[float, float]:
     """Return the minimum relative residual (5) of any impulse, and the residual that rounding of b can cause.
 
-    If b was computed, its rounding is that of target and J v*.
+    If b was computed, its rounding is the rounding of target and J v*.
     """
     data, size = problem.metric, np.abs(problem.b)
     get_reference(problem)
@@ -360,7 +368,7 @@ def _energy_norm(data: Any, w: FloatArray) -> Any:
     return np.sqrt(np.sum(w * w / data.d))
 
 
-def _polish(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
+def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
     """Yield the nearest direction in the metric of D, on the rows of y, with A^T y = 0 wherever it nearly is 0.
 
     The direction is yielded twice: rounded to 26 bits, with which sums of halves and thirds of simple numbers can be
@@ -396,7 +404,7 @@ def _polish(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[Flo
     yield y
 
 
-def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
+def _explain_recession_violation(problem: Problem, y: FloatArray) -> str | None:
     """Return why y (m,) is not in the recession cone of the admissible impulses, or None if it is."""
     c = problem.cones
     bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))

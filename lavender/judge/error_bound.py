@@ -27,7 +27,7 @@ Any other one is uncertain: P0 is the middle of all values that P may have, and 
 
 Why it holds: all mean values in the box of (3) or (4) are regular, so F is one-to-one on the box and a local
 homeomorphism at each of its points (Clarke 1976, Pacific J. Math. 64, 97-102). The root of F(.) = (1 - tau) F(z) is
-followed from tau = 0 to 1; its distance from z is at most tau times the bound, so it cannot leave the box. So an
+followed from tau = 0 to 1; its distance from z does not exceed tau times the bound, so it cannot leave the box. So an
 exact solution lies within the bound, and no other one does. If A is symmetric positive definite and the law is convex,
 (3) contracts for every set of uncertain blocks (if all are uncertain, R^T T L is twice Cayley's transform of H), and
 there is one solution only. Under Coulomb's law, or with another A, further solutions may exist outside of the box.
@@ -47,12 +47,12 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.problem.ordering import rows_by_island
+from lavender.problem.ordering import group_rows_by_island
 from lavender_ext.derivative.linear import CASES, Linear
 
 UNIT_ROUNDOFF = 2.0**-53
 MAX_ISLAND_ROWS = 600  # Larger islands have no bound: dense products of 600 rows take about 0.1 s.
-MAX_MATRIX_ENTRIES = 4e6  # Problems whose A has more entries than this have no bound: A is formed.
+MAX_MATRIX_ENTRIES = 4e6  # No bound is computed if A has more entries than this, because A is formed.
 MAX_UNCERTAINTY_STEPS = (
     8  # Every row counts as uncertain after this many rounds that each found further uncertain rows.
 )
@@ -132,7 +132,7 @@ def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple
         return impulse_error, margin_error
     with np.errstate(all="ignore"):  # An island with an overflow has no bound.
         scaled = _Scaled(problem, impulse, linear)
-        for rows in rows_by_island(disk, disk.cones.ptr):
+        for rows in group_rows_by_island(disk, disk.cones.ptr):
             if len(rows) > MAX_ISLAND_ROWS:
                 continue
             errors = _Island(scaled, rows).bound()
@@ -144,7 +144,7 @@ def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple
 
 
 def bound_slack_rounding(problem: Problem, impulse: FloatArray) -> FloatArray:
-    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, without that of a factor of M."""
+    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, apart from a factor of M."""
     x, b = np.abs(impulse), np.abs(problem.b)
     if problem.matrix is not None:
         operations: Any = np.diff(problem.csr.indptr) + 8.0
@@ -227,8 +227,8 @@ class _Scaled:
         )
         self.local_row = np.zeros(disk.m, np.intp)  # index of each row in its island; `_Island` fills it
         self.components: dict[int, list[_Component]] = {}
-        coefficient = cones.reach
-        for block, rows in cones.parts():
+        coefficient = cones.friction_coefficient
+        for block, rows in cones.friction_components():
             if coefficient[rows[0]] > 0.0:
                 block_rows = np.arange(cones.ptr[block], cones.ptr[block + 1])
                 a = float(coefficient[rows[0]] * self.root[rows[0]] / self.root[block_rows[0]])
@@ -279,7 +279,7 @@ class _Island:
             self.f_rounding[block_rows] += lipschitz * _norm(self.y_rounding[block_rows]) + rounding
 
     def bound(self) -> tuple[FloatArray, FloatArray] | None:
-        """Compute error bounds of impulses and of margins, (n,) [N s] each; None if there is no bound."""
+        """Compute error bounds of impulses and of margins, (n,) [N s] each; None without a bound."""
         possible = np.isfinite(self.margin)
         uncertain, x = np.zeros(len(self.f), bool), np.zeros(len(self.f))
         for step in range(2 * MAX_UNCERTAINTY_STEPS):

@@ -72,11 +72,11 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     lam = problem.impulse_array(impulse)
     u = problem.slack(lam)
     c = problem.cones
-    if (c.apart_rows >= 0).any() or c.has_round or c.has_ellipse:
+    if (c.separate_rows >= 0).any() or c.has_round or c.has_ellipse:
         raise InputError("siconos_error has no spin rows, and no boxes or ellipses: its friction is a disk")
     components_of: dict[int, list[tuple[slice, float]]] = {}
-    coefficient, is_contact = c.reach, c.is_contact
-    for block, rows in c.parts():
+    coefficient, is_contact = c.friction_coefficient, c.is_contact
+    for block, rows in c.friction_components():
         in_block = slice(int(rows[0] - c.ptr[block]), int(rows[-1] - c.ptr[block]) + 1)
         components_of.setdefault(block, []).append((in_block, float(coefficient[rows[0]])))
     error = np.empty(problem.m)

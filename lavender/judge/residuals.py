@@ -10,7 +10,7 @@ step of one more projected update (w / d strictly inside the bounds; formulas in
               float64; no solver can guarantee less than about twice that
     success   relative <= tol
 
-Relative residual and floor are those of the worst island: each island (blocks connected through moving bodies, trees of
+Relative residual and floor belong to the worst island: each island (blocks connected through moving bodies, trees of
 M or entries of A) has its own E, V, E0 and V0, so bodies that never meet do not change each other's verdict. E shows
 errors of heavy bodies, V errors of light bodies. If the zero impulse solves an island, row by row to rounding, the
 reference is the size of the terms of its active rows (`lavender_ext/judge/reference.pxd`).
@@ -23,7 +23,7 @@ ill-conditioned M loses digits of x that no term above counts. If n 2^-53 cond(M
 pass is repeated with x refined by residuals in twice the precision of float64. The floor then also contains the change
 of w and a bound of the error that remains (`lavender_ext/judge/refine.pxd`).
 
-A solution computed in float32 has a different floor. Each number is rounded independently by at most u = 2^-24 of
+A solution computed in float32 has a different floor. Each number is rounded independently by up to u = 2^-24 of
 itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
 
     lambda rounded         u^2 A^2 lambda^2                                                                        (1)
@@ -35,7 +35,7 @@ itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with
 
 (5) counts if impulses are computed by lambda = (target - J v+) / theta, as in engines that minimise over velocities:
 in generalised coordinates, if every active row is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
-norms. A matrix whose numbers are float32 already has no rounding (2); forming A and b from J and M in float32 costs
+norms. A matrix of float32 numbers has no rounding (2); forming A and b from J and M in float32 costs
 about as much as rounding these.
 
 An ellipse is measured as the disk of stretched tangents, `Problem.disk`: the energy is unchanged, and the velocity
@@ -59,7 +59,7 @@ from lavender.base.arrays import (
     as_array,
     check_choice,
     check_float,
-    read_only,
+    mark_read_only,
 )
 from lavender.base.errors import InputError
 from lavender.base.renamed import build_attribute_error
@@ -67,7 +67,8 @@ from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
 
-MAX_EXCUSED_RESIDUAL = 1e-5  # -. A solver is not excused by rounding to float64 above this relative residual.
+# [-] Above this relative residual, rounding to float64 does not excuse a solver.
+MAX_EXCUSED_RESIDUAL = 1e-5
 #: Key of `Derived.cache`: the residual of a result that is about to be returned.
 JUDGED_KEY = "lavender.judge.residuals: judged"
 MAX_REST_VELOCITY = (
@@ -76,15 +77,15 @@ MAX_REST_VELOCITY = (
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half its spacing at 1
 # Times of the judge, fitted by the command that `solvers/setup_times.py` names.
 RESULT_TIME = 1e-4  # s to build one result
-PASS_TIME_PER_PRODUCT = 1.5e-9  # s for each multiply-add of a pass
-WHITENING_TIME_PER_PRODUCT = 4e-10  # s for each product of J L^-1
-READ_TIME_PER_ENTRY = 5e-9  # s for each entry of J L^-1 or of a matrix
+PASS_TIME_PER_PRODUCT = 1.5e-9  # [s] Time for each multiply-add of a pass.
+WHITENING_TIME_PER_PRODUCT = 4e-10  # [s] Time for each product of J L^-1.
+READ_TIME_PER_ENTRY = 5e-9  # [s] Time to read an entry of J L^-1 or of a matrix.
 PRODUCTS_PER_BODY_ROW = 32  # multiply-adds of a pass for each row between two bodies
 
 # at_floor(relative, floor) of one island; solvers and the judge share this test, its reason is in the kernel.
 at_floor = measure.at_floor
 
-TOL = 1e-6  # -, default tolerance of `residual` and `solve`
+TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
 DEFAULT_THRESHOLD = (
     1e-6  # m/s, default of `threshold`. The sensors of robots do not measure smaller velocity errors.
 )
@@ -161,7 +162,7 @@ class Residual:
     worst_row : int
         Row of the largest velocity error, -1 for an empty problem; `worst_name` is its name.
     above_floor : float, -
-        Largest relative residual of the islands whose residual rounding does not explain; 0 if there are none.
+        Largest relative residual of the islands with a residual that rounding does not explain; else 0.
     worst_island : int
         Island of `relative` (see `islands`), -1 if all blocks are one island.
     floor_energy : float, sqrt J
@@ -175,7 +176,7 @@ class Residual:
     rounding : Rounding or None
         With float32: contributions to the floor.
     threshold : float, m/s
-        Largest velocity error of an answer whose verdict is "close enough".
+        Largest velocity error of an answer with the verdict "close enough".
     """
 
     relative: float
@@ -211,19 +212,19 @@ class Residual:
         sqrt(3) standard deviations, and the maximum over many rows is larger. In float32, rounding of the data alone
         can be almost as large as the error of the zero impulse.
         """
-        return _at_floor(self.relative, self.above_floor, self.precision)
+        return _is_at_floor(self.relative, self.above_floor, self.precision)
 
     @property
     def rounds(self) -> bool:
-        """Whether rounding explains the residual, also if the impulse is no better than the zero impulse."""
-        return _rounds(self.relative, self.roundoff_floor, self.precision)
+        """Whether rounding explains the residual, even if the impulse is not better than the zero impulse."""
+        return _is_explained_by_rounding(self.relative, self.roundoff_floor, self.precision)
 
     @property
     def verdict(self) -> str:
         """Verdict: "at its floor", "close enough", "stopped before convergence" (see `excess`) or "wrong".
 
         At its floor: `at_floor` holds. Close enough: it does not, but no row's velocity error exceeds `threshold`.
-        Wrong: not finite, or an error as large as that of the zero impulse. A residual cannot distinguish a smaller
+        Wrong: not finite, or an error as large as the zero impulse's. A residual cannot distinguish a smaller
         mistake from a stop before convergence: a different mu, for example, leaves the same error.
         """
         return compute_verdict(
@@ -281,12 +282,12 @@ class Residual:
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
 
 
-def _rounds(relative: float, floor: float, precision: str) -> bool:
+def _is_explained_by_rounding(relative: float, floor: float, precision: str) -> bool:
     """Compute `Residual.rounds` from numbers."""
     return relative <= (2.0 if precision == "float64" else 4.0) * floor < math.inf
 
 
-def _at_floor(relative: float, above_floor: float, precision: str) -> bool:
+def _is_at_floor(relative: float, above_floor: float, precision: str) -> bool:
     """Compute `Residual.at_floor` from numbers."""
     return above_floor == 0.0 and (precision == "float64" or relative < 1.0)
 
@@ -306,9 +307,9 @@ def compute_verdict(
 
     `nothing`: the zero impulse is a solution; `energy_rhs` [sqrt J] is the norm of b.
     """
-    if _at_floor(relative, above_floor, precision):
+    if _is_at_floor(relative, above_floor, precision):
         return AT_FLOOR
-    if nothing and _rounds(relative, floor, precision):
+    if nothing and _is_explained_by_rounding(relative, floor, precision):
         # The reference is rounding noise, so compare with b: a diverged impulse has a larger error.
         return AT_FLOOR if energy <= energy_rhs else WRONG
     if velocity <= threshold:
@@ -352,7 +353,7 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
     return measure.Judged(data, impulse)
 
 
-def best_of_islands(
+def combine_best_islands(
     problem: Problem, starts: Sequence[FloatArray], impulses: Sequence[FloatArray], tol: float
 ) -> FloatArray:
     """Return the best of starts and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
@@ -365,21 +366,21 @@ def best_of_islands(
     return best
 
 
-def judging_time(problem: Problem) -> float:
+def estimate_judging_time(problem: Problem) -> float:
     """Estimate the time [s] of one pass of the judge and of building its result, from the size of its data."""
     return RESULT_TIME + PASS_TIME_PER_PRODUCT * (
         float(problem.metric.work) if _is_set_up(problem) else _estimate_pass(problem)[0]
     )
 
 
-def setup_time(problem: Problem) -> float:
+def estimate_judge_setup_time(problem: Problem) -> float:
     """Estimate the time [s] to set up the judge's first pass: A by rows, J L^-1, or the arrays of bodies."""
     return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
 
 
-def reading_time(problem: Problem) -> float:
+def estimate_pass_time(problem: Problem) -> float:
     """Estimate the time [s] to set up and run one pass without building a result."""
-    return setup_time(problem) + judging_time(problem) - RESULT_TIME
+    return estimate_judge_setup_time(problem) + estimate_judging_time(problem) - RESULT_TIME
 
 
 def _is_set_up(problem: Problem) -> bool:
@@ -408,7 +409,7 @@ def store_result(problem: Problem, last: measure.Judged) -> None:
     problem.derived.cache[JUDGED_KEY] = last
 
 
-def find_stored(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
+def find_stored_residual(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
     """Return the stored result if it belongs to `impulse`, bit for bit, and to this problem; else None."""
     last: measure.Judged | None = problem.derived.cache.get(JUDGED_KEY)
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
@@ -418,7 +419,7 @@ def find_stored(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
 
 def find_known_relative(problem: Problem, impulse: FloatArray) -> float | None:
     """Return the relative residual if `impulse` is the stored or the zero impulse, bit for bit; else None."""
-    last = find_stored(problem, impulse)
+    last = find_stored_residual(problem, impulse)
     if last is not None:
         return float(last.relative)
     start: float = problem.metric.relative_at_zero
@@ -490,7 +491,7 @@ def residual(
         return convert_from_disk(
             problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         )
-    judgement = find_stored(problem, impulse)
+    judgement = find_stored_residual(problem, impulse)
     problem.derived.cache.pop(JUDGED_KEY, None)
     if judgement is None:
         judgement = judge_impulse(problem, impulse)
@@ -506,7 +507,7 @@ def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
     """Convert the residual of `problem.disk` to one of `problem`, which has ellipses."""
     s = problem.cones.stretch
     with np.errstate(over="ignore"):
-        error, slack = read_only(s * of_disk.error), read_only(of_disk.slack / s)
+        error, slack = mark_read_only(s * of_disk.error), mark_read_only(of_disk.slack / s)
     return replace(of_disk, error=error, slack=slack, _problem=problem)
 
 
@@ -519,7 +520,7 @@ def _with_float32_floor(problem: Problem, result: Residual, impulse: FloatArray)
     floors = [measure.size_of_square(problem.metric, x) for x in squares]
     *contributions, floor = (x[max(result.worst_island, 0)] for x in floors)
     is_rounding = [
-        _rounds(x, island_floor, "float32") and x < 1.0
+        _is_explained_by_rounding(x, island_floor, "float32") and x < 1.0
         for x, island_floor in zip(relative, floors[-1], strict=True)
     ]
     above = max((x for x, rounds in zip(relative, is_rounding, strict=True) if not rounds), default=0.0)
@@ -539,7 +540,7 @@ def estimate_float32_errors(
         )
         return of_impulse, of_data, of_velocities
     unit, zeros = UNIT_ROUNDOFF_FLOAT32 * UNIT_ROUNDOFF_FLOAT32, np.zeros(problem.m)
-    a, b, lam = _squared(problem.csr), problem.b**2, impulse**2
+    a, b, lam = _square_entries(problem.csr), problem.b**2, impulse**2
     of_impulse = a @ lam
     if problem.matrix is not None:
         of_data = zeros if problem.precision == "float32" else unit * (of_impulse + b)
@@ -549,14 +550,14 @@ def estimate_float32_errors(
     assert rows is not None
     inverse = rows.inverse_mass_matrix()
     x, free = inverse @ (jac.T @ impulse), rows.v_free.ravel()
-    of_inverse = _squared(jac @ inverse) @ (_squared(jac.T) @ lam)
-    of_inverse += _squared(jac) @ (_squared(inverse) @ (jac.T @ impulse) ** 2)
-    of_rhs = (problem.b + jac @ free) ** 2 + 2.0 * (_squared(jac) @ free**2)
-    of_data = _squared(jac) @ x**2 + of_inverse + compliance**2 * lam + of_rhs
+    of_inverse = _square_entries(jac @ inverse) @ (_square_entries(jac.T) @ lam)
+    of_inverse += _square_entries(jac) @ (_square_entries(inverse) @ (jac.T @ impulse) ** 2)
+    of_rhs = (problem.b + jac @ free) ** 2 + 2.0 * (_square_entries(jac) @ free**2)
+    of_data = _square_entries(jac) @ x**2 + of_inverse + compliance**2 * lam + of_rhs
     return unit * of_impulse, unit * of_data, zeros
 
 
-def _squared(a: Any) -> Any:
+def _square_entries(a: Any) -> Any:
     """Square every entry of a sparse matrix."""
     return a.multiply(a).tocsr()
 
@@ -575,8 +576,8 @@ def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
         "worst_row": judgement.worst,
         "energy_at_zero": problem.metric.reference_energy,
         "velocity_at_zero": problem.metric.reference_velocity,
-        "error": read_only(judgement.error),
-        "slack": read_only(judgement.slack),
+        "error": mark_read_only(judgement.error),
+        "slack": mark_read_only(judgement.slack),
         "_problem": problem,
         "_impulse": judgement.impulse,
         "precision": "float64",

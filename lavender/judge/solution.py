@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_choice, format_html_table, read_only
+from lavender.base.arrays import FloatArray, check_choice, format_html_table, mark_read_only
 from lavender.base.errors import SolveFailed
 from lavender.base.lazy_import import lazy_module
 from lavender.base.renamed import build_attribute_error
@@ -267,7 +267,7 @@ class Solution:
         rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
         setup_time: float = 0.0,
     ) -> Solution:
-        """Build a solution whose other fields `rest` (a function and its arguments) computes at their first access."""
+        """Build a solution; `rest` (a function and its arguments) computes the other fields when one is first read."""
         solution: Solution = object.__new__(cls)
         attributes = solution.__dict__
         attributes["impulse"], attributes["status"], attributes["tol"] = impulse, status, tol
@@ -292,7 +292,7 @@ class Solution:
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict cannot be pickled.
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return _restored, (values | {"work": dict(self.work)},)
+        return _rebuild_solution, (values | {"work": dict(self.work)},)
 
     @property
     def slack(self) -> FloatArray:
@@ -304,9 +304,9 @@ class Solution:
         """State of each block (open, sticks, slides, at a bound or free), and which states are uncertain."""
         attributes = self.__dict__
         if "_states" not in attributes:
-            from lavender.judge.states import states_of
+            from lavender.judge.states import compute_states
 
-            attributes["_states"] = states_of(self.residual._problem, self.impulse)
+            attributes["_states"] = compute_states(self.residual._problem, self.impulse)
         states: States = attributes["_states"]
         return states
 
@@ -337,11 +337,14 @@ class Solution:
     def unstretched(self, problem: Problem) -> Solution:
         """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
         s = problem.cones.stretch
-        impulse, proof = read_only(s * self.impulse), self.certificate
+        impulse, proof = mark_read_only(s * self.impulse), self.certificate
         # The residual of the returned numbers, since s (lambda / s) rounds.
         found = residual(problem, impulse, "float64", tol=self.tol)
         return replace(
-            self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
+            self,
+            impulse=impulse,
+            residual=found,
+            certificate=None if proof is None else mark_read_only(s * proof),
         )
 
     def motion_error(self, reference: Any = None) -> Any:
@@ -369,8 +372,8 @@ class Solution:
             "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
             "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
             "floor of float64": f"{self.residual.roundoff_floor:.1e}",
-            "work": self._done,
-            "time": self._took,
+            "work": self._work_text,
+            "time": self._time_text,
         }
         if self.claim_check != CONFIRMED:
             facts[self.claim_check] = self.status_conflict or self.status.name
@@ -380,13 +383,15 @@ class Solution:
         return f"<Solution {self}>"
 
     @property
-    def _done(self) -> str:
+    def _work_text(self) -> str:
         """Work that was done, in words."""
-        done = ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
+        done = ", ".join(
+            format_work_count(n, k) for k, n in (self.work or {"iterations": self.iterations}).items()
+        )
         return f"{done}, order {self.solver.order}" if self.solver.order else done
 
     @property
-    def _took(self) -> str:
+    def _time_text(self) -> str:
         """Time that the solve took, in words."""
         t = self.setup_time + self.solve_time
         return f"{1e3 * t:.3g} ms" if t < 0.9995 else f"{t:.3g} s"
@@ -395,23 +400,23 @@ class Solution:
         note = f"; {self.message}" if self.message else ""
         wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
         return (
-            f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
-            f"{self._took}{note}{wrong}"
+            f"{self.solver.name}: {self.status.name}, {self.residual}, {self._work_text}, "
+            f"{self._time_text}{note}{wrong}"
         )
 
 
-def order_name(order: Any) -> str:
+def get_order_name(order: Any) -> str:
     """Return the name of a sweep order; an array of blocks is a permutation."""
     return order if isinstance(order, str) else "permutation"
 
 
-def counted(n: int, kind: str) -> str:
+def format_work_count(n: int, kind: str) -> str:
     """Format a count of `work` with its name: 1 sweep, 2 sweeps."""
     kind = kind.replace("_", " ")
     return f"{n} {kind.removesuffix('s') if n == 1 else kind}"
 
 
-def summed(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def sum_work(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add the work of several claims or stages, kind by kind."""
     out: dict[str, int] = {}
     for work in works:
@@ -420,13 +425,13 @@ def summed(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return out
 
 
-def uninterrupted(solution: Solution) -> Solution:
+def raise_if_interrupted(solution: Solution) -> Solution:
     """Return the solution to a caller that continues; raise KeyboardInterrupt if Ctrl-C ended its solve."""
     if solution.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return solution
 
 
-def _restored(values: dict[str, Any]) -> Solution:
+def _rebuild_solution(values: dict[str, Any]) -> Solution:
     """Rebuild a pickled solution."""
     return Solution.of(values | {"work": MappingProxyType(values["work"])})

@@ -45,7 +45,7 @@ class State:
         Distance to the nearest other state; inf if there is none.
     tolerance : float, N s
         Error bound: an exact solution exists at which the block's impulse (by the norm of its rows) and margin differ
-        from the answer's by at most this; inf if no bound is known.
+        from the answer's by up to this; inf if no bound is known.
     """
 
     name: str
@@ -80,7 +80,7 @@ class States(Sequence[State]):
     problem : Problem
     impulse : (m,), N s
     linear : Linear
-        Result of `linear_of(problem, impulse)`.
+        Result of `linearise_at(problem, impulse)`.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class States(Sequence[State]):
             self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return states_of, (self._problem, self._impulse)
+        return compute_states, (self._problem, self._impulse)
 
     @cached_property
     def tolerance(self) -> FloatArray:
@@ -122,7 +122,7 @@ class States(Sequence[State]):
 
     @property
     def boundary(self) -> tuple[int, ...]:
-        """Blocks whose state is not certain (`State.at_boundary`), including blocks without an error bound."""
+        """Blocks with an uncertain state (`State.at_boundary`), including blocks without an error bound."""
         return tuple(int(i) for i in np.flatnonzero((self.margin <= self.tolerance) & (self.margin < np.inf)))
 
     @property
@@ -156,7 +156,7 @@ class States(Sequence[State]):
         return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
 
 
-def linear_of(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
+def linearise_at(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
     """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `max_rows`: see `Linears`."""
     data = problem.disk.metric
     if data.reference_energy < 0.0:
@@ -164,6 +164,6 @@ def linear_of(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linea
     return Linears([data], [problem.on_disk(impulse)], max_rows).item(0)
 
 
-def states_of(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
-    """Return the states at an impulse (m,) [N s]; `linear` is `linear_of(problem, impulse)` if it is known."""
-    return States(problem, impulse, linear_of(problem, impulse) if linear is None else linear)
+def compute_states(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
+    """Return the states at an impulse (m,) [N s]; `linear` is `linearise_at(problem, impulse)` if it is known."""
+    return States(problem, impulse, linearise_at(problem, impulse) if linear is None else linear)

@@ -36,7 +36,7 @@ from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.states import VECTOR
-from lavender.io.stored import folder_for_steps, write_arrays
+from lavender.io.stored import open_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
@@ -50,10 +50,10 @@ from lavender.lab.simulated_worlds import (
     Divergence,
     Runs,
     StepSizes,
-    can_touch,
-    fields_of,
+    can_any_geoms_collide,
     iterate_frames,
     simulate_world,
+    split_state_vector,
 )
 from lavender.problem import PRECISIONS, Problem
 
@@ -194,40 +194,40 @@ class Audit:
         return (self.verdict >= 0) & (self.verdict < NOT_JUDGED)
 
     @property
-    def unconverged(self) -> Any:
+    def is_unconverged(self) -> Any:
         """(worlds, steps) bool: whether the solve stopped before convergence, or is wrong."""
         return (self.verdict == AUDIT_VERDICTS.index(UNCONVERGED)) | (
             self.verdict == AUDIT_VERDICTS.index(WRONG)
         )
 
     @property
-    def judged(self) -> int:
+    def n_judged(self) -> int:
         """Number of steps judged."""
         return int(np.count_nonzero(self.is_judged))
 
     @property
-    def unjudged(self) -> int:
+    def n_unjudged(self) -> int:
         """Number of steps that were requested and not judged."""
-        return self.verdict.size - self.judged
+        return self.verdict.size - self.n_judged
 
     @property
-    def done(self) -> int:
+    def n_processed(self) -> int:
         """Number of steps that the audit processed."""
         return int(np.count_nonzero(self.verdict >= 0))
 
     @property
-    def diverged(self) -> int:
+    def n_diverged(self) -> int:
         """Number of steps in which a world diverged: one for each world that diverged."""
         return len(self.divergences)
 
     @property
-    def largest(self) -> float:
+    def max_velocity_error(self) -> float:
         """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
         measured = self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))
         return float(np.max(self.numbers[0][measured], initial=0.0))
 
     @property
-    def sizes(self) -> StepSizes:
+    def judged_sizes(self) -> StepSizes:
         """Rows and contacts of the steps judged."""
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
@@ -242,9 +242,9 @@ class Audit:
         return bool(np.all(close | (verdict == AUDIT_VERDICTS.index(AT_FLOOR))))
 
     @property
-    def head(self) -> str:
+    def summary_text(self) -> str:
         """Summary in a few sentences."""
-        unconverged, judged = self.unconverged, self.judged
+        unconverged, judged = self.is_unconverged, self.n_judged
         worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
         n = int(unconverged.sum())
         text = (
@@ -254,10 +254,11 @@ class Audit:
         if n:
             text += (
                 f" ({format_percent(n, judged, 1)}), in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
-                f"the worst error is {format_size(self.largest)} m/s"
+                f"the worst error is {format_size(self.max_velocity_error)} m/s"
             )
-        warning = "" if self.sizes.is_enough else (
-            f"Only {self.sizes.sentence}: this is too little to rate the solver. Start from other states with --states."
+        warning = "" if self.judged_sizes.has_enough_contact else (
+            f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
+            "Start from other states with --states."
         )  # fmt: skip
         more = [self._divergence_sentence, warning]
         return " ".join([f"{text}.", *filter(None, more)])
@@ -271,10 +272,10 @@ class Audit:
         if not self.divergences:
             return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
         first = min(d.step for d in self.divergences)
-        text = f"{format_count(self.diverged, 'world')} diverged, in step {first} at the earliest"
+        text = f"{format_count(self.n_diverged, 'world')} diverged, in step {first} at the earliest"
         text += f"; {unjudged} {were} not judged." if lost.any() else "."
         exact = sum(map(self.has_exact_solves, self.divergences))
-        if exact == self.diverged:
+        if exact == self.n_diverged:
             return f"{text} Every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
         if exact:
             text += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
@@ -285,7 +286,7 @@ class Audit:
         """Quantiles of the errors over all steps judged, and over those that stopped before convergence."""
         heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
         rows: list[list[str | Cell]] = []
-        for of, selected in (("all steps judged", self.is_judged), (UNCONVERGED, self.unconverged)):
+        for of, selected in (("all steps judged", self.is_judged), (UNCONVERGED, self.is_unconverged)):
             for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
                 known = x[selected & np.isfinite(x)]
                 if len(known):
@@ -301,7 +302,9 @@ class Audit:
             here = self.verdict == i
             if here.any():
                 worlds = str(np.count_nonzero(here.any(axis=1)))
-                rows.append([word, str(here.sum()), format_percent(int(here.sum()), self.done, 2), worlds])
+                rows.append(
+                    [word, str(here.sum()), format_percent(int(here.sum()), self.n_processed, 2), worlds]
+                )
         return Table(["verdict", "steps", "share", "worlds"], rows, words=frozenset({"verdict"}))
 
     @property
@@ -341,7 +344,7 @@ class Audit:
         parts = [self.numbers[0][:, k : k + width] for k in range(0, self.runs.steps, width)]
         known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
         curves = tuple(
-            Curve.of(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
+            Curve.from_points(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
             for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0)) if known
         )  # fmt: skip
         return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
@@ -357,7 +360,7 @@ class Audit:
         mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
-        with folder_for_steps(folder / "worst", replace=True) as worst:
+        with open_step_folder(folder / "worst", replace=True) as worst:
             for i, w in enumerate(self.worst, 1):
                 npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
         names = self.worst[0].state if self.worst else ()
@@ -373,13 +376,15 @@ class Audit:
     @property
     def totals(self) -> dict[str, Any]:
         """Totals, as `numbers.json` holds them."""
-        runs, unconverged = self.runs, self.unconverged
+        runs, unconverged = self.runs, self.is_unconverged
         divergences = [d._asdict() | {"exact": self.has_exact_solves(d)} for d in self.divergences]
         return {
-            "head": self.head, "engine": self.engine, "model": runs.model, "worlds": runs.worlds, "steps": runs.steps,
-            "seed": runs.seed, "judged": self.judged, "unjudged": self.unjudged, "diverged": self.diverged,
+            "head": self.summary_text, "engine": self.engine, "model": runs.model, "worlds": runs.worlds,
+            "steps": runs.steps,
+            "seed": runs.seed, "judged": self.n_judged, "unjudged": self.n_unjudged, "diverged": self.n_diverged,
             "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
-            "largest": self.largest, "divergences": divergences, **self.sizes.numbers, "busy": self.busy,
+            "largest": self.max_velocity_error, "divergences": divergences, **self.judged_sizes.as_dict,
+            "busy": self.busy,
             "stopped": self.stopped,
         }  # fmt: skip
 
@@ -387,12 +392,12 @@ class Audit:
     def summary_page(self) -> SummaryPage:
         """The summary page."""
         return SummaryPage(
-            "lavender audit", self.head,
+            "lavender audit", self.summary_text,
             [
                 PageSection(
                     "Errors", [self.table_of_errors, self.table_of_verdicts], [self.figure], ERRORS_NOTE, short=4
                 ),
-                PageSection("Rows and contacts", [self.sizes.table], short=2, note=SIZES_NOTE),
+                PageSection("Rows and contacts", [self.judged_sizes.size_table], short=2, note=SIZES_NOTE),
                 PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
                 PageSection("Worst rows", [self.table_of_rows], short=3,
                         note="Rows that were the worst of a step that stopped before convergence."),
@@ -467,16 +472,21 @@ def audit(
         if watch is not None:
             watch(Event(0, 0, "timing one world", ""))
         expected_time = DEFAULT_DURATION
-        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed, spread=spread).start_from(states)
+        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed, spread=spread).with_start_states(
+            states
+        )
         worlds = choose_worlds(one, judging, count_processes(workers) if engine == "mujoco" else 1)
-    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
+    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).with_start_states(
+        states
+    )
     numbers, verdict = (
         np.full((len(WORST_ROW_ERRORS), worlds, steps), np.nan),
         np.full((worlds, steps), -1, np.int8),
     )
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(
-        runs, engine, numbers, verdict, rows=rows, contacts=contacts, can_touch=can_touch(*runs.load()), where={},
+        runs, engine, numbers, verdict, rows=rows, contacts=contacts,
+        can_touch=can_any_geoms_collide(*runs.load_model()), where={},
         worst=[], divergences=[],
     )  # fmt: skip
     loads, processes = [], 1
@@ -501,25 +511,25 @@ def audit(
                 result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
             result.worst[:] = _select_worst([*result.worst, *piece.worst])
             result.divergences[:] = sorted([*result.divergences, *piece.divergences])
-            loads.append(machine.running())
+            loads.append(machine.count_runnable_processes())
             if watch is not None:
                 # The time before the first results contains the start of the workers.
-                first = first or (result.done, perf_counter())
-                elapsed, since = perf_counter() - first[1], result.done - first[0]
+                first = first or (result.n_processed, perf_counter())
+                elapsed, since = perf_counter() - first[1], result.n_processed - first[0]
                 remaining = (
                     None if expected_time is None else max(0.0, expected_time + begin - perf_counter())
                 )
                 if since and elapsed >= MIN_PROGRESS_TIME:
-                    remaining = elapsed * (worlds * steps - result.done) / since
-                text = f"steps judged, {int(result.unconverged.sum())} {UNCONVERGED}"
-                watch(Event(result.done, worlds * steps, text, "", remaining=remaining))
+                    remaining = elapsed * (worlds * steps - result.n_processed) / since
+                text = f"steps judged, {int(result.is_unconverged.sum())} {UNCONVERGED}"
+                watch(Event(result.n_processed, worlds * steps, text, "", remaining=remaining))
     except KeyboardInterrupt:
-        if not result.done:
+        if not result.n_processed:
             raise
-    if not result.done:
+    if not result.n_processed:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
     busy = machine.describe_busy(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
-    return replace(result, stopped=result.done < worlds * steps, busy=busy)
+    return replace(result, stopped=result.n_processed < worlds * steps, busy=busy)
 
 
 def count_processes(workers: int) -> int:
@@ -565,14 +575,14 @@ def _audit_mujoco(runs: Runs, judging: tuple[str, float], workers: int, backend:
 
 
 def _reject_unsupported_model(runs: Runs) -> None:
-    """Raise the error of a model whose constraint problems cannot be built, once and before any worker starts."""
-    _, model = runs.load()
+    """Raise an error if the model's constraint problems cannot be built, once and before any worker starts."""
+    _, model = runs.load_model()
     from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
 
 
 def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
     """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
-    mj, model = runs.load()
+    mj, model = runs.load_model()
     simulations = [simulate_world(mj, model, runs, world) for world in worlds]
     states = np.concatenate([states for states, _ in simulations])
     divergences = [divergence for _, divergence in simulations if divergence is not None]
@@ -586,7 +596,7 @@ def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[
         assert impulse is not None
 
         def state_of(k: int, selection: FloatArray = states[selection]) -> dict[str, FloatArray]:
-            return fields_of(mj, model, selection[k]) | {VECTOR: selection[k].copy()}
+            return split_state_vector(mj, model, selection[k]) | {VECTOR: selection[k].copy()}
 
         sizes = batch.row_counts, batch.contact_counts
         out.append(_judge_steps(batch, impulse, judging, world[selection], step[selection], state_of, sizes))

@@ -17,9 +17,9 @@ import numpy as np
 from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
-from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
+from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
-from lavender.lab.motion.bound import separation
+from lavender.lab.motion.bound import compute_separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.solve import check_budget, check_time_limit
@@ -261,7 +261,7 @@ def _check_solver(
         return CrossCheckRow(name, REFUSED, note=reason)
     run = name if other is None else other.name
     try:
-        solution = uninterrupted(run_solver(run))
+        solution = raise_if_interrupted(run_solver(run))
     except Exception as error:
         if isinstance(error, TaskFailed):
             return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
@@ -272,7 +272,7 @@ def _check_solver(
             raise
         # A plug-in may raise any exception; only its own row is lost.
         return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
-    return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
+    return replace(compare_with_reference(problem, name, solution, optimum), ran="" if other is None else run)
 
 
 def _solve_reference(
@@ -297,7 +297,9 @@ def _solve_reference(
         try:
             # A reference may take longer than a solver.
             budget = 100 * spec.max_iter if spec.resumable else None
-            solution = uninterrupted(run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget))
+            solution = raise_if_interrupted(
+                run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)
+            )
         except Exception as error:
             if spec.builtin and not isinstance(error, LavenderError):
                 raise
@@ -312,7 +314,9 @@ def _solve_reference(
     return None, None, "; ".join(failed)
 
 
-def compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
+def compare_with_reference(
+    problem: Problem, name: str, solution: Solution, optimum: Solution | None
+) -> CrossCheckRow:
     """Compare one solver's solution with the optimum and build its row."""
     r = solution.residual
     note = "; ".join(
@@ -328,12 +332,12 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
         with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
-            distance, allowed = separation(problem, solution, optimum)
+            distance, allowed = compute_separation(problem, solution, optimum)
             fields |= {
                 "distance": distance,
                 "allowed": allowed,
                 "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
-                "objective": _objective(problem, solution) - _objective(problem, optimum),
+                "objective": _compute_objective(problem, solution) - _compute_objective(problem, optimum),
             }
         verdict, breached = AGREES, distance > allowed
     if breached:
@@ -352,7 +356,7 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     return CrossCheckRow(name, verdict, note=note, **fields)
 
 
-def _objective(problem: Problem, solution: Solution) -> float:
+def _compute_objective(problem: Problem, solution: Solution) -> float:
     """Compute the objective 1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
     if problem.has_singular_program:
         return float(problem.qp.solution(solution).objective)

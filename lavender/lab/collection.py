@@ -1,7 +1,7 @@
 """The citable problem set: the cases of the suite's sets, and the proved properties of each problem's solution.
 
     enclosed    an exact solution is proved to lie within `radius` m/s of an answer (`lavender.prove`)
-    infeasible  a certificate, checked by the judge, proves that there is no solution
+    infeasible  a certificate, checked by the judge, proves that no solution exists
     open        neither is proved: `reason` says why
 
 `manifest.json` in this folder has a line for each problem. Its `sha` is a hash of all numbers, so that anybody can
@@ -23,7 +23,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.io.stored import read_whole_file, write_text
 from lavender.judge.solution import CONFIRMED, Status
 from lavender.lab import suite
-from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
+from lavender.lab.bench.cases import compute_condition, hash_problem, is_path, resolve_sources
 from lavender.lab.motion import find_solutions
 from lavender.lab.proof import prove
 from lavender.problem import Problem
@@ -93,21 +93,21 @@ class Entry:
     reason: str = ""
 
 
-def certify(problem: Problem, name: str, group: str) -> Entry:
+def certify_problem(problem: Problem, name: str, group: str) -> Entry:
     """Build the entry of a problem, with a proof or a certificate if there is one; needs the extra `proof`."""
-    package = suite.package_of(name)
+    package = suite.get_model_package(name)
     answer = solve(problem, "auto", tol=1e-12, time_limit=ANSWER_TIME_LIMIT)
     entry = Entry(
         name=name,
         group=group,
-        sha=fingerprint(problem),
+        sha=hash_problem(problem),
         rows=problem.m,
         law=problem.law,
         form=problem.operator,
         licence=suite.LICENCES.get(package, ""),
-        made=suite.versions(package),
-        sweeps=difficulty(problem),
-        condition=condition(problem),
+        made=suite.get_package_versions(package),
+        sweeps=count_sweeps_to_thousandth(problem),
+        condition=compute_condition(problem),
         degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
     base = asdict(entry)
@@ -128,7 +128,7 @@ def certify(problem: Problem, name: str, group: str) -> Entry:
     return Entry(**base)
 
 
-def difficulty(problem: Problem) -> int | None:
+def count_sweeps_to_thousandth(problem: Problem) -> int | None:
     """Count the sweeps that `pgs` needs to a thousandth of the zero impulse's error; None if they do not suffice."""
     try:
         found = solve(problem, "pgs", impulse=problem.start(), tol=1e-3, max_iter=MAX_SWEEPS)
@@ -137,19 +137,19 @@ def difficulty(problem: Problem) -> int | None:
     return found.iterations if found.success else None
 
 
-def entries(groups: Iterable[str]) -> Iterator[Entry]:
+def certify_groups(groups: Iterable[str]) -> Iterator[Entry]:
     """Certify every problem of these sets, files and folders; of all sets if none is named."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
         if is_path(group):
-            for item in resolve(group):
-                yield certify(item.problem, item.name, "recorded")
-                item.forget()
+            for item in resolve_sources(group):
+                yield certify_problem(item.problem, item.name, "recorded")
+                item.release_problem()
             continue
         for case in suite.cases(f"@{group}"):
-            yield certify(case.problem, case.name, group)
+            yield certify_problem(case.problem, case.name, group)
 
 
-def save(entries_to_save: Iterable[Entry], path: Path | str) -> None:
+def save_manifest(entries_to_save: Iterable[Entry], path: Path | str) -> None:
     """Write a manifest."""
     defaults = {f.name: f.default for f in fields(Entry)}
     lines = [{k: v for k, v in asdict(e).items() if v != defaults[k]} for e in entries_to_save]
@@ -157,7 +157,7 @@ def save(entries_to_save: Iterable[Entry], path: Path | str) -> None:
     write_text(path, f"[{text}]\n")
 
 
-def load(path: Path | str = MANIFEST) -> list[Entry]:
+def load_manifest(path: Path | str = MANIFEST) -> list[Entry]:
     """Read a manifest.
 
     Raises
@@ -176,7 +176,11 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
 def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
     """Select the entries with installed models; return them and a line for each missing package."""
     entries = list(entries)
-    missing = {e.name: suite.missing(package) for e in entries if (package := suite.package_of(e.name))}
+    missing = {
+        e.name: suite.explain_missing_packages(package)
+        for e in entries
+        if (package := suite.get_model_package(e.name))
+    }
     buildable = [e for e in entries if not missing.get(e.name)]
     return buildable, sorted({message for message in missing.values() if message})
 
@@ -185,20 +189,20 @@ def find_changes(entries: Iterable[Entry]) -> Iterator[str]:
     """Build every problem again from its name; yield a line for each that has other numbers."""
     for entry in entries:
         problem = suite.case(entry.name).problem
-        if (now := fingerprint(problem)) != entry.sha:
-            here = suite.versions(suite.package_of(entry.name))
+        if (now := hash_problem(problem)) != entry.sha:
+            here = suite.get_package_versions(suite.get_model_package(entry.name))
             why = f"; made with {entry.made}, here {here}" if here != entry.made else ""
             yield f"{entry.name}: {now} here, {entry.sha} in the manifest{why}"
 
 
-def describe(entry: Entry) -> str:
+def describe_properties(entry: Entry) -> str:
     """Describe the proved properties of a problem in a few words."""
     text = f"enclosed within {entry.radius:.1e} m/s" if entry.radius is not None else entry.known
     more = ", one motion" if entry.unique else ""
     return text + more + (f", at least {entry.motions} motions" if entry.motions > 1 else "")
 
 
-def page(entries: list[Entry], recorded: Sequence[Entry] = ()) -> str:
+def format_catalogue(entries: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     """Write the catalogue: counts of proved properties, and problems without a solution, with several, or open.
 
     `recorded` holds the entries of files of other projects.
@@ -257,7 +261,9 @@ def page(entries: list[Entry], recorded: Sequence[Entry] = ()) -> str:
         out.append("| " + " | ".join(map(str, cells)) + " |")
     if recorded:
         out += ["## Recorded files", "| file | sha | rows | law | known |\n|---|---|---|---|---|"]
-        out += [f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {describe(e)} |" for e in recorded]
+        out += [
+            f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {describe_properties(e)} |" for e in recorded
+        ]
     solutions = [e for e in found if e.motions > 1]
     for title, selected, cell in (
         ("No solution", [e for e in found if e.known == "infeasible"], lambda e: e.reason),

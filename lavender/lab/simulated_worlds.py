@@ -87,19 +87,19 @@ class Runs:
         check_int("seed", self.seed, high=None)
         check_float("spread", self.spread, low=0.0)
 
-    def load(self) -> tuple[Any, Any]:
+    def load_model(self) -> tuple[Any, Any]:
         """Load MuJoCo and the model; InputError if it cannot be read, or the controls do not fit."""
         mj, model = load_model(self.model)
         make_controller(model, self.control, self.seed)
         return mj, model
 
-    def start_from(self, states: Any) -> Runs:
+    def with_start_states(self, states: Any) -> Runs:
         """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
         if states is None:
             return self
-        return replace(self, starts=read_states(*self.load(), states).subset(self.worlds))
+        return replace(self, starts=read_states(*self.load_model(), states).select_evenly(self.worlds))
 
-    def start(self, mj: Any, model: Any, world: int) -> Any:
+    def create_start_data(self, mj: Any, model: Any, world: int) -> Any:
         """Create the MjData with which a world starts."""
         data, exact = mj.MjData(model), 1
         if self.starts is not None:
@@ -110,7 +110,7 @@ class Runs:
             data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(model.nv)
         return data
 
-    def drive(self, model: Any, world: int) -> Any:
+    def make_controller(self, model: Any, world: int) -> Any:
         """Return the function (data, step) -> controls of a world."""
         drive = make_controller(model, self.control, self.seed + world)
         if self.starts is None or self.starts.controls is None:
@@ -137,7 +137,7 @@ class StepSizes:
     can_touch: bool
 
     @property
-    def is_enough(self) -> bool:
+    def has_enough_contact(self) -> bool:
         """Whether enough of the steps have contact to recommend a setting."""
         return self._n_with_contact >= MIN_CONTACT_SHARE * len(self.rows)
 
@@ -147,7 +147,7 @@ class StepSizes:
         return int(np.count_nonzero(self.contacts if self.can_touch else self.rows))
 
     @property
-    def sentence(self) -> str:
+    def contact_phrase(self) -> str:
         """Phrase with the number of steps that have contact and the fraction that is needed."""
         n, object_name = len(self.rows), "contact" if self.can_touch else "a constraint"
         fraction = f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})" if n else ""
@@ -155,7 +155,7 @@ class StepSizes:
         return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
 
     @property
-    def table(self) -> Table:
+    def size_table(self) -> Table:
         """Median and maximum of rows and contacts, and the fraction of steps that have any."""
         rows = []
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
@@ -166,7 +166,7 @@ class StepSizes:
         return Table(heads, rows, words=frozenset(heads[:1]))
 
     @property
-    def numbers(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """The contents of `table` for numbers.json."""
         numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
@@ -179,7 +179,7 @@ class StepSizes:
         return numbers
 
 
-def can_touch(mj: Any, model: Any) -> bool:
+def can_any_geoms_collide(mj: Any, model: Any) -> bool:
     """Whether any two geoms of the model can collide."""
     if model.opt.disableflags & (mj.mjtDisableBit.mjDSBL_CONTACT | mj.mjtDisableBit.mjDSBL_CONSTRAINT):
         return False
@@ -245,7 +245,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
     divergence : Divergence or None
     """
     kind = mj.mjtState.mjSTATE_INTEGRATION
-    data, drive = runs.start(mj, model, world), runs.drive(model, world)
+    data, drive = runs.create_start_data(mj, model, world), runs.make_controller(model, world)
     states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
     for step in range(runs.steps):
         data.ctrl[:] = drive(data, step)
@@ -257,7 +257,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
             return states, Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
         if has_diverged(mj, data):
             states[step + 1 :] = np.nan
-            return states, _divergence_of(mj, model, data, states[step], world, step)
+            return states, _find_divergence(mj, model, data, states[step], world, step)
     return states, None
 
 
@@ -270,7 +270,7 @@ def has_diverged(mj: Any, data: Any) -> bool:
     )
 
 
-def _divergence_of(mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int) -> Divergence:
+def _find_divergence(mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int) -> Divergence:
     """Determine which quantity was too large in a step in which MuJoCo reset the simulation."""
     kinds = mj.mjtWarning
     for kind, name in ((kinds.mjWARN_BADQPOS, "position"), (kinds.mjWARN_BADQVEL, "velocity")):
@@ -288,7 +288,7 @@ def _divergence_of(mj: Any, model: Any, data: Any, state: FloatArray, world: int
     return Divergence(world, step, "acceleration", False)
 
 
-def fields_of(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:
+def split_state_vector(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:
     """Convert a state vector to a dict by the names of MjData."""
     data = mj.MjData(model)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
@@ -305,15 +305,15 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
     CapabilityError
         A world has more rows than MuJoCo Warp has memory for.
     """
-    mj, model = runs.load()
+    mj, model = runs.load_model()
     model = copy.copy(model)
     model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
-    starts = [runs.start(mj, model, world) for world in range(runs.worlds)]
-    drives = [runs.drive(model, world) for world in range(runs.worlds)]
+    starts = [runs.create_start_data(mj, model, world) for world in range(runs.worlds)]
+    drives = [runs.make_controller(model, world) for world in range(runs.worlds)]
     names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
     start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
     try:
-        step = {"mjx": _mjx, "mujoco_warp": _warp}[engine](mj, model, start_arrays)
+        step = {"mjx": _make_mjx_stepper, "mujoco_warp": _make_warp_stepper}[engine](mj, model, start_arrays)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
@@ -328,17 +328,19 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
         triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
         problem_arrays |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
         problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
-        problems.batch.names_of = _block_namer(mj, model, problems.batch, efc["type"], contact)
+        problems.batch.names_of = _make_block_namer(mj, model, problems.batch, efc["type"], contact)
         assert problems.impulse is not None
         yield Frame(
             problems.batch,
             problems.impulse,
             state,
-            *_sizes_of(efc["J"], extra.get("nefc"), world_of, address),
+            *_count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address),
         )
 
 
-def _sizes_of(jac: Any, nefc: Any, world_of: Any, address: Any) -> tuple[np.ndarray, np.ndarray]:
+def _count_rows_and_contacts(
+    jac: Any, nefc: Any, world_of: Any, address: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """Count the rows of each world that are not padding (zeros of J), and the contacts that begin with such a row."""
     is_active = (jac != 0.0).any(axis=2)
     if nefc is not None:
@@ -348,7 +350,7 @@ def _sizes_of(jac: Any, nefc: Any, world_of: Any, address: Any) -> tuple[np.ndar
     return is_active.sum(axis=1), np.bincount(world_of[has_row], minlength=len(jac))
 
 
-def _mjx(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
+def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     """Return the function that steps all worlds with MJX and returns the data of the step."""
     import jax
     from mujoco import mjx
@@ -374,8 +376,9 @@ def _mjx(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
         address = np.broadcast_to(np.asarray(c.efc_address), (n, np.shape(c.dist)[1]))
         size = address.shape[1]
         contact = (
-            np.repeat(np.arange(n), size), address.ravel(), _flat(c.dim, n, size), _flat(c.friction, n, size, 5),
-            _flat(c.geom, n, size, 2),
+            np.repeat(np.arange(n), size), address.ravel(), _concatenate_worlds(c.dim, n, size),
+            _concatenate_worlds(c.friction, n, size, 5),
+            _concatenate_worlds(c.geom, n, size, 2),
         )  # fmt: skip
         state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
         extra = {"qacc_smooth": np.asarray(now.qacc_smooth), "qfrc_smooth": np.asarray(now.qfrc_smooth)}
@@ -384,12 +387,12 @@ def _mjx(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     return step
 
 
-def _flat(x: Any, n: int, size: int, *each: int) -> Any:
+def _concatenate_worlds(x: Any, n: int, size: int, *each: int) -> Any:
     """Concatenate an array over the contacts of n worlds."""
     return np.broadcast_to(np.asarray(x), (n, size, *each)).reshape(n * size, *each)
 
 
-def _warp(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
+def _make_warp_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     """Return the function that steps all worlds with MuJoCo Warp and returns the data of the step."""
     import mujoco_warp as mjw
     import warp as wp
@@ -429,7 +432,7 @@ def _warp(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     return step
 
 
-def _block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact: Any) -> Any:
+def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact: Any) -> Any:
     """Return the function that names a world's blocks by the types of its rows and the geoms of its contacts."""
     world_of, address, _, _, geom = contact
 
@@ -442,7 +445,7 @@ def _block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact
         types = np.broadcast_to(row_types, (len(batch), row_types.shape[-1]))[i]
         first = {int(address[k]): k for k in np.flatnonzero((world_of == i) & (address >= 0))}
         names, name, first_row = [], "contact", 0
-        for row in batch._cones_of(i).ptr[:-1].tolist():
+        for row in batch._get_cones_of_world(i).ptr[:-1].tolist():
             if row in first:
                 name, first_row = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
             edge = f", edge {row - first_row}" if int(types[row]) == PYRAMIDAL_CONTACT else ""

@@ -333,7 +333,7 @@ def explain_mujoco_slip(
     from lavender.io import mujoco as adapter
     from lavender.io.states import read_states
 
-    mj = adapter.package()
+    mj = adapter.import_mujoco()
     data = mj.MjData(model)
     vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
     round_model = None

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_float, check_int
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.base.errors import InputError, reject_former_names
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
@@ -46,7 +46,7 @@ from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_ratio, format_size
-from lavender.lab.simulated_worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
+from lavender.lab.simulated_worlds import Runs, StepSizes, can_any_geoms_collide, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
 
 ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error.
@@ -63,7 +63,7 @@ TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
 #: Kinds of measurements: the error of a setting, and the times of its steps.
 MEASUREMENTS = ("judging", "timing")
-EXPECTED_VARIED_SETTINGS = 4  # Settings whose variants are measured, for the estimate of the remaining time.
+EXPECTED_VARIED_SETTINGS = 4  # Expected number of settings with measured variants, for the remaining time.
 MERGE_NOTE = (
     "Add the line next to the model's own <option>: MuJoCo merges both. If it replaces the model's own <option>, "
     "its integrator and time step are lost."
@@ -93,21 +93,21 @@ class Setting:
     options: tuple[tuple[str, Any], ...] = ()
 
     @classmethod
-    def of(cls, mj: Any, model: Any, **options: Any) -> Setting:
+    def from_options(cls, mj: Any, model: Any, **options: Any) -> Setting:
         """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
-        has = {name: _option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
+        has = {name: _get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
         return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
 
-    def on(self, mj: Any, model: Any) -> Any:
+    def apply_to(self, mj: Any, model: Any) -> Any:
         """Return a copy of the model with these options."""
         configured = copy.copy(model)
         for name, x in self.options:
             kind = ENUMS.get(name)
-            setattr(configured.opt, name, x if kind is None else _keyword_values(mj, name)[x])
+            setattr(configured.opt, name, x if kind is None else _map_keywords_to_values(mj, name)[x])
         return configured
 
     @property
-    def line(self) -> str:
+    def option_line(self) -> str:
         """`<option>` line to copy into the model; empty if no option differs."""
         texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
         return f"<option {' '.join(texts)}/>" if self.options else ""
@@ -115,15 +115,15 @@ class Setting:
     @property
     def name(self) -> str:
         """The line, or "the model's own setting"."""
-        return self.line or "the model's own setting"
+        return self.option_line or "the model's own setting"
 
     @property
-    def is_other(self) -> bool:
+    def changes_problem(self) -> bool:
         """Whether the setting defines another problem than the model's."""
         return any(name in PROBLEM_OPTIONS for name, _ in self.options)
 
 
-def _keyword_values(mj: Any, name: str) -> dict[str, Any]:
+def _map_keywords_to_values(mj: Any, name: str) -> dict[str, Any]:
     """Return {MJCF keyword: MuJoCo's value} of an enumerated option."""
     members = getattr(mj, f"mjt{name.capitalize()}").__members__
     keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
@@ -131,12 +131,12 @@ def _keyword_values(mj: Any, name: str) -> dict[str, Any]:
     return {keywords.get(key, key.lower()): value for key, value in short}
 
 
-def _option_value(mj: Any, model: Any, name: str) -> Any:
+def _get_option_value(mj: Any, model: Any, name: str) -> Any:
     """Return the model's value of an option as MJCF writes it."""
     x = getattr(model.opt, name)
     if name not in ENUMS:
         return float(x) if isinstance(x, float) else int(x)
-    return next(word for word, value in _keyword_values(mj, name).items() if int(value) == int(x))
+    return next(word for word, value in _map_keywords_to_values(mj, name).items() if int(value) == int(x))
 
 
 @dataclass(eq=False)
@@ -163,12 +163,12 @@ class Measured:
     contacts: Any = field(default=(), repr=False)
 
     @property
-    def time(self) -> float:
+    def mean_step_time(self) -> float:
         """Mean time of a step [s]; infinite if it was not timed."""
         return float(self.times.mean())
 
     @property
-    def worst(self) -> float:
+    def worst_error(self) -> float:
         """Error that one step in a hundred exceeds [m/s]."""
         return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
 
@@ -225,7 +225,7 @@ class Schedule:
             count = sum(self._expected.values()) + sum(self._reserved.values())
             self.watch(Event(self.done, self.done + count, f"{kind}: {text}", "", remaining=self.remaining))
         if kind == "timing":
-            self.loads.append(machine.running())
+            self.loads.append(machine.count_runnable_processes())
         begin = perf_counter()
         yield
         self._durations[kind].append(perf_counter() - begin)
@@ -255,23 +255,25 @@ class Stage:
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
+    def from_runs(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
         """Cut worlds that run with the model's own setting into stretches."""
         starts, controls = [], []
         for world in worlds:
-            drive = runs.drive(model, world)
+            drive = runs.make_controller(model, world)
             world_controls = np.array([drive(None, step) for step in range(runs.steps)])
             ctrl = world_controls.reshape(runs.steps // horizon, horizon, model.nu)
             starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
             controls.append(ctrl)
         configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
-            configured.ends = configured.run(Setting.of(mj, model, **CONVERGED_OPTIONS).on(mj, model))[1]
+            configured.ends = configured.run_stretches(
+                Setting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
+            )[1]
         except mj.FatalError as error:
             raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
         return configured
 
-    def run(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    def run_stretches(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Run all stretches.
 
         Returns (seconds of each step, positions of bodies after each stretch (n, bodies, 3) [m]), and stores the state
@@ -295,11 +297,11 @@ class Stage:
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return step_times, ends
 
-    def measure(self, setting: Setting) -> Measured:
+    def judge_setting(self, setting: Setting) -> Measured:
         """Judge a setting without timing it; its errors are infinite if a world diverges."""
-        mj, model = self.mj, setting.on(self.mj, self.model)
+        mj, model = self.mj, setting.apply_to(self.mj, self.model)
         never = np.full(1, np.inf)
-        result = Measured(setting, str(_option_value(mj, model, "solver")), never, never, never)
+        result = Measured(setting, str(_get_option_value(mj, model, "solver")), never, never, never)
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
@@ -307,7 +309,7 @@ class Stage:
         rows: list[Any] = []
         contacts: list[Any] = []
         try:
-            ends = self.run(model, states)[1]
+            ends = self.run_stretches(model, states)[1]
             for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
                 batch, impulse = from_mujoco_many(
                     judge, states[i : i + MAX_PROBLEMS_IN_MEMORY], errors="status"
@@ -325,13 +327,13 @@ class Stage:
             result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
         )
 
-    def time(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
+    def time_settings(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
         """Time the steps of several rounds in which all settings alternate; the first is the model's own.
 
         A setting with which a world diverges is not timed.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
-        models = [m.setting.on(self.mj, self.model) for m in settings]
+        models = [m.setting.apply_to(self.mj, self.model) for m in settings]
         schedule.expect("timing", len(settings) * repeats)
         for round_index in range(repeats):
             for m, model in zip(settings, models, strict=True):
@@ -340,7 +342,7 @@ class Stage:
                     schedule.skip("timing")
                     continue
                 with schedule.measure("timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"):
-                    m.times = np.minimum(m.times, self.run(model)[0])
+                    m.times = np.minimum(m.times, self.run_stretches(model)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,74 +378,83 @@ class Tuning:
     busy: str = ""
 
     @property
-    def now(self) -> Measured:
+    def present_result(self) -> Measured:
         """Result of the model's own setting."""
         return self.measured[0]
 
     @property
     def _same_problem(self) -> list[Measured]:
         """Timed settings that do not change the problem."""
-        return [m for m in self.measured if not m.setting.is_other and np.isfinite(m.time)]
+        return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
 
-    def _holds(self, m: Measured) -> bool:
+    def _is_accurate_enough(self, m: Measured) -> bool:
         """Whether worst error and motion are at most the present setting's, or within the threshold."""
-        now, threshold = self.now, self.threshold
+        now, threshold = self.present_result, self.threshold
         pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
         return all(x <= max(own, threshold) for x, own in pairs)
 
     @cached_property
     def faster(self) -> Measured | None:
         """Fastest setting that is at least as accurate as the present one, or within the threshold; None if none is."""
-        now = self.now
-        good = [m for m in self._same_problem if m.worst <= max(now.worst, self.threshold) and self._holds(m)]
-        best = min(good, key=lambda m: m.time)
-        return best if best.time < (1.0 - TIME_NOISE_FRACTION) * now.time else None
+        now = self.present_result
+        good = [
+            m
+            for m in self._same_problem
+            if m.worst_error <= max(now.worst_error, self.threshold) and self._is_accurate_enough(m)
+        ]
+        best = min(good, key=lambda m: m.mean_step_time)
+        return best if best.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time else None
 
     @cached_property
     def closer(self) -> Measured | None:
         """Most accurate setting that is as fast as the present one; None if that is within the threshold."""
-        now = self.now
+        now = self.present_result
         good = [
             m
             for m in self._same_problem
-            if m.time <= (1.0 + TIME_NOISE_FRACTION) * now.time and self._holds(m)
+            if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+            and self._is_accurate_enough(m)
         ]
-        best = min(good, key=lambda m: m.worst)
-        return best if best.worst < now.worst > self.threshold else None
+        best = min(good, key=lambda m: m.worst_error)
+        return best if best.worst_error < now.worst_error > self.threshold else None
 
     @property
-    def front(self) -> list[Measured]:
+    def pareto_front(self) -> list[Measured]:
         """Settings that no other setting beats in both time and error, fastest first."""
         front: list[Measured] = []
-        for m in sorted(self._same_problem, key=lambda m: (m.time, m.worst)):
-            if not front or m.worst < front[-1].worst:
+        for m in sorted(self._same_problem, key=lambda m: (m.mean_step_time, m.worst_error)):
+            if not front or m.worst_error < front[-1].worst_error:
                 front.append(m)
         return front
 
     @property
-    def why_no_line(self) -> str:
+    def reason_without_line(self) -> str:
         """Reason why no line is recommended; empty if enough of the steps have contact."""
-        if self.sizes is None or self.sizes.is_enough:
+        if self.sizes is None or self.sizes.has_enough_contact:
             return ""
         if not self.sizes.can_touch:
-            return f"No setting is recommended: {self.sizes.sentence}, and settings do not matter without."
+            return (
+                f"No setting is recommended: {self.sizes.contact_phrase}, and settings do not matter without."
+            )
         return (
-            f"No setting is recommended: {self.sizes.sentence}. A setting that is fast and accurate without contact "
-            "may be neither with it. Start from states with contact (--states FILE), or take more --steps."
+            f"No setting is recommended: {self.sizes.contact_phrase}. A setting that is fast and accurate without "
+            "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
         )
 
     @property
     def lines(self) -> list[str]:
         """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
-        if self.why_no_line:
+        if self.reason_without_line:
             return []
         none = f"none of {len(self._same_problem)} settings"
-        enough = f"not needed, {format_size(self.now.worst)} m/s is within {self.threshold:g}"
-        closer = enough if self.now.worst <= self.threshold else none
+        enough = (
+            f"not needed, {format_size(self.present_result.worst_error)} m/s is within {self.threshold:g}"
+        )
+        closer = enough if self.present_result.worst_error <= self.threshold else none
         lines = []
         for description, m, reason, gains, max_ratio in (
-            ("as accurate as now, faster", self.faster, none, "time", 1.0 - TIME_NOISE_FRACTION),
-            ("as fast as now, more accurate", self.closer, closer, "worst", 1.0),
+            ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
+            ("as fast as now, more accurate", self.closer, closer, "worst_error", 1.0),
         ):
             if m is None:
                 lines.append(f"{description}: {reason}")
@@ -452,7 +463,8 @@ class Tuning:
             if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
                 description += ": not on the worlds held back"
             lines += [
-                f"{m.setting.line}  <!-- {description} -->", f"    chosen on: {_compare(m, self.now)}",
+                f"{m.setting.option_line}  <!-- {description} -->",
+                f"    chosen on: {_compare(m, self.present_result)}",
                 f"    held back: {'not measured' if held is None else _compare(held, self.held[0])}",
             ]  # fmt: skip
         return lines
@@ -461,7 +473,8 @@ class Tuning:
         """Build the table of some settings."""
         rows: list[list[str | Cell]] = [
             [
-                m.setting.line or "as it is", Cell.time(m.time), f"{m.time / self.now.time:.2f}", Cell.size(m.worst),
+                m.setting.option_line or "as it is", Cell.time(m.mean_step_time),
+                f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
                 Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
             ]
             for m in settings
@@ -481,39 +494,48 @@ class Tuning:
         """Error over time: every setting, the front, and the model's own setting."""
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
-            notes = tuple(m.setting.line for m in settings)
-            return replace(Curve.of(name, name, [(m.time, m.worst) for m in settings], notes=notes), **more)
+            notes = tuple(m.setting.option_line for m in settings)
+            return replace(
+                Curve.from_points(
+                    name, name, [(m.mean_step_time, m.worst_error) for m in settings], notes=notes
+                ),
+                **more,
+            )
 
         by = {s: [m for m in self._same_problem if m.solver == s] for s in ITERATIONS}
         parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
-        parts += [curve("front", self.front), curve("as it is", [self.now], points=True)]
+        parts += [curve("front", self.pareto_front), curve("as it is", [self.present_result], points=True)]
         return Figure("time-and-error", Path(self.runs.model).name, "time of a step [s]",
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 
     @property
     def summary_page(self) -> SummaryPage:
         """The summary page."""
-        now = self.now
+        now = self.present_result
         head = (
-            f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps have errors above "
-            f"{format_size(now.worst)} m/s."
+            f"{Path(self.runs.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "
+            f"have errors above {format_size(now.worst_error)} m/s."
         )
         if self.closer is not None:
-            gain = format_ratio(now.worst / self.closer.worst) if self.closer.worst else "exact:"
+            gain = (
+                format_ratio(now.worst_error / self.closer.worst_error)
+                if self.closer.worst_error
+                else "exact:"
+            )
             head += f" In the same time the error can be {gain} less."
-        if self.why_no_line:
-            head += f" {self.why_no_line}"
+        if self.reason_without_line:
+            head += f" {self.reason_without_line}"
         merge_note = f" {MERGE_NOTE}" if self.faster or self.closer else ""
-        other = [m for m in self.measured if m.setting.is_other]
-        shown = [now, *(m for m in self.front if m is not now)]
-        every = sorted(self.measured, key=lambda m: m.time)
-        sizes = [] if self.sizes is None else [self.sizes.table]
-        figures = [] if self.why_no_line else [self.figure]
+        other = [m for m in self.measured if m.setting.changes_problem]
+        shown = [now, *(m for m in self.pareto_front if m is not now)]
+        every = sorted(self.measured, key=lambda m: m.mean_step_time)
+        sizes = [] if self.sizes is None else [self.sizes.size_table]
+        figures = [] if self.reason_without_line else [self.figure]
         return SummaryPage(
             "lavender tune", head,
             [
                 PageSection("Lines to copy", code=self.lines,
-                     note="None, for the reason above." if self.why_no_line
+                     note="None, for the reason above." if self.reason_without_line
                      else "Chosen on the worlds with even numbers, tested on the others." + merge_note),
                 PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
                 PageSection("The front of time and error", [self._table(shown)], figures, short=5),
@@ -521,8 +543,8 @@ class Tuning:
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
                 PageSection("Every setting", [self._table(every)], note="Without those with which a world diverges."),
             ],
-            {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line, "busy": self.busy,
-             **({} if self.sizes is None else self.sizes.numbers), "stopped": self.stopped,
+            {"model": self.runs.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
              "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
             stopped=self.stopped,
             warning=self.busy,
@@ -531,16 +553,19 @@ class Tuning:
 
 def _compare(m: Measured, now: Measured) -> str:
     """Compare time and error of a setting with the present ones."""
-    return f"{m.time / now.time:.2f} of the time, error {format_size(m.worst)} m/s instead of {format_size(now.worst)}"
+    return (
+        f"{m.mean_step_time / now.mean_step_time:.2f} of the time, error {format_size(m.worst_error)} m/s "
+        f"instead of {format_size(now.worst_error)}"
+    )
 
 
 def _to_dict(m: Measured) -> dict[str, Any]:
     """Convert a result to a dict for JSON."""
-    return {"options": dict(m.setting.options), "seconds": m.time, "error": m.worst,
+    return {"options": dict(m.setting.options), "seconds": m.mean_step_time, "error": m.worst_error,
             "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip
 
 
-def grid(mj: Any, model: Any) -> list[Setting]:
+def list_first_settings(mj: Any, model: Any) -> list[Setting]:
     """List the first settings: each solver with each tolerance and number of iterations; then other problems."""
     enough = max(100, int(model.opt.iterations))
     tried: list[dict[str, Any]] = [{}]
@@ -549,18 +574,18 @@ def grid(mj: Any, model: Any) -> list[Setting]:
         tried += [{"solver": solver, "iterations": n} for n in budgets]
     tried += [{"cone": "pyramidal"}, {"cone": "elliptic"}, {"impratio": 1.0}, {"impratio": 10.0}]
     tried += [{"noslip_iterations": n} for n in (0, 3, 10)]
-    return list(dict.fromkeys(Setting.of(mj, model, **x) for x in tried))
+    return list(dict.fromkeys(Setting.from_options(mj, model, **x) for x in tried))
 
 
-def vary(mj: Any, model: Any, setting: Setting) -> list[Setting]:
+def list_variants(mj: Any, model: Any, setting: Setting) -> list[Setting]:
     """List variants of a setting: other line searches, and dense instead of sparse J or the reverse."""
     options = dict(setting.options)
     stored = "dense" if mj.mj_isSparse(model) else "sparse"
     tried: list[dict[str, Any]] = [{"jacobian": stored}]
-    if options.get("solver", _option_value(mj, model, "solver")) != "PGS":
+    if options.get("solver", _get_option_value(mj, model, "solver")) != "PGS":
         tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [{"ls_iterations": n} for n in (5, 15, 50)]
         tried += [{"jacobian": stored, "ls_tolerance": x} for x in (0.1, 1e-3)]
-    return [Setting.of(mj, model, **options | x) for x in tried]
+    return [Setting.from_options(mj, model, **options | x) for x in tried]
 
 
 @reject_former_names(ahead="horizon", rounds="repeats")
@@ -609,12 +634,12 @@ def tune(
         The problem of the model's integrator is not one of M.
     """
     own: dict[str, Any] = {"worlds": check_int("worlds", worlds, 2, None), "steps": steps}
-    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
+    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).with_start_states(states)
     horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
     threshold = check_float("threshold", threshold, low=0.0)
     if steps % horizon:
         raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
-    mj, configured = runs.load()
+    mj, configured = runs.load_model()
     # An unsupported model raises here, once.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
     schedule = Schedule(watch)
@@ -624,7 +649,7 @@ def tune(
 
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
-        timed = [m for m in measured if np.isfinite(m.time)]
+        timed = [m for m in measured if np.isfinite(m.mean_step_time)]
         busy = machine.describe_busy(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             runs, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy
@@ -636,49 +661,55 @@ def tune(
         schedule.expect("judging", len(settings))
         for setting in settings:
             with schedule.measure("judging", setting.name):
-                results.append(stage.measure(setting))
+                results.append(stage.judge_setting(setting))
         return results
 
-    first_settings = grid(mj, configured)
-    n_variants = len(vary(mj, configured, Setting())) * EXPECTED_VARIED_SETTINGS
+    first_settings = list_first_settings(mj, configured)
+    n_variants = len(list_variants(mj, configured, Setting())) * EXPECTED_VARIED_SETTINGS
     n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
     schedule.reserve("judging", n_first + 3 + n_variants)  # 3: the worlds held back
     schedule.reserve("timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats)
 
     try:
-        stage, held_back = (Stage.of(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
+        stage, held_back = (
+            Stage.from_runs(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1)
+        )
         measured += judge(stage, [Setting()])
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds diverge with the model's own setting")
         last = judge(held_back, [Setting()])
         both = [*measured, *last]
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
-        sizes = StepSizes(rows, contacts, can_touch(mj, configured))
-        if not sizes.is_enough:
+        sizes = StepSizes(rows, contacts, can_any_geoms_collide(mj, configured))
+        if not sizes.has_enough_contact:
             schedule.reserve("judging", 0)
             schedule.reserve("timing", 0)
-            stage.time(measured, repeats, schedule)
+            stage.time_settings(measured, repeats, schedule)
             return make_result(False)
         measured += judge(stage, first_settings[1:])
-        stage.time(measured, n_trial, schedule)
+        stage.time_settings(measured, n_trial, schedule)
         near = [
-            m.setting for m in make_result(False).front if m.time <= MAX_VARIED_TIME_RATIO * measured[0].time
+            m.setting
+            for m in make_result(False).pareto_front
+            if m.mean_step_time <= MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
         ]
         known = {m.setting for m in measured}
-        more = dict.fromkeys(x for s in [Setting(), *near] for x in vary(mj, configured, s) if x not in known)
+        more = dict.fromkeys(
+            x for s in [Setting(), *near] for x in list_variants(mj, configured, s) if x not in known
+        )
         schedule.reserve("judging", len(more) + 2)
         schedule.reserve("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
         measured += judge(stage, list(more))
-        stage.time(measured, repeats, schedule)
+        stage.time_settings(measured, repeats, schedule)
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
         schedule.reserve("judging", 0)
         schedule.reserve("timing", 0)
-        held_back.time(last, 2 * repeats, schedule)
-        held += last if np.isfinite(last[0].time) else []
+        held_back.time_settings(last, 2 * repeats, schedule)
+        held += last if np.isfinite(last[0].mean_step_time) else []
     except KeyboardInterrupt:
-        if not measured or not np.isfinite(measured[0].time):
+        if not measured or not np.isfinite(measured[0].mean_step_time):
             raise
         return make_result(True)
     return make_result(False)

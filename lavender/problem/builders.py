@@ -15,15 +15,15 @@ from lavender.base.arrays import (
     IntArray,
     as_array,
     check_unmasked,
-    precision_of,
-    shape_of,
+    get_common_precision,
+    get_shape,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.renamed import suggest_argument
-from lavender.problem.cones import Cones, kinds_of
+from lavender.problem.cones import Cones, get_kinds
 from lavender.problem.data import Names, check_matrix
-from lavender.problem.findex import blocks_from_findex, findex_from_blocks, order_rows
+from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
@@ -74,7 +74,7 @@ def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()
 
 def check_rhs_length(A: Any, b: FloatArray) -> None:
     """Raise InputError that names b if A is square with another number of rows."""
-    shape = A.shape if isinstance(A, np.ndarray) or issparse(A) else shape_of("A", A)
+    shape = A.shape if isinstance(A, np.ndarray) or issparse(A) else get_shape("A", A)
     if len(shape) == 2 and shape[0] == shape[1] != len(b):
         raise InputError(f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows")
 
@@ -163,7 +163,7 @@ class Builders(Operators):
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
         check_unmasked("mu", mu)
-        if len(shape_of("mu", mu)) > 1:
+        if len(get_shape("mu", mu)) > 1:
             return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
         angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
@@ -213,7 +213,7 @@ class Builders(Operators):
         lower, upper : scalar or (m,) N s
             Bounds of rows with findex < 0. On other rows upper is mu [-] and lower is not read, as in these engines.
         findex : (m,) int
-            Row of the normal whose impulse bounds this row, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+            Row of the normal impulse that bounds this row, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
         **more
             Keywords of `Problem`: name, names, ...
 
@@ -229,12 +229,12 @@ class Builders(Operators):
         >>> import lavender as lv
         >>> A, b = np.eye(3), [10.0, 9.0, -1.0]  # pressed on, and dragged along both tangents
         >>> problem = lv.Problem.from_findex(A, b, [0.0, -0.5, -0.5], [np.inf, 0.5, 0.5], [-1, 0, 0])
-        >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # N s: the first slides, the second holds
+        >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # [N s]: the first tangent slides, the second holds
         [10.0, 5.0, -1.0]
         """
         check_keywords("from_findex", more, ("lower", "upper", "findex"))
         b = as_array("b", b, (None,), unit="m/s")
-        order, cones = blocks_from_findex(lower, upper, findex, len(b))
+        order, cones = convert_from_findex(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
             matrix = check_matrix(A, len(b), True)
             if more.get("guess") is not None:
@@ -250,7 +250,7 @@ class Builders(Operators):
         >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as in Bullet
         [0, 2, 3, 1, 4, 5]
         """
-        return order_rows(findex)
+        return order_findex_rows(findex)
 
     def to_findex(self) -> tuple[Any, FloatArray, FloatArray, FloatArray, IntArray]:
         """Return A, b, lower, upper and findex as ODE, Bullet and DART use them, in the order of this problem's rows.
@@ -260,7 +260,7 @@ class Builders(Operators):
         InputError
             The problem has a disk or the law "cone", which findex cannot express.
         """
-        lower, upper, findex = findex_from_blocks(self.cones)
+        lower, upper, findex = convert_to_findex(self.cones)
         if self.law == "cone":
             raise InputError(
                 "findex means Coulomb friction, not the law 'cone': pass problem.relaxed('coulomb')"
@@ -418,7 +418,9 @@ class Builders(Operators):
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
             )
             raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
-        more.setdefault("precision", precision_of(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free))
+        more.setdefault(
+            "precision", get_common_precision(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free)
+        )
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
@@ -587,7 +589,7 @@ def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rollin
     if min_tangents == max_tangents:
         return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + has_spin + 2 * has_rolling)]).astype(np.int32)
-    kind = kinds_of(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
+    kind = get_kinds(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
     infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(c)
     cones = Cones(
         ptr=ptr, kind=kind, lower=-infinite, upper=infinite, mu=mu,

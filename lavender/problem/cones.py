@@ -31,15 +31,16 @@ from lavender.base.arrays import (
     IntArray,
     are_equal,
     as_array,
-    check_inside,
     check_int,
+    check_magnitudes,
+    check_nonnegative_magnitudes,
     check_not_nan,
-    check_sizes,
-    read_only,
+    get_shape,
+    mark_read_only,
     resolve_index,
-    shape_of,
 )
 from lavender.base.errors import InputError
+from lavender.base.renamed import build_attribute_error
 from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
@@ -63,8 +64,8 @@ __all__ = [
     "ROW",
     "SHAPES",
     "Cones",
-    "kinds_of",
-    "project",
+    "get_kinds",
+    "project_impulse",
 ]
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
@@ -112,7 +113,7 @@ class Cones:
 
     Examples
     --------
-    A hinge of five rows, a motor of at most 2 N s, and two contacts of one normal and two tangents each:
+    A hinge of five rows, a motor of up to 2 N s, and two contacts of one normal and two tangents each:
 
     >>> import lavender as lv
     >>> cones = lv.Cones.free(5) + lv.Cones.bounded([-2.0], [2.0]) + lv.Cones.contacts(0.5, count=2)
@@ -163,7 +164,7 @@ class Cones:
         def __getattr__(self, name: str) -> Any:
             # The arrays of the fields are created when one of them is first read.
             if name not in CONES_FIELDS:
-                raise AttributeError(f"Cones have no {name}")
+                raise build_attribute_error("Cones", "'Cones'", name)
             self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
             return self.__dict__[name]
 
@@ -288,7 +289,7 @@ class Cones:
         if type(tangents) is not int or not 0 <= tangents <= 5:
             tangents = check_int("tangents", tangents, 0, 5)
         is_box = check_shape("shape", shape) == "box"
-        is_pair = type(mu) is not float and len(shape_of("mu", mu)) > 1
+        is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
         if patch_radius is not None or rolling is not None or tangents != 2:
             check_combination(mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair)
         ratio, pair_kind = None, 0
@@ -298,7 +299,7 @@ class Cones:
         elif is_pair and not is_box:
             mu, ratio = convert_ellipse_coefficients(mu)
             pair_kind = 0 if ratio is None else CONTACT_ELLIPSE
-        size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
+        size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else get_shape("mu", mu)[0]
         k = size_of_mu if count is None else check_int("count", count)
         if type(mu) is not float or not (mu == 0.0 or MIN_MAGNITUDE <= mu <= MAX_MAGNITUDE):
             mu = check_coefficients("mu", mu, k)
@@ -311,7 +312,9 @@ class Cones:
         blocks = kernels.contacts(k, tangents, mu, patch_radius, rolling, pair_kind)
         if blocks is None:
             if patch_radius is not None:
-                check_sizes(SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m")
+                check_nonnegative_magnitudes(
+                    SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m"
+                )
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._from_blocks(blocks)
 
@@ -351,7 +354,7 @@ class Cones:
         return bool(self._blocks.has_rolling)
 
     @property
-    def has_more_parts(self) -> bool:
+    def has_more_components(self) -> bool:
         """Whether a contact has friction components other than tangents and spin."""
         return self.has_rolling
 
@@ -402,7 +405,7 @@ class Cones:
 
     @property
     def n_together(self) -> IntArray:
-        """Number of tangent rows of each block (k,) whose norm is bounded by mu lambda_n; 0 for ROW."""
+        """Number of tangent rows of each block (k,) that share the bound mu lambda_n of their norm; 0 for ROW."""
         return self.n_tangents - (self.kind == CONTACT_BOX)
 
     @property
@@ -417,7 +420,7 @@ class Cones:
         """Number of tangent rows of each block (k,), 0 for ROW; spin and rolling rows count only in a round cone."""
         count = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
         count = np.where(self.kind == CONTACT_ROLLING, 2, count)
-        return read_only(np.where(self.kind == ROW, 0, count).astype(np.int32))
+        return mark_read_only(np.where(self.kind == ROW, 0, count).astype(np.int32))
 
     def shaped(self, shape: str) -> Cones:
         """Return these blocks with another shape of friction.
@@ -468,43 +471,43 @@ class Cones:
         return np.asarray(self.ptr[:-1][self.kind != ROW])
 
     @cached_property
-    def reach(self) -> FloatArray:
-        """Friction coefficient of each row (m,): mu, mu r on `apart_rows` [m], mu_r on rolling rows [m], else 0."""
+    def friction_coefficient(self) -> FloatArray:
+        """Friction coefficient of each row (m,): mu, mu r on `separate_rows` [m], mu_r on rolling rows [m], else 0."""
         size = np.diff(self.ptr)
         coefficient = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
         coefficient[self.ptr[:-1]] = 0.0
-        has_apart, has_rolling = self.apart_rows >= 0, self.rolling_rows >= 0
+        has_apart, has_rolling = self.separate_rows >= 0, self.rolling_rows >= 0
         ellipse = self.ptr[:-1][self.kind == CONTACT_ELLIPSE] + 2
         coefficient[ellipse] *= self.patch_radius[self.kind == CONTACT_ELLIPSE]
-        coefficient[self.apart_rows[has_apart]] *= self.patch_radius[has_apart]
+        coefficient[self.separate_rows[has_apart]] *= self.patch_radius[has_apart]
         for k in (0, 1):
             coefficient[self.rolling_rows[has_rolling] + k] = self.rolling[has_rolling]
-        return read_only(coefficient)
+        return mark_read_only(coefficient)
 
     @cached_property
     def spin_rows(self) -> IntArray:
         """Spin row of each block (k,), -1 if it has none."""
         has_spin = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
-        return read_only(np.where(has_spin, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
+        return mark_read_only(np.where(has_spin, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
 
     @cached_property
-    def apart_rows(self) -> IntArray:
+    def separate_rows(self) -> IntArray:
         """Row of each block (k,) with the bound mu patch_radius lambda_n: spin, second tangent of a box; -1 if none."""
-        return read_only(
+        return mark_read_only(
             np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
         )
 
     @cached_property
     def rolling_rows(self) -> IntArray:
         """First of the two rolling rows of each block (k,) with a bound of their own, -1 if it has none."""
-        return read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
+        return mark_read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
 
-    def parts(self) -> Iterator[tuple[int, IntArray]]:
-        """Yield (block, rows) of each friction component: rows whose norm has one bound.
+    def friction_components(self) -> Iterator[tuple[int, IntArray]]:
+        """Yield (block, rows) of each friction component: rows with one bound of their norm.
 
         A contact has up to three: tangents, then spin or the second tangent of a box, then rolling.
         """
-        tangents, apart, rolling = self.n_together, self.apart_rows, self.rolling_rows
+        tangents, apart, rolling = self.n_together, self.separate_rows, self.rolling_rows
         for i in np.flatnonzero(self.kind != ROW).tolist():
             first = self.ptr[i] + 1
             if tangents[i]:
@@ -514,7 +517,7 @@ class Cones:
             if rolling[i] >= 0:
                 yield i, np.arange(rolling[i], rolling[i] + 2)
 
-    def take(self, blocks: ArrayLike) -> Cones:
+    def select(self, blocks: ArrayLike) -> Cones:
         """Return the selected blocks in the given order.
 
         Parameters
@@ -530,9 +533,9 @@ class Cones:
             indices = resolve_index(blocks, self.n_blocks, "block")
         except IndexError as error:
             raise InputError(f"blocks: {error}") from None
-        return self._take_blocks(np.array(indices if isinstance(indices, list) else [indices], np.int32))
+        return self._select_blocks(np.array(indices if isinstance(indices, list) else [indices], np.int32))
 
-    def _take_blocks(self, blocks: IntArray) -> Cones:
+    def _select_blocks(self, blocks: IntArray) -> Cones:
         """Return the blocks with these indices, which are not checked."""
         size = np.diff(self.ptr)[blocks]
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
@@ -569,7 +572,7 @@ class Cones:
         return type(self), self._blocks.arrays
 
 
-def kinds_of(
+def get_kinds(
     is_contact: Any, *, tangents: Any = 0, box: Any = False, spin: Any = False, rolling: Any = False
 ) -> IntArray:
     """Return the kind of each block (k,); blocks that are not contacts are ROW.
@@ -602,13 +605,13 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
         )
     if fault in ("lower", "upper"):
         bound = lower if fault == "lower" else upper
-        check_inside(
+        check_magnitudes(
             fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(fields[0])), 0.0, bound), "N s"
         )
-    check_sizes("mu", mu, "-")
-    check_sizes("patch_radius", radius, "m")
-    check_sizes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
-    check_sizes("rolling", rolling, "m")
+    check_nonnegative_magnitudes("mu", mu, "-")
+    check_nonnegative_magnitudes("patch_radius", radius, "m")
+    check_nonnegative_magnitudes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
+    check_nonnegative_magnitudes("rolling", rolling, "m")
     raise InputError(f"block {index} is invalid: {fault}")
 
 
@@ -628,25 +631,25 @@ def _check_kinds(kind: IntArray, size: IntArray) -> IntArray:
     return kind
 
 
-def project(cones: Cones, impulse: FloatArray) -> FloatArray:
+def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:
     """Project an impulse (m,) [N s] on the bounds, normal rows first.
 
     Bounded rows and normals are clipped. Then each friction component is projected radially on its coefficient times
     the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
     """
     if cones.has_ellipse:
-        return cones.stretch * project(cones.disks, impulse / cones.stretch)
+        return cones.stretch * project_impulse(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
     first, tangents = cones.ptr[:-1], cones.n_together
 
     def bounds(blocks: Any, rows: Any) -> FloatArray:
-        bound: FloatArray = cones.reach[rows] * out[first[blocks]]
+        bound: FloatArray = cones.friction_coefficient[rows] * out[first[blocks]]
         return bound
 
     # components of one row
     for blocks, rows in (
         (np.flatnonzero(tangents == 1), first + 1),
-        (np.flatnonzero(cones.apart_rows >= 0), cones.apart_rows),
+        (np.flatnonzero(cones.separate_rows >= 0), cones.separate_rows),
     ):
         bound = bounds(blocks, rows[blocks])
         out[rows[blocks]] = np.clip(out[rows[blocks]], -bound, bound)

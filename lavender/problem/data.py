@@ -18,11 +18,11 @@ from lavender.base.arrays import (
     check_choice,
     check_finite,
     check_int,
-    check_sizes,
+    check_nonnegative_magnitudes,
     check_unmasked,
     format_html_table,
-    read_only,
-    shape_of,
+    get_shape,
+    mark_read_only,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -136,7 +136,7 @@ class ProblemData:
             put(self, "matrix", check_matrix(self.matrix, m, self.copy))
             if issparse(
                 self.matrix
-            ):  # the checked arrays, because callers can replace those of the matrix object
+            ):  # the checked arrays, because callers can replace the arrays of the matrix object
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
@@ -145,7 +145,7 @@ class ProblemData:
             check_finite("guess [N s]", guess)
             put(self, "guess", guess)
         if self.key is not None:
-            shape_of("key", self.key)
+            get_shape("key", self.key)
             check_unmasked("key", self.key)
             key = np.asarray(self.key)
             if (
@@ -156,7 +156,7 @@ class ProblemData:
                 raise InputError(
                     f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed"
                 )
-            put(self, "key", read_only(key.astype(np.uint64)))
+            put(self, "key", mark_read_only(key.astype(np.uint64)))
         if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
             put(self, "names", as_names("blocks", self.names, k))
         put(self, "name", str(self.name))
@@ -206,10 +206,10 @@ class ProblemData:
         """Convert the compliance to a checked array (m,) [1/kg]; the default is 0."""
         put = object.__setattr__
         if self.compliance is None:
-            put(self, "compliance", read_only(np.zeros(m)))
+            put(self, "compliance", mark_read_only(np.zeros(m)))
             return
         put(self, "compliance", as_array("compliance", self.compliance, (m,), unit="1/kg", copy=self.copy))
-        check_sizes("compliance", self.compliance, "1/kg")
+        check_nonnegative_magnitudes("compliance", self.compliance, "1/kg")
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -324,9 +324,8 @@ class ProblemData:
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
-        return (
-            f"<Problem {name}{self.law}, {_count(self.m, 'row')} in {_count(self.n_blocks, 'block')}, {kind}>"
-        )
+        size = f"{_format_count(self.m, 'row')} in {_format_count(self.n_blocks, 'block')}"
+        return f"<Problem {name}{self.law}, {size}, {kind}>"
 
     def _repr_html_(self) -> str:
         """Return a small HTML table of the problem for notebooks."""
@@ -363,7 +362,7 @@ def check_problem(problem: Any) -> None:
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
 
 
-def _count(n: int, noun: str) -> str:
+def _format_count(n: int, noun: str) -> str:
     """Format a number with its noun: 1 row, 2 rows."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array
 from lavender.base.errors import InputError
-from lavender.problem.cones import Cones, kinds_of
+from lavender.problem.cones import Cones, get_kinds
 
 
-def order_rows(findex: Any, count: int | None = None) -> IntArray:
+def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
     """Return the row of the arrays for each row of the problem (m,): each normal is followed by its friction rows."""
     findex = as_array("findex", findex, (count,), dtype=np.int32)
     m = len(findex)
@@ -40,10 +40,10 @@ def order_rows(findex: Any, count: int | None = None) -> IntArray:
     return np.lexsort((np.arange(m), findex >= 0, normal)).astype(np.int32)
 
 
-def blocks_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Cones]:
-    """Check the arrays (m,) and return `order_rows` and the blocks."""
+def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Cones]:
+    """Check the arrays (m,) and return `order_findex_rows` and the blocks."""
     findex = as_array("findex", findex, (m,), dtype=np.int32)
-    order = order_rows(findex, m)
+    order = order_findex_rows(findex, m)
     low = as_array("lower", lower, (m,), finite=False, unit="N s")
     high = as_array("upper", upper, (m,), finite=False, unit="N s")
     is_friction = findex >= 0
@@ -84,7 +84,7 @@ def blocks_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[Int
     box, is_box = Cones.contacts(mu, shape="box"), size == 3
     return order, Cones(
         ptr=ptr,
-        kind=kinds_of(size > 1, box=is_box),
+        kind=get_kinds(size > 1, box=is_box),
         lower=np.where(is_friction, -high, low)[order],
         upper=high[order],
         mu=np.where(is_box, box.mu, mu[:, 0]),
@@ -92,7 +92,7 @@ def blocks_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[Int
     )
 
 
-def findex_from_blocks(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
+def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return lower, upper and findex (m,) of blocks; raise InputError for disks."""
     disks = np.flatnonzero(cones.n_together > 1)
     if len(disks):
@@ -102,7 +102,7 @@ def findex_from_blocks(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
         )
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)
-    rows, coefficient = np.flatnonzero(cones.friction_rows), cones.reach.copy()
+    rows, coefficient = np.flatnonzero(cones.friction_rows), cones.friction_coefficient.copy()
     first_tangent = cones.ptr[:-1][cones.is_box] + 1
     coefficient[first_tangent] = cones.coefficients[
         cones.is_box, 0

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_sizes
+from lavender.base.arrays import FloatArray, as_array, check_nonnegative_magnitudes
 from lavender.base.errors import InputError, check_name
 
 # Shapes of the bound of two tangents: their norm is bounded, or each tangent separately.
@@ -25,7 +25,7 @@ def check_shape(name: str, shape: Any) -> str:
 def check_coefficients(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
     """Convert coefficients or radii to a checked array (k,), one for each of k contacts."""
     array = as_array(name, value, (k,), unit=unit or "-")
-    check_sizes(name, array, unit or "-")
+    check_nonnegative_magnitudes(name, array, unit or "-")
     return array
 
 
@@ -53,7 +53,7 @@ def check_combination(mu: Any, tangents: int, spin: bool, rolling: bool, is_box:
 def _check_pairs(mu: Any) -> FloatArray:
     """Convert coefficients of two tangents to a checked array (k, 2)."""
     array = as_array("mu", mu, (None,) * np.ndim(mu))
-    check_sizes("mu", array, "-")
+    check_nonnegative_magnitudes("mu", array, "-")
     if array.ndim != 2 or array.shape[1] != 2:
         raise InputError(f"mu has shape {array.shape}; (k,) or (k, 2), one for each tangent, is needed")
     return array

@@ -23,8 +23,8 @@ from lavender.base.arrays import (
     as_csr,
     as_names,
     check_int,
-    precision_of,
-    read_only,
+    get_common_precision,
+    mark_read_only,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -128,7 +128,7 @@ class Generalized:
 
     @classmethod
     def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
-        """Build from checked arrays as `compressed`, without the factor of M and v*, which `shifted` computes."""
+        """Build from checked arrays, as `compressed`, without the factor of M and v*, which `shifted` computes."""
         new = object.__new__(cls)
         new._make_operator(jac, mass, len(mass[0]) - 1)
         new.__dict__["names"] = None
@@ -159,7 +159,7 @@ class Generalized:
             indptr = np.append(0, np.cumsum(is_nonzero))[indptr].astype(np.int32)
             indices, data = indices[is_nonzero], data[is_nonzero]
         new = object.__new__(Generalized)
-        operator = kernels.Operator(indptr, indices, read_only(data), *self.operator.mass, self.operator)
+        operator = kernels.Operator(indptr, indices, mark_read_only(data), *self.operator.mass, self.operator)
         operator.share_factor(self.operator)
         new.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
         return new
@@ -177,7 +177,7 @@ class Generalized:
         operator = kernels.Operator(*self.operator.jac, indptr, indices, data, self.operator)
         new.__dict__.update(names=self.names, order=self.order, operator=operator)
         new._factor()
-        new.__dict__["v_free"] = self.v_free if momentum is None else read_only(new.solve(momentum))
+        new.__dict__["v_free"] = self.v_free if momentum is None else mark_read_only(new.solve(momentum))
         return new
 
     def _initialize(
@@ -209,11 +209,11 @@ class Generalized:
             order = _order_velocities(mass, n)
             reordered = kernels.Operator(*_permute_columns(jac, order), *_permute_lower(mass, order))
             if operator is None or reordered.fill < operator.fill:
-                attributes["order"], operator = read_only(order), reordered
+                attributes["order"], operator = mark_read_only(order), reordered
         if n >= MIN_TREE_ORDERING_VELOCITIES and attributes["order"] is None:
             tree_order = _order_trees(jac, operator.parents)
             if tree_order is not None:
-                attributes["order"] = read_only(tree_order)
+                attributes["order"] = mark_read_only(tree_order)
                 operator = kernels.Operator(
                     *_permute_columns(jac, tree_order), *_permute_lower(mass, tree_order)
                 )
@@ -261,7 +261,7 @@ class Generalized:
             original = sp.csr_array((data.copy(), self.order[indices], indptr), shape=(self.m, self.nv))
             original.sort_indices()
             indices, data = original.indices, original.data
-        arrays = read_only(data), read_only(indices), read_only(indptr)
+        arrays = mark_read_only(data), mark_read_only(indices), mark_read_only(indptr)
         return sp.csr_array(arrays, shape=(self.m, self.nv))
 
     @cached_property
@@ -275,7 +275,7 @@ class Generalized:
             mass = sp.csr_array(mass[position][:, position])
         mass.sort_indices()
         for array in (mass.data, mass.indices, mass.indptr):
-            read_only(array)
+            mark_read_only(array)
         return mass
 
     @cached_property
@@ -283,10 +283,10 @@ class Generalized:
         """Tree of each velocity (nv,): velocities that M couples, directly or indirectly, are one tree."""
         label = _label_trees(self.operator.parents)
         if self.order is None:
-            return read_only(label)
+            return mark_read_only(label)
         original = np.empty_like(label)
         original[self.order] = label
-        return read_only(np.unique(original, return_inverse=True)[1].astype(np.int32))
+        return mark_read_only(np.unique(original, return_inverse=True)[1].astype(np.int32))
 
     def velocity_of(self, v: FloatArray) -> FloatArray:
         """Compute J v (m,) [m/s, rad/s] for velocities v (nv,)."""
@@ -371,24 +371,24 @@ def _convert_jacobian(jac: Any, n: int) -> Compressed:
     array = jac if sparse else as_array_view("J", jac, (None, None))
     if len(array.shape) != 2 or array.shape[1] != n:
         raise InputError(f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities")
-    return compressed("J", array) if sparse else dense_to_csr(array)
+    return convert_to_compressed_rows("J", array) if sparse else dense_to_csr(array)
 
 
 def _convert_mass(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     """Return the checked lower triangle of M and the number of velocities."""
     blocks = mass if isinstance(mass, (list, tuple)) else [mass]
-    max_asymmetry = MAX_ASYMMETRY_FLOAT32 if precision_of(*blocks) == "float32" else MAX_ASYMMETRY
+    max_asymmetry = MAX_ASYMMETRY_FLOAT32 if get_common_precision(*blocks) == "float32" else MAX_ASYMMETRY
     if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
         arrays = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
         # SciPy 1.18 warns about dense blocks.
         mass = sp.block_diag([sp.coo_array(block) for block in arrays], format="csr")
-    lower = lower_of(
+    lower = extract_lower_triangle(
         "M", mass, "give both triangles (Pinocchio's crba fills the upper one)", max_asymmetry, names
     )
     return lower, len(lower[0]) - 1
 
 
-def lower_of(
+def extract_lower_triangle(
     name: str,
     matrix: Any,
     hint: str,
@@ -407,7 +407,9 @@ def lower_of(
     if len(array.shape) != 2 or array.shape[0] != array.shape[1]:
         raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
     lower, (i, j, asymmetry) = (
-        kernels.lower_of_rows(*compressed(name, array)) if sparse else kernels.lower_of_dense(array)
+        kernels.lower_of_rows(*convert_to_compressed_rows(name, array))
+        if sparse
+        else kernels.lower_of_dense(array)
     )
     if asymmetry > max_asymmetry:
         entries: Any = sp.csr_array(array) if sparse else array
@@ -420,7 +422,7 @@ def lower_of(
     return lower
 
 
-def compressed(name: str, matrix: Any, sign: float = 1.0) -> Compressed:
+def convert_to_compressed_rows(name: str, matrix: Any, sign: float = 1.0) -> Compressed:
     """Convert a sparse matrix times a sign to checked compressed rows, without entries that are zero."""
     m, n = matrix.shape
     if matrix.format in ("csr", "csc") and m < 2**31 > n:

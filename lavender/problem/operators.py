@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, read_only
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, mark_read_only
 from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
@@ -24,7 +24,7 @@ from lavender_ext.judge import measure
 # the entries causes negative eigenvalues of about -m 2^-53 in the metric of D.
 SEMIDEFINITE_SHIFT = 1e-12
 MAX_SAFE_ENTRY = (
-    1e15  # If entries of J and M^-1 are at most this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
+    1e15  # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 )
 MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
 
@@ -68,7 +68,7 @@ class Operators(ProblemData):
     def asymmetry(self) -> float:
         """Asymmetry max |A - A^T| / max |A| [-]; exactly 0 with J and M.
 
-        If this is rounding (at most 1e-14), but the maximum of |A_ij - A_ji| / sqrt(d_i d_j) is not (above 1e-10), the
+        If this is rounding (up to 1e-14), but the maximum of |A_ij - A_ji| / sqrt(d_i d_j) is not (above 1e-10), the
         value is that maximum: entries of heavy bodies are small compared with entries of light bodies.
         """
         return 0.0 if self.matrix is None else self._scan[2]
@@ -199,7 +199,7 @@ class Operators(ProblemData):
                     "use a solver that reads rows"
                 )
             indptr, indices, data = assemble.delassus(self.data, bound, start, blocks)
-            return read_only(indptr), read_only(indices), read_only(data)
+            return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
         return dense_to_csr(self.matrix)
 
     def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -214,7 +214,7 @@ class Operators(ProblemData):
         assert self.generalized is not None
         y = self.metric.whitened()  # without SciPy: a first solve with a time limit has no time to import it
         indptr, indices, data = assemble.gram(*y, self.generalized.nv, self.compliance)
-        return read_only(indptr), read_only(indices), read_only(data)
+        return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
     @once
     def whitened(self) -> sp.csr_array:
@@ -324,7 +324,7 @@ class Operators(ProblemData):
 def _read_only(matrix: sp.csr_array) -> sp.csr_array:
     """Mark the arrays of a matrix read-only, and return it."""
     for array in (matrix.data, matrix.indices, matrix.indptr):
-        read_only(array)
+        mark_read_only(array)
     return matrix
 
 

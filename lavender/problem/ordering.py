@@ -66,7 +66,7 @@ class Order:
         return self.mode == GIVEN
 
 
-def block_order(
+def compute_block_order(
     problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None
 ) -> Order:
     """Compute the sweep order of a problem's blocks.
@@ -118,14 +118,14 @@ def block_order(
     if order == "reverse":
         blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
     elif order in ("bottom_up", "top_down"):
-        level = levels(problem, ground)
+        level = compute_levels(problem, ground)
         if order == "top_down":
             level = level.max(initial=0) - level
         blocks = _sort_by_key(level, split)
     elif order == "local":
-        blocks = local_order(problem)
+        blocks = compute_local_order(problem)
     elif order == "colored":
-        blocks = _sort_by_key(colors(problem), split)
+        blocks = _sort_by_key(compute_colors(problem), split)
     mode = SYMMETRIC if order == "symmetric" else RANDOM if order == "random" else GIVEN
     return Order(np.ascontiguousarray(blocks, np.int32), split, mode, rng)
 
@@ -136,7 +136,7 @@ def _sort_by_key(key: IntArray, split: int) -> IntArray:
     return np.lexsort((key, is_contact)).astype(np.int32)
 
 
-def levels(problem: Problem, ground: Any = None) -> IntArray:
+def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
     """Compute the level (k,) of each block: its distance from static bodies, or in A's graph from `ground`."""
     k = problem.n_blocks
     if problem.rows is not None:
@@ -152,7 +152,7 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
         raise InputError(f"ground names block {ground.max()}; there are {k} blocks")
-    graph = _block_graph(problem)
+    graph = _build_block_graph(problem)
     level = np.full(k, -1, np.int32)
     front = np.unique(ground)
     depth = 0
@@ -170,7 +170,7 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
 MAX_MEAN_BODY_DISTANCE = 4_096
 
 
-def body_ranks(problem: Problem) -> IntArray:
+def rank_bodies(problem: Problem) -> IntArray:
     """Return a numbering (n,) of bodies in which touching bodies have close numbers.
 
     It is the present numbering if that is close enough, else reverse Cuthill-McKee.
@@ -188,14 +188,14 @@ def body_ranks(problem: Problem) -> IntArray:
     return rank
 
 
-def local_order(problem: Problem) -> IntArray:
-    """Sort blocks (k,), joints first, by the `body_ranks` of their bodies; a matrix by reverse Cuthill-McKee."""
+def compute_local_order(problem: Problem) -> IntArray:
+    """Sort blocks (k,), joints first, by the `rank_bodies` of their bodies; a matrix by reverse Cuthill-McKee."""
     if problem.rows is None:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
-        graph = sp.csr_matrix(_block_graph(problem))
+        graph = sp.csr_matrix(_build_block_graph(problem))
         return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
-    rank = np.append(body_ranks(problem), np.int32(-1))
+    rank = np.append(rank_bodies(problem), np.int32(-1))
     pair = rank[problem.rows.block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
     low = np.where(low < 0, high, low)  # Contacts with a static body are sorted by the moving body.
@@ -203,14 +203,14 @@ def local_order(problem: Problem) -> IntArray:
     return np.lexsort((high, low, is_contact)).astype(np.int32)
 
 
-def colors(problem: Problem) -> IntArray:
+def compute_colors(problem: Problem) -> IntArray:
     """Compute the colour (k,) of each block by a greedy search in the order of the problem.
 
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
     if problem.rows is not None:
         return body_colors(problem.rows.block_bodies, problem.rows.n_bodies)
-    graph = _block_graph(problem)
+    graph = _build_block_graph(problem)
     k = problem.n_blocks
     return graph_colors(
         np.arange(k + 1, dtype=np.int32),
@@ -220,21 +220,21 @@ def colors(problem: Problem) -> IntArray:
     )
 
 
-def rows_by_island(problem: Problem, ptr: IntArray) -> list[IntArray]:
+def group_rows_by_island(problem: Problem, ptr: IntArray) -> list[IntArray]:
     """Return the rows of each island of A, in order; rows ptr[i] to ptr[i + 1] - 1 are never separated."""
     group = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
     indptr, indices, _ = problem._compressed
     count, label = matrix_components(ptr, group, indptr, indices)
-    return blocks_by_island(count, label[group])
+    return group_blocks_by_island(count, label[group])
 
 
-def blocks_by_island(count: int, label: IntArray) -> list[IntArray]:
+def group_blocks_by_island(count: int, label: IntArray) -> list[IntArray]:
     """Return the blocks of each of `count` islands, in order, from the island `label` (k,) of each block."""
     order = np.argsort(label, kind="stable").astype(np.int32)
     return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
 
 
-def _block_graph(problem: Problem) -> sp.csr_array:
+def _build_block_graph(problem: Problem) -> sp.csr_array:
     """Return the graph of blocks that A couples, as a symmetric pattern without the diagonal."""
     a = problem.csr
     block_of = np.repeat(np.arange(problem.n_blocks), np.diff(problem.cones.ptr))

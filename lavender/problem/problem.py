@@ -242,7 +242,10 @@ class Problem(Builders):
         check_not_negative("normal_impulse", n)
         with np.errstate(over="ignore"):
             bound = as_array(
-                "mu N", c.reach * np.repeat(normal_of_block, np.diff(c.ptr)), (self.m,), unit="N s"
+                "mu N",
+                c.friction_coefficient * np.repeat(normal_of_block, np.diff(c.ptr)),
+                (self.m,),
+                unit="N s",
             )
         lower, upper = np.where(c.friction_rows, [-bound, bound], [c.lower, c.upper])
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]

@@ -6,7 +6,7 @@ With the rows J x = target (the first ones) and J x >= target (the others),
 
     J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]                                    (2)
 
-f: variables with lb = ub; l, u: other finite bounds; G without rows whose h is infinite. Numbers of at least 1e20 in
+f: variables with lb = ub; l, u: other finite bounds; G without rows with infinite h. Numbers of at least 1e20 in
 absolute value count as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others, and
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
@@ -15,7 +15,7 @@ P positive definite: (1) is the constraint problem of the generalised velocities
 
     M = P,   v* = -P^-1 q,   so that M (x - v*) = J^T lambda                                              (4)
 
-P singular (its Cholesky factor has a pivot of at most MAX_SINGULAR_PIVOT times the diagonal entry): P has no inverse,
+P singular (its Cholesky factor has a pivot of up to MAX_SINGULAR_PIVOT times the diagonal entry): P has no inverse,
 and (1) is the constraint problem of x and lambda together, with x free,
 
     w = [ P  -J^T ] [ x      ]  -  [ -q     ]                                                             (5)
@@ -38,17 +38,22 @@ from lavender.base.arrays import (
     IntArray,
     as_array,
     as_array_view,
+    check_nonnegative_magnitudes,
     check_not_nan,
-    check_sizes,
-    read_only,
-    shape_of,
+    get_shape,
+    mark_read_only,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
-from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
+from lavender.problem.generalized import (
+    Compressed,
+    Generalized,
+    convert_to_compressed_rows,
+    extract_lower_triangle,
+)
 from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked
 from lavender_ext.core.checks import norm_inf
 from lavender_ext.judge.measure import all_finite, program_residuals
@@ -56,7 +61,7 @@ from lavender_ext.judge.measure import all_finite, program_residuals
 IntpArray = npt.NDArray[np.intp]
 
 MAX_SINGULAR_PIVOT = (
-    1e-13  # P is singular if a pivot of its Cholesky factor is at most this share of the diagonal entry.
+    1e-13  # P is singular if a pivot of its Cholesky factor does not exceed this share of the diagonal entry.
 )
 # P is semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor: rounding may cause negative eigenvalues.
 SEMIDEFINITE_SHIFT = 1e-12
@@ -120,18 +125,19 @@ class QPSolution:
     @cached_property
     def _curvature(self) -> FloatArray:
         """P x (n,)."""
-        return self.qp.times_hessian(self.x)
+        return self.qp.multiply_hessian(self.x)
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
         """r_p, r_d, gap, the same three relative to their terms, and the largest relative one."""
-        qp, multipliers, min_force = self.qp, self.qp.of_rows(self.impulse), 0.0
+        qp, multipliers, min_force = self.qp, self.qp.select_row_multipliers(self.impulse), 0.0
         if norm_inf(qp.q) == 0.0:
             min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
         jac, order = qp.compressed_rows
         result: tuple[float, ...] = program_residuals(
-            self.x, qp.q, self._curvature, qp.force(multipliers), qp.times_rows(self.x), qp.target, multipliers,
-            qp.free, jac, self.x if order is None else self.x[order], qp.sizes_without_rows, min_force,
+            self.x, qp.q, self._curvature, qp.multiply_jacobian_transposed(multipliers),
+            qp.multiply_jacobian(self.x), qp.target, multipliers,
+            qp.free, jac, self.x if order is None else self.x[order], qp.estimate_variable_sizes, min_force,
         )  # fmt: skip
         return result
 
@@ -176,8 +182,8 @@ class QPSolution:
     def found(self) -> bool:
         """Whether the program is solved.
 
-        The error is at most `tol`, no ray or certificate proves that there is no solution, and the solver's claim is
-        not contradicted.
+        The error does not exceed `tol`, no ray or certificate proves that no solution exists, and the solver's claim
+        is not contradicted.
         """
         if self.ray is not None or not self.error <= self.tol:
             return False
@@ -232,19 +238,19 @@ class QuadraticProgram:
     def problem_fields(self) -> dict[str, Any]:
         """Return the fields b, cones and matrix or generalized of the constraint problem."""
         if self.generalized is not None:
-            cones = _one_sided(self.free, len(self.target))
+            cones = _make_one_sided_cones(self.free, len(self.target))
             return {"b": self.generalized.bias(self.target), "cones": cones, "generalized": self.generalized}
         n, jac = len(self.q), self.jacobian
         matrix = sp.csr_array(sp.block_array([[self.hessian, -jac.T], [jac, None]], format="csr"))
         matrix.eliminate_zeros()
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
-        return {"b": b, "cones": _one_sided(n + self.free, len(b)), "matrix": matrix}
+        return {"b": b, "cones": _make_one_sided_cones(n + self.free, len(b)), "matrix": matrix}
 
     def with_bias(self, b: FloatArray) -> QuadraticProgram:
-        """Return the program of a singular P whose right-hand side in (5) is b (n + m,)."""
+        """Return the program of a singular P for which the right-hand side of (5) is b (n + m,)."""
         n = len(self.q)
-        return replace(self, q=read_only(-b[:n]), target=read_only(b[n:].copy()))
+        return replace(self, q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()))
 
     def with_saddle(self) -> QuadraticProgram:
         """Return the same program in the form (5), whatever P is."""
@@ -278,21 +284,21 @@ class QuadraticProgram:
         assert self.singular is not None
         return self.singular[1], None
 
-    def times_hessian(self, x: FloatArray) -> FloatArray:
+    def multiply_hessian(self, x: FloatArray) -> FloatArray:
         """Compute P x (n,)."""
         return self.hessian @ x if self.generalized is None else self.generalized.momentum_of(x)
 
-    def times_rows(self, x: FloatArray) -> FloatArray:
+    def multiply_jacobian(self, x: FloatArray) -> FloatArray:
         """Compute J x (m,)."""
         return self.jacobian @ x if self.generalized is None else self.generalized.velocity_of(x)
 
-    def force(self, multipliers: FloatArray) -> FloatArray:
+    def multiply_jacobian_transposed(self, multipliers: FloatArray) -> FloatArray:
         """Compute J^T lambda (n,) for multipliers (m,)."""
         if self.generalized is None:
             return self.jacobian.T @ multipliers
         return self.generalized.force(multipliers)
 
-    def sizes_without_rows(self) -> FloatArray:
+    def estimate_variable_sizes(self) -> FloatArray:
         """Compute the size of each variable (n,) without rows, |q_i| / P_ii or |v*_i|, in the order of J's columns."""
         general = self.generalized
         if general is None:
@@ -306,13 +312,13 @@ class QuadraticProgram:
         out: FloatArray = np.where(size > 0.0, size, free)
         return out
 
-    def variables(self, impulse: FloatArray) -> FloatArray:
+    def recover_variables(self, impulse: FloatArray) -> FloatArray:
         """Compute x (n,) from the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""
         if self.generalized is None:
             return impulse[: len(self.q)].copy()
         return self.generalized.v_free + self.generalized.change(impulse)
 
-    def of_rows(self, impulse: FloatArray) -> FloatArray:
+    def select_row_multipliers(self, impulse: FloatArray) -> FloatArray:
         """Return the multipliers lambda (m,) of the rows from impulses (m,) or (n + m,)."""
         return impulse[len(impulse) - len(self.target) :]
 
@@ -325,7 +331,7 @@ class QuadraticProgram:
         b.y + h.z + (ub or lb).z_box < 0.
         """
         y = z = box = None
-        impulse = self.of_rows(impulse)
+        impulse = self.select_row_multipliers(impulse)
         n_equalities, end = self.n_equalities or 0, len(impulse)
         if self.n_equalities is not None:
             y = -impulse[:n_equalities]
@@ -347,7 +353,7 @@ class QuadraticProgram:
     def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
         """Return x, y, z and z_box of a `Solution` of this problem, or of its impulses.
 
-        It is `found` if the error is at most `tol`.
+        It is `found` if the error does not exceed `tol`.
         """
         impulse = getattr(solution, "impulse", None)
         of_solution = None if impulse is None else solution
@@ -356,13 +362,14 @@ class QuadraticProgram:
             impulse = as_array("impulse", solution, (size,))
         y, z, box = self.multipliers(impulse)
         return QPSolution(
-            x=self.variables(impulse), y=y, z=z, z_box=box, solution=of_solution, ray=None, impulse=impulse, qp=self,
+            x=self.recover_variables(impulse), y=y, z=z, z_box=box, solution=of_solution, ray=None,
+            impulse=impulse, qp=self,
             tol=tol,
         )  # fmt: skip
 
 
 @lru_cache(maxsize=8)  # All programs of one controller have the same cones.
-def _one_sided(free: int, m: int) -> Cones:
+def _make_one_sided_cones(free: int, m: int) -> Cones:
     """Return cones of m rows, the first ones free and the others nonnegative."""
     low = np.zeros(m)
     low[:free] = -np.inf
@@ -397,14 +404,14 @@ def convert_program(arrays: ProgramArrays) -> QuadraticProgram:
     jac, target = rows.stacked
     general = _factor_definite(lower, jac, q)
     return QuadraticProgram(
-        q=q, target=read_only(target), free=free, generalized=general,
+        q=q, target=mark_read_only(target), free=free, generalized=general,
         singular=None if general is not None else (mirrored(*lower), jac), n_equalities=n_a, n_inequalities=n_g,
         kept=finite_rows, fixed=fixed, lower=low, upper=up,
     )  # fmt: skip
 
 
-def program_of_matrix(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -> QuadraticProgram:
-    """Return the program of n variables whose problem (5) has this matrix, right-hand side and bounds.
+def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -> QuadraticProgram:
+    """Return the program of n variables from the matrix, right-hand side and bounds of its problem (5).
 
     Its equations count as A x = b, its other rows as G x <= h.
 
@@ -415,13 +422,17 @@ def program_of_matrix(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int)
     """
     jac, hessian = sp.csr_array(matrix[n:, :n]), sp.csr_array(matrix[:n, :n])
     free = int(np.count_nonzero(np.isneginf(cones.lower[n:])))
-    if matrix[n:, n:].nnz or abs(matrix[:n, n:] + jac.T).nnz or cones != _one_sided(n + free, len(b)):
+    if (
+        matrix[n:, n:].nnz
+        or abs(matrix[:n, n:] + jac.T).nnz
+        or cones != _make_one_sided_cones(n + free, len(b))
+    ):
         raise InputError(f"the problem is not that of a quadratic program of {n} variables")
-    lower = lower_of("P", hessian, "give both triangles")
-    rows = compressed("J", jac)
+    lower = extract_lower_triangle("P", hessian, "give both triangles")
+    rows = convert_to_compressed_rows("J", jac)
     _factor_definite(lower, rows, -b[:n])
     return QuadraticProgram(
-        q=read_only(-b[:n]), target=read_only(b[n:].copy()), free=free, generalized=None,
+        q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=None,
         singular=(mirrored(*lower), rows), n_equalities=free, n_inequalities=len(b) - n - free, kept=None, fixed=None,
         lower=None, upper=None,
     )  # fmt: skip
@@ -452,18 +463,18 @@ def _convert_matrix(name: str, matrix: Any, n: int, sign: float) -> Compressed:
     """
     sparse = issparse(matrix)
     if not sparse:
-        dense = as_array_view(name, matrix, (None,) * max(1, len(shape_of(name, matrix))))
+        dense = as_array_view(name, matrix, (None,) * max(1, len(get_shape(name, matrix))))
         matrix = dense[None] if dense.ndim == 1 else dense
     if len(matrix.shape) != 2 or matrix.shape[1] != n:
         raise InputError(f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries")
-    return compressed(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
+    return convert_to_compressed_rows(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
 
 
 def _convert_hessian(P: Any, n: int) -> Compressed:
     """Return the lower triangle of P with its diagonal."""
-    if shape_of("P", P) != (n, n):
-        raise InputError(f"P has shape {shape_of('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
-    return lower_of("P", P, "give both triangles, or (P + P^T) / 2, which has the same x.P x")
+    if get_shape("P", P) != (n, n):
+        raise InputError(f"P has shape {get_shape('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
+    return extract_lower_triangle("P", P, "give both triangles, or (P + P^T) / 2, which has the same x.P x")
 
 
 class _RowStack:
@@ -474,7 +485,7 @@ class _RowStack:
         self.groups = list[Compressed]()
         self.targets = list[FloatArray]()
 
-    def add(self, rows: Compressed, target: FloatArray) -> None:
+    def add_rows(self, rows: Compressed, target: FloatArray) -> None:
         """Add a group of rows."""
         self.groups.append(rows)
         self.targets.append(target)
@@ -492,7 +503,7 @@ class _RowStack:
         """Add the rows sign x_i >= sign bound_i of these variables."""
         k = len(variables)
         rows = np.arange(k + 1, dtype=np.int32), variables.astype(np.int32), np.full(k, sign)
-        self.add(rows, sign * bound[variables])
+        self.add_rows(rows, sign * bound[variables])
 
     def add_matrix(
         self, name: str, matrix: Any, rhs_name: str, rhs: Any
@@ -512,7 +523,7 @@ class _RowStack:
         rows = _convert_matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
         m = len(rows[0]) - 1
         if name == "A":
-            self.add(rows, as_array(rhs_name, rhs, (m,)))
+            self.add_rows(rows, as_array(rhs_name, rhs, (m,)))
             return m, None
         h, finite_rows = as_array(rhs_name, rhs, (m,), finite=False), None
         if not (all_finite(h) and (h < INFINITE).all()):
@@ -521,7 +532,7 @@ class _RowStack:
             rows, h = _select_rows(rows, finite_rows), h[finite_rows]
             if not all_finite(h):
                 raise InputError(f"h is -inf at [{finite_rows[np.argmin(h)]}]: no x is below it")
-        self.add(rows, -h)
+        self.add_rows(rows, -h)
         return m, finite_rows
 
 
@@ -562,7 +573,7 @@ def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Gener
     is_zero = diagonal == 0.0
     shift = np.where(is_zero, diagonal.max(initial=0.0) or 1.0, SEMIDEFINITE_SHIFT * diagonal)
     if not _are_rows_empty(lower, is_zero) or _factor_shifted(unfactored, shift, momentum) is None:
-        check_sizes("the diagonal of P", np.abs(diagonal))
+        check_nonnegative_magnitudes("the diagonal of P", np.abs(diagonal))
         raise InputError(f"P is not positive semidefinite: {_describe_indefinite(lower, diagonal)}")
     return None
 

@@ -28,8 +28,8 @@ from lavender.base.arrays import (
     as_array,
     check_float,
     check_int,
-    check_sizes,
-    shape_of,
+    check_nonnegative_magnitudes,
+    get_shape,
 )
 from lavender.base.errors import InputError
 from lavender.problem.problem import Problem
@@ -160,7 +160,7 @@ class RowBuilder:
         baumgarte: float = 0.2,
         slop: float = 0.0,
     ) -> None:
-        shape = shape_of("position", position)
+        shape = get_shape("position", position)
         if len(shape) != 2 or shape[1] not in (2, 3):
             raise InputError(
                 f"position [m] has shape {shape}; (n, 2) is needed in two dimensions, (n, 3) in three"
@@ -172,10 +172,10 @@ class RowBuilder:
         self._position[:, : shape[1]] = as_array("position", position, (n, shape[1]), unit="m")
         self._centres: list[Vector] = [(x, y, z) for x, y, z in self._position.tolist()]
         self._inv_mass = as_array("inv_mass", inv_mass, (n,), unit="1/kg")
-        check_sizes("inv_mass", self._inv_mass, "1/kg")
+        check_nonnegative_magnitudes("inv_mass", self._inv_mass, "1/kg")
         if self._is_planar:
             about_z = as_array("inv_inertia", inv_inertia, (n,), unit="1/(kg m^2)")
-            check_sizes("inv_inertia", about_z, "1/(kg m^2)")
+            check_nonnegative_magnitudes("inv_inertia", about_z, "1/(kg m^2)")
             self._inv_inertia = np.zeros((n, 3, 3))
             self._inv_inertia[:, 2, 2] = about_z
             self._velocity = np.zeros((n, 6))
@@ -219,8 +219,8 @@ class RowBuilder:
         int
             Key of the block: the same in every step with the same method, bodies and feature.
         """
-        pair = self._pair(a, b)
-        rows = self._point_rows(pair, *self._anchors(anchor, anchor_b))
+        pair = self._check_pair(a, b)
+        rows = self._make_point_rows(pair, *self._get_anchors(anchor, anchor_b))
         return self._add_joint("ball", pair, rows, feature, name)
 
     def hinge(
@@ -247,14 +247,14 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        rows = self._point_rows(pair, *self._anchors(anchor, anchor_b))
-        axis_on_a = self._rotation_axis("axis", axis)
-        axis_on_b = axis_on_a if axis_b is None else self._rotation_axis("axis_b", axis_b)
+        pair = self._check_pair(a, b)
+        rows = self._make_point_rows(pair, *self._get_anchors(anchor, anchor_b))
+        axis_on_a = self._check_rotation_axis("axis", axis)
+        axis_on_b = axis_on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
         if not self._is_planar:
             error = _cross(axis_on_a, axis_on_b)
-            for side in _sides(axis_on_a):
-                rows.append(self._angular_row(pair, side, side, _dot(side, error)))
+            for side in _make_side_vectors(axis_on_a):
+                rows.append(self._make_angular_row(pair, side, side, _dot(side, error)))
         return self._add_joint("hinge", pair, rows, feature, name)
 
     def weld(
@@ -276,8 +276,10 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        rows = self._point_rows(pair, *self._anchors(anchor, anchor_b)) + self._locked_rows(pair, angle_error)
+        pair = self._check_pair(a, b)
+        rows = self._make_point_rows(
+            pair, *self._get_anchors(anchor, anchor_b)
+        ) + self._make_orientation_rows(pair, angle_error)
         return self._add_joint("weld", pair, rows, feature, name)
 
     def slider(
@@ -303,13 +305,15 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        point_a, point_b = self._anchors(anchor, anchor_b)
-        direction, offset = self._direction("axis", axis), _minus(point_b, point_a)
-        sides = [_cross(Z_AXIS, direction)] if self._is_planar else _sides(direction)
+        pair = self._check_pair(a, b)
+        point_a, point_b = self._get_anchors(anchor, anchor_b)
+        direction, offset = self._check_direction("axis", axis), _subtract(point_b, point_a)
+        sides = [_cross(Z_AXIS, direction)] if self._is_planar else _make_side_vectors(direction)
         # The line is fixed to a: its rotation moves the point of a that coincides with point_b.
-        rows = [self._linear_row(pair, side, point_b, point_b, _dot(side, offset)) for side in sides]
-        return self._add_joint("slider", pair, rows + self._locked_rows(pair, angle_error), feature, name)
+        rows = [self._make_linear_row(pair, side, point_b, point_b, _dot(side, offset)) for side in sides]
+        return self._add_joint(
+            "slider", pair, rows + self._make_orientation_rows(pair, angle_error), feature, name
+        )
 
     def distance(
         self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float | None = None,
@@ -331,10 +335,10 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        direction, present, point_a, point_b = self._line(anchor_a, anchor_b)
+        pair = self._check_pair(a, b)
+        direction, present, point_a, point_b = self._measure_line(anchor_a, anchor_b)
         wanted = present if length is None else check_float("length", length, low=0.0)
-        row = self._linear_row(pair, direction, point_a, point_b, present - wanted)
+        row = self._make_linear_row(pair, direction, point_a, point_b, present - wanted)
         return self._add_joint("distance", pair, [row], feature, name)
 
     def spring(
@@ -361,8 +365,8 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        direction, present, point_a, point_b = self._line(anchor_a, anchor_b)
+        pair = self._check_pair(a, b)
+        direction, present, point_a, point_b = self._measure_line(anchor_a, anchor_b)
         rest = check_float("length", length, low=0.0)
         k, c = check_float("stiffness", stiffness, low=0.0), check_float("damping", damping, low=0.0)
         resistance = c + self._dt * k
@@ -371,7 +375,7 @@ class RowBuilder:
                 f"stiffness is {k:g} N/m and damping is {c:g} N s/m; at least one must be positive, so that "
                 f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}"
             )
-        row = self._linear_row(pair, direction, point_a, point_b, 0.0)._replace(
+        row = self._make_linear_row(pair, direction, point_a, point_b, 0.0)._replace(
             target=-k * (present - rest) / resistance, compliance=1.0 / (self._dt * resistance)
         )
         return self._add_joint("spring", pair, [row], feature, name)
@@ -381,7 +385,7 @@ class RowBuilder:
         max_torque: float | None = None, max_force: float | None = None, anchor: ArrayLike | None = None,
         feature: int | None = None, name: str = "",
     ) -> int:  # fmt: skip
-        """Add a motor: it drives the relative velocity to `speed` with at most a torque or a force (eq. 3); one row.
+        """Add a motor: it drives the relative velocity to `speed` with a limited torque or force (eq. 3); one row.
 
         Parameters
         ----------
@@ -404,7 +408,7 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
+        pair = self._check_pair(a, b)
         wanted = check_float("speed", speed)
         if (max_torque is None) == (max_force is None):
             state = "neither is given" if max_torque is None else "both are given"
@@ -413,7 +417,7 @@ class RowBuilder:
             bound = self._dt * check_float("max_torque", max_torque, low=0.0)
         else:
             bound = self._dt * check_float("max_force", max_force, low=0.0)
-        row = self._driven_row(pair, axis, anchor, max_force is not None)
+        row = self._make_motor_or_limit_row(pair, axis, anchor, max_force is not None)
         row = row._replace(target=wanted, lower=-bound, upper=bound)
         return self._add_joint("motor", pair, [row], feature, name)
 
@@ -442,18 +446,20 @@ class RowBuilder:
         int
             Key of the block. Both rows have impulses of at least 0: first the lower limit, then the upper.
         """
-        pair, present = self._pair(a, b), check_float("value", value)
+        pair, present = self._check_pair(a, b), check_float("value", value)
         low = -inf if _is_float(lower) and lower == -inf else check_float("lower", lower)
         high = inf if _is_float(upper) and upper == inf else check_float("upper", upper)
         if low > high or (low == -inf and high == inf):
             wanted = "lower must not exceed upper" if low > high else "at least one must be finite"
             raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}")
-        row, rows = self._driven_row(pair, axis, anchor, anchor is not None), []
+        row, rows = self._make_motor_or_limit_row(pair, axis, anchor, anchor is not None), []
         if low > -inf:
-            rows.append(row._replace(target=self._stop_velocity(present - low), lower=0.0))
+            rows.append(row._replace(target=self._compute_stop_velocity(present - low), lower=0.0))
         if high < inf:
             opposite = [-x for x in row.jac]
-            rows.append(row._replace(jac=opposite, target=self._stop_velocity(high - present), lower=0.0))
+            rows.append(
+                row._replace(jac=opposite, target=self._compute_stop_velocity(high - present), lower=0.0)
+            )
         return self._add_joint("limit", pair, rows, feature, name)
 
     def gear(
@@ -479,14 +485,14 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair = self._pair(a, b)
-        on_a = self._rotation_axis("axis_a", axis_a)
-        on_b = on_a if axis_b is None else self._rotation_axis("axis_b", axis_b)
+        pair = self._check_pair(a, b)
+        on_a = self._check_rotation_axis("axis_a", axis_a)
+        on_b = on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
         factor = check_float("ratio", ratio)
         if factor == 0.0:
             raise InputError("ratio is 0; another number is needed: 0 would hold a and leave b free")
         error = check_float("angle_error", angle_error)
-        row = self._angular_row(pair, _scale(-1.0, on_a), _scale(factor, on_b), error)
+        row = self._make_angular_row(pair, _scale(-1.0, on_a), _scale(factor, on_b), error)
         return self._add_joint("gear", pair, [row], feature, name)
 
     # -- contacts ------------------------------------------------------------------------------------------------
@@ -528,8 +534,8 @@ class RowBuilder:
         int
             Key of the block.
         """
-        pair, at = self._pair(a, b), self._vector("point", point, "m")
-        along, size = self._vector("normal", normal), hypot(*self._vector("normal", normal))
+        pair, at = self._check_pair(a, b), self._check_vector("point", point, "m")
+        along, size = self._check_vector("normal", normal), hypot(*self._check_vector("normal", normal))
         if abs(size - 1.0) > NORMAL_LENGTH_TOLERANCE:
             raise InputError(f"normal has length {size:g}; a unit vector from a to b is needed")
         along = _scale(1.0 / size, along)
@@ -540,9 +546,9 @@ class RowBuilder:
             target = -distance / self._dt
         else:
             target = self._baumgarte * max(0.0, -distance - self._slop) / self._dt
-        side = self._tangent(along, tangent)
-        arm_a, arm_b = self._arm(pair[0], at), self._arm(pair[1], at)
-        key, label = self._take_key("contact", pair, feature, name)
+        side = self._choose_tangent(along, tangent)
+        arm_a, arm_b = self._compute_arm(pair[0], at), self._compute_arm(pair[1], at)
+        key, label = self._reserve_key("contact", pair, feature, name)
         self._contacts.append(
             Contact(
                 name=label,
@@ -599,7 +605,7 @@ class RowBuilder:
         target, compliance = np.zeros(first[-1]), np.zeros(first[-1])
         target[: len(rows)] = [row.target for row in rows]
         compliance[: len(rows)] = [row.compliance for row in rows]
-        target[first[:-1]] = [self._normal_target(x) for x in contacts]
+        target[first[:-1]] = [self._compute_normal_target(x) for x in contacts]
         blocks: list[Block | Contact] = [*joints, *contacts]
         return Problem.from_rows(
             data,
@@ -668,7 +674,7 @@ class RowBuilder:
     def _is_planar(self) -> bool:
         return self._dimensions == 2
 
-    def _pair(self, a: int | None, b: int | None) -> tuple[int, int]:
+    def _check_pair(self, a: int | None, b: int | None) -> tuple[int, int]:
         """Return the numbers of two different bodies, at most one of them the static world (-1)."""
         found, n = [], len(self._centres)
         for name, body in (("a", a), ("b", b)):
@@ -684,18 +690,18 @@ class RowBuilder:
             raise InputError(f"a and b are both {same}; two bodies are needed, at most one of them static")
         return found[0], found[1]
 
-    def _vector(self, name: str, value: ArrayLike, unit: str = "") -> Vector:
+    def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> Vector:
         """Return a vector of the builder's dimension with three components."""
-        if shape_of(name, value) == ():  # as_array would fill the vector with it
+        if get_shape(name, value) == ():  # as_array would fill the vector with it
             raise InputError(f"{name} is {value!r:.60}; a vector ({self._dimensions},) is needed")
         x = as_array(name, value, (self._dimensions,), unit=unit).tolist()
         return x[0], x[1], x[2] if len(x) == 3 else 0.0
 
-    def _direction(self, name: str, value: ArrayLike) -> Vector:
+    def _check_direction(self, name: str, value: ArrayLike) -> Vector:
         """Return a vector divided by its length."""
-        return _unit(name, self._vector(name, value))
+        return _normalise(name, self._check_vector(name, value))
 
-    def _rotation_axis(self, name: str, value: ArrayLike | None) -> Vector:
+    def _check_rotation_axis(self, name: str, value: ArrayLike | None) -> Vector:
         """Return the unit vector of an axis of rotation: z in two dimensions, which need no axis."""
         if self._is_planar:
             if value is not None:
@@ -707,23 +713,26 @@ class RowBuilder:
             raise InputError(
                 f"{name} is None; a vector (3,) in world coordinates is needed in three dimensions"
             )
-        return self._direction(name, value)
+        return self._check_direction(name, value)
 
-    def _anchors(self, anchor: ArrayLike, anchor_b: ArrayLike | None) -> tuple[Vector, Vector]:
+    def _get_anchors(self, anchor: ArrayLike, anchor_b: ArrayLike | None) -> tuple[Vector, Vector]:
         """Return the anchor points on a and on b."""
-        point = self._vector("anchor", anchor, "m")
-        return point, point if anchor_b is None else self._vector("anchor_b", anchor_b, "m")
+        point = self._check_vector("anchor", anchor, "m")
+        return point, point if anchor_b is None else self._check_vector("anchor_b", anchor_b, "m")
 
-    def _line(self, anchor_a: ArrayLike, anchor_b: ArrayLike) -> tuple[Vector, float, Vector, Vector]:
+    def _measure_line(self, anchor_a: ArrayLike, anchor_b: ArrayLike) -> tuple[Vector, float, Vector, Vector]:
         """Return unit vector, distance and both ends of the line between two anchors."""
-        point_a, point_b = self._vector("anchor_a", anchor_a, "m"), self._vector("anchor_b", anchor_b, "m")
-        offset = _minus(point_b, point_a)
+        point_a, point_b = (
+            self._check_vector("anchor_a", anchor_a, "m"),
+            self._check_vector("anchor_b", anchor_b, "m"),
+        )
+        offset = _subtract(point_b, point_a)
         size = hypot(*offset)
         if size > MIN_MAGNITUDE:
             return _scale(1.0 / size, offset), size, point_a, point_b
         return (Y_AXIS if self._is_planar else Z_AXIS), size, point_a, point_b
 
-    def _tangent(self, normal: Vector, tangent: ArrayLike | None) -> Vector:
+    def _choose_tangent(self, normal: Vector, tangent: ArrayLike | None) -> Vector:
         """Return the unit vector of the first tangent."""
         if self._is_planar:
             if tangent is not None:
@@ -732,14 +741,14 @@ class RowBuilder:
                 )
             return _cross(Z_AXIS, normal)
         if tangent is None:
-            return _sides(normal)[0]
-        along = self._direction("tangent", tangent)
-        across = _minus(along, _scale(_dot(along, normal), normal))
+            return _make_side_vectors(normal)[0]
+        along = self._check_direction("tangent", tangent)
+        across = _subtract(along, _scale(_dot(along, normal), normal))
         if hypot(*across) < NORMAL_LENGTH_TOLERANCE:
             raise InputError("tangent is parallel to normal; another direction is needed")
-        return _unit("tangent", across)
+        return _normalise("tangent", across)
 
-    def _take_key(
+    def _reserve_key(
         self, block_type: str, pair: tuple[int, int], feature: int | None, name: str
     ) -> tuple[int, str]:
         """Return the key and the name of a new block, and reserve the key."""
@@ -767,17 +776,17 @@ class RowBuilder:
         self, block_type: str, pair: tuple[int, int], rows: list[Row], feature: int | None, name: str
     ) -> int:
         """Add a joint and return its key."""
-        key, label = self._take_key(block_type, pair, feature, name)
+        key, label = self._reserve_key(block_type, pair, feature, name)
         self._joints.append(Block(label, key, pair, rows))
         return key
 
     # -- rows ----------------------------------------------------------------------------------------------------
 
-    def _arm(self, body: int, point: Vector) -> Vector:
+    def _compute_arm(self, body: int, point: Vector) -> Vector:
         """Return a point minus the centre of a body; 0 for the static world."""
-        return ZERO if body < 0 else _minus(point, self._centres[body])
+        return ZERO if body < 0 else _subtract(point, self._centres[body])
 
-    def _row(
+    def _make_rigid_row(
         self, pair: tuple[int, int], on_a: tuple[float, ...], on_b: tuple[float, ...], error: float
     ) -> Row:
         """Return a rigid row (eq. 1) from its Jacobian on a and on b; columns of the static world are 0."""
@@ -788,27 +797,27 @@ class RowBuilder:
             jac[6:] = on_b
         return Row(jac, -self._baumgarte * error / self._dt)
 
-    def _linear_row(
+    def _make_linear_row(
         self, pair: tuple[int, int], axis: Vector, point_a: Vector, point_b: Vector, error: float
     ) -> Row:
-        """Return the row axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a), whose error is that distance [m]."""
-        moment_a = _cross(self._arm(pair[0], point_a), axis)
-        moment_b = _cross(self._arm(pair[1], point_b), axis)
-        return self._row(pair, _scale(-1.0, axis) + _scale(-1.0, moment_a), axis + moment_b, error)
+        """Return the row axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a); its error is a distance [m]."""
+        moment_a = _cross(self._compute_arm(pair[0], point_a), axis)
+        moment_b = _cross(self._compute_arm(pair[1], point_b), axis)
+        return self._make_rigid_row(pair, _scale(-1.0, axis) + _scale(-1.0, moment_a), axis + moment_b, error)
 
-    def _angular_row(self, pair: tuple[int, int], axis_a: Vector, axis_b: Vector, error: float) -> Row:
-        """Return the row axis_b.omega_b - axis_a.omega_a, whose error is that angle [rad]."""
-        return self._row(pair, ZERO + _scale(-1.0, axis_a), ZERO + axis_b, error)
+    def _make_angular_row(self, pair: tuple[int, int], axis_a: Vector, axis_b: Vector, error: float) -> Row:
+        """Return the row axis_b.omega_b - axis_a.omega_a; its error is an angle [rad]."""
+        return self._make_rigid_row(pair, ZERO + _scale(-1.0, axis_a), ZERO + axis_b, error)
 
-    def _point_rows(self, pair: tuple[int, int], point_a: Vector, point_b: Vector) -> list[Row]:
+    def _make_point_rows(self, pair: tuple[int, int], point_a: Vector, point_b: Vector) -> list[Row]:
         """Return the rows that hold a point of b at a point of a."""
-        offset = _minus(point_b, point_a)
+        offset = _subtract(point_b, point_a)
         return [
-            self._linear_row(pair, axis, point_a, point_b, offset[i])
+            self._make_linear_row(pair, axis, point_a, point_b, offset[i])
             for i, axis in enumerate((X_AXIS, Y_AXIS, Z_AXIS)[: self._dimensions])
         ]
 
-    def _locked_rows(self, pair: tuple[int, int], angle_error: ArrayLike) -> list[Row]:
+    def _make_orientation_rows(self, pair: tuple[int, int], angle_error: ArrayLike) -> list[Row]:
         """Return the rows that hold the relative orientation."""
         if self._is_planar:
             error: list[float] = [check_float("angle_error", angle_error)]
@@ -816,29 +825,29 @@ class RowBuilder:
         else:
             error = as_array("angle_error", angle_error, (3,), unit="rad").tolist()
             axes = (X_AXIS, Y_AXIS, Z_AXIS)
-        return [self._angular_row(pair, axis, axis, x) for axis, x in zip(axes, error, strict=True)]
+        return [self._make_angular_row(pair, axis, axis, x) for axis, x in zip(axes, error, strict=True)]
 
-    def _driven_row(
+    def _make_motor_or_limit_row(
         self, pair: tuple[int, int], axis: ArrayLike | None, anchor: ArrayLike | None, is_linear: bool
     ) -> Row:
         """Return the row of a motor or limit: of travel at the anchor, or of rotation."""
         if not is_linear:
             if anchor is not None:
                 raise InputError("anchor is given with max_torque; leave it out, or give max_force")
-            direction = self._rotation_axis("axis", axis)
-            return self._angular_row(pair, direction, direction, 0.0)
+            direction = self._check_rotation_axis("axis", axis)
+            return self._make_angular_row(pair, direction, direction, 0.0)
         if anchor is None:
             raise InputError("anchor is None; with max_force the point at which the force acts is needed")
         if axis is None:
             raise InputError(f"axis is None; the direction of travel ({self._dimensions},) is needed")
-        point = self._vector("anchor", anchor, "m")
-        return self._linear_row(pair, self._direction("axis", axis), point, point, 0.0)
+        point = self._check_vector("anchor", anchor, "m")
+        return self._make_linear_row(pair, self._check_direction("axis", axis), point, point, 0.0)
 
-    def _stop_velocity(self, travel: float) -> float:
+    def _compute_stop_velocity(self, travel: float) -> float:
         """Return the smallest velocity away from a limit, of which `travel` remains (eq. 4)."""
         return (-travel if travel > 0.0 else -self._baumgarte * travel) / self._dt
 
-    def _normal_target(self, contact: Contact) -> float:
+    def _compute_normal_target(self, contact: Contact) -> float:
         """Return the target of a contact's normal row, with restitution if the bodies approach fast enough (eq. 5)."""
         approach = 0.0
         for sign, body, arm in (
@@ -868,7 +877,7 @@ def _cross(x: Vector, y: Vector) -> Vector:
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
 
-def _minus(x: Vector, y: Vector) -> Vector:
+def _subtract(x: Vector, y: Vector) -> Vector:
     return x[0] - y[0], x[1] - y[1], x[2] - y[2]
 
 
@@ -876,7 +885,7 @@ def _scale(factor: float, x: Vector) -> Vector:
     return factor * x[0], factor * x[1], factor * x[2]
 
 
-def _unit(name: str, x: Vector) -> Vector:
+def _normalise(name: str, x: Vector) -> Vector:
     """Return a vector divided by its length; raise InputError if that is 0."""
     size = hypot(*x)
     if size < MIN_MAGNITUDE:
@@ -884,8 +893,8 @@ def _unit(name: str, x: Vector) -> Vector:
     return x[0] / size, x[1] / size, x[2] / size
 
 
-def _sides(axis: Vector) -> list[Vector]:
+def _make_side_vectors(axis: Vector) -> list[Vector]:
     """Return two unit vectors that form a right-handed frame with a unit vector: side, axis x side."""
     smallest = min(range(3), key=lambda i: abs(axis[i]))
-    side = _unit("axis", _cross(axis, (X_AXIS, Y_AXIS, Z_AXIS)[smallest]))
+    side = _normalise("axis", _cross(axis, (X_AXIS, Y_AXIS, Z_AXIS)[smallest]))
     return [side, _cross(axis, side)]

@@ -13,17 +13,17 @@ from lavender.base.arrays import (
     IntArray,
     are_equal,
     as_array,
-    check_sizes,
-    precision_of,
-    read_only,
-    shape_of,
+    check_nonnegative_magnitudes,
+    get_common_precision,
+    get_shape,
+    mark_read_only,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
 from lavender_ext.core import checks
 
-# Unit vectors and inertias that are off by at most this are not corrected; rounding in float64 causes less.
+# Unit vectors and inertias that are off by up to this are not corrected; rounding in float64 causes less.
 MAX_UNCORRECTED_ERROR = 1e-9
 # Unit vectors and inertias that are off by more than this raise an error; float32 with several rotations causes less.
 MAX_CORRECTED_ERROR = 1e-5
@@ -50,7 +50,7 @@ class Rows:
     Parameters
     ----------
     inv_mass : array-like (n,), 1/kg
-        0: a kinematic body, whose velocity is `v_free` with any impulses.
+        0: a kinematic body, which has the velocity `v_free` with any impulses.
     inv_inertia : array-like (n, 3, 3), 1/(kg m^2)
         In world axes, symmetric, positive semidefinite.
     v_free : array-like (n, 6), m/s and rad/s
@@ -135,7 +135,7 @@ class Rows:
         ) -> None: ...  # fmt: skip
 
     def __post_init__(self) -> None:
-        masses, normals = shape_of("inv_mass", self.inv_mass), shape_of("normal", self.normal)
+        masses, normals = get_shape("inv_mass", self.inv_mass), get_shape("normal", self.normal)
         n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
         if not checks.counts_up(ptr):
@@ -153,7 +153,7 @@ class Rows:
             value = getattr(self, name)
             object.__setattr__(self, name, as_array(name, value, shape, copy=self.copy, unit=UNITS[name]))
             nonempty += [value] if getattr(self, name).size else []
-        if precision_of(*nonempty) == "float32":
+        if get_common_precision(*nonempty) == "float32":
             object.__setattr__(self, "precision", "float32")
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
@@ -185,8 +185,10 @@ class Rows:
             raise InputError(
                 f"{name}_body[{index}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
             )
-        check_sizes("inv_mass", self.inv_mass, UNITS["inv_mass"])
-        check_sizes("largest entry of inv_inertia", tensor_size(self.inv_inertia), UNITS["inv_inertia"])
+        check_nonnegative_magnitudes("inv_mass", self.inv_mass, UNITS["inv_mass"])
+        check_nonnegative_magnitudes(
+            "largest entry of inv_inertia", compute_max_abs_entries(self.inv_inertia), UNITS["inv_inertia"]
+        )
         if self.copy:
             object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
         if self.n_contacts:
@@ -213,8 +215,8 @@ class Rows:
         t = t - np.einsum("ij,ij->i", n, t)[:, None] * n
         t /= np.linalg.norm(t, axis=1)[:, None]
         is_corrected = (error > MAX_UNCORRECTED_ERROR)[:, None]
-        object.__setattr__(self, "normal", read_only(np.where(is_corrected, n, self.normal)))
-        object.__setattr__(self, "tangent", read_only(np.where(is_corrected, t, self.tangent)))
+        object.__setattr__(self, "normal", mark_read_only(np.where(is_corrected, n, self.normal)))
+        object.__setattr__(self, "tangent", mark_read_only(np.where(is_corrected, t, self.tangent)))
 
     @property
     def n_bodies(self) -> int:
@@ -300,7 +302,7 @@ class Rows:
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
 
 
-def tensor_size(tensors: FloatArray) -> FloatArray:
+def compute_max_abs_entries(tensors: FloatArray) -> FloatArray:
     """Return the largest absolute entry of each tensor (n, 3, 3)."""
     return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
@@ -332,4 +334,6 @@ def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
         return tensors
     value, axes = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
     new = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
-    return read_only(np.where(is_corrected[:, None, None], 0.5 * (new + new.transpose(0, 2, 1)), tensors))
+    return mark_read_only(
+        np.where(is_corrected[:, None, None], 0.5 * (new + new.transpose(0, 2, 1)), tensors)
+    )

@@ -1,6 +1,6 @@
 """`solve_qp`: quadratic programs through `solve`, to an error of the program itself.
 
-`solve` ends at a residual relative to that of the zero impulse; `QPSolution.error` is relative to the terms of the
+`solve` ends at a residual relative to the zero impulse's; `QPSolution.error` is relative to the terms of the
 program. While the error is above tol, the solve is continued from its result with a smaller tol. If this does not
 reach tol with `auto` and a positive definite P, the program in the form (5) of `problem/program.py` is given to the
 backend that solves programs with a singular P.
@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import check_float, read_only
+from lavender.base.arrays import check_float, mark_read_only
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, summed
+from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, sum_work
 from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import QuadraticProgram
@@ -64,7 +64,7 @@ def solve_qp(
     Returns
     -------
     QPSolution
-        x, y, z, z_box with their `error`; `solution.status` is CONVERGED if the error is at most `tol`.
+        x, y, z, z_box with their `error`; `solution.status` is CONVERGED if the error does not exceed `tol`.
         `solution.setup_time` and `solution.solve_time` add up to the time of this call. INFEASIBLE: no x satisfies the
         constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, if `solution.claim_check` is
         "confirmed". An unbounded program has a `ray`.
@@ -109,7 +109,7 @@ def solve_qp(
 def _complete(answer: QPSolution, seconds: float) -> None:
     """Set the time of the whole call, and CONVERGED if the program's error is within `tol`, in the answer's solution.
 
-    Residuals of the constraint problem are relative to those of the zero impulse; the program's error decides.
+    Residuals of the constraint problem are relative to the zero impulse's; the program's error decides.
     """
     solution: Solution = answer.solution
     values = solution.__dict__
@@ -126,7 +126,7 @@ def _complete(answer: QPSolution, seconds: float) -> None:
 def _solve_to_error(
     problem: Problem, solver: str, tol: float, end: float, impulse: Any, options: dict[str, Any]
 ) -> QPSolution:
-    """Solve the constraint problem, with smaller tol until the error of the program is at most `tol`."""
+    """Solve the constraint problem, with smaller tol until the error of the program does not exceed `tol`."""
     best: QPSolution | None = None
     inner = tol
     for _ in range(MAX_SOLVES):
@@ -146,7 +146,7 @@ def _solve_to_error(
 
 
 def _is_refuted(answer: QPSolution) -> bool:
-    """Whether a certificate that the judge has checked shows that there is no solution."""
+    """Whether a certificate that the judge has checked shows that no solution exists."""
     solution = answer.solution
     return bool(solution.status is Status.INFEASIBLE and solution.claim_check == CONFIRMED)
 
@@ -176,7 +176,7 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     if other.error < answer.error or _is_refuted(other):
         answer = other
     stages = tuple(stage for solution in ran for stage in solution.stages)
-    work = MappingProxyType(summed(solution.work for solution in ran))
+    work = MappingProxyType(sum_work(solution.work for solution in ran))
     message = f"{describe_stages(stages)}; {answer.solution.message}".rstrip("; ")
     answer.solution.__dict__.update(stages=stages, work=work, message=message)
     return answer
@@ -193,7 +193,7 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
     start = None
     if impulse is not None:
         given = problem.impulse_array(impulse)
-        start = np.concatenate([problem.qp.variables(given), given])
+        start = np.concatenate([problem.qp.recover_variables(given), given])
         start = start if np.isfinite(start).all() else None
     answer = _solve_to_error(program, "auto", tol, end, start, {})
     solution: Solution = answer.solution
@@ -203,10 +203,10 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
         solution.iterations,
         solution.work,
         describe_stages(solution.stages),
-        certificate=None if certificate is None else qp.of_rows(certificate),
+        certificate=None if certificate is None else qp.select_row_multipliers(certificate),
         stages=solution.stages,
     )
-    impulse = qp.of_rows(answer.impulse).copy()
+    impulse = qp.select_row_multipliers(answer.impulse).copy()
     judged = finish(problem, get("auto"), {}, impulse, claim, tol, solution.setup_time, 0.0, None)
     return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
 
@@ -220,12 +220,12 @@ def _find_ray(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
     solution, qp = answer.solution, problem.qp
     if not _is_refuted(answer) or solution.certificate is None:
         return answer
-    direction, rows = solution.certificate[: len(qp.q)], qp.of_rows(solution.certificate)
+    direction, rows = solution.certificate[: len(qp.q)], qp.select_row_multipliers(solution.certificate)
     if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:
         return answer
     unit = problem.d[: len(qp.q)]  # min sum unit_i x_i^2 under the same constraints
     general = Generalized(qp.jacobian, sp.diags_array(unit), np.zeros(len(unit)))
-    cones = problem.cones.take(np.arange(len(qp.q), problem.n_blocks))
+    cones = problem.cones.select(np.arange(len(qp.q), problem.n_blocks))
     nearest = Problem(qp.target, cones, generalized=general, copy=False)
     left = None if end == math.inf else max(end - perf_counter(), 1e-6)
     point = solve(nearest, tol=FEASIBLE_TOL, time_limit=left)
@@ -234,4 +234,4 @@ def _find_ray(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
         return replace(answer, solution=replace(solution, certificate=certificate, message=point.message))
     if not (point.success or point.residual.at_floor):
         return answer
-    return replace(answer, ray=read_only(direction / np.abs(direction).max()))
+    return replace(answer, ray=mark_read_only(direction / np.abs(direction).max()))

@@ -9,7 +9,7 @@ from typing import Any
 from lavender.base.lazy_import import import_locked
 from lavender.solvers.registry import SolverSpec
 
-__all__ = ["SPECS", "spec_of"]
+__all__ = ["SPECS", "get_spec"]
 
 # Files in this folder with a SPEC, from exact to simple methods.
 _TABLE = (
@@ -31,7 +31,7 @@ _TABLE = (
 SPECS: tuple[SolverSpec, ...]  # The specs of all solvers; `__getattr__` imports them at the first access.
 
 
-def spec_of(name: str) -> SolverSpec | None:
+def get_spec(name: str) -> SolverSpec | None:
     """Return the spec of one solver, importing its file if necessary; None if it is not in the table."""
     return import_locked(f"{__name__}.{name}").SPEC if name in _TABLE else None
 
@@ -39,11 +39,11 @@ def spec_of(name: str) -> SolverSpec | None:
 def __getattr__(name: str) -> Any:
     if name != "SPECS":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return tuple(map(spec_of, _TABLE))
+    return tuple(map(get_spec, _TABLE))
 
 
 class _SolversModule(ModuleType):
-    """Module whose call, `lavender.solvers()`, raises an error that names the functions that list solvers."""
+    """Module that raises an error when it is called: `lavender.solvers()` names the functions that list solvers."""
 
     def __call__(self, *args: Any, **arguments: Any) -> Any:
         raise TypeError(

@@ -8,7 +8,7 @@ from typing import Any
 from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.problem.ordering import Order, block_order
+from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.setup_times import forming_time
 from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
 from lavender_ext.accelerate import accelerated
@@ -94,7 +94,7 @@ class Accelerated(Sweeping):
 
 def state_as_given(solver: Accelerated, problem: Problem) -> AcceleratedState:
     """Return the state of sweeps over the form in which the problem was given: A is not formed."""
-    return solver._over(problem, block_order(problem, solver.order), problem.metric)
+    return solver._over(problem, compute_block_order(problem, solver.order), problem.metric)
 
 
 def operator(problem: Problem) -> Any:

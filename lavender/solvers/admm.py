@@ -64,7 +64,7 @@ _START_RHO = 0.1  # First penalty; B has unit diagonal, so its scale is 1. Measu
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# `prepare` scales the problem if that is estimated to take at most this time [s]; otherwise `run` does.
+# `prepare` scales the problem if that is estimated to take up to this time [s]; otherwise `run` does.
 MAX_SETUP_SCALING_TIME = 5e-3
 _SCALING_ENTRY_TIME = 1e-8  # Time [s] per entry of A.
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
@@ -88,7 +88,7 @@ class AdmmState:
         self.watch: Any = None
         self.factor: Any = None
         self.is_scaled = self.is_analysed = False
-        self.seconds = _scaling_time(
+        self.seconds = _estimate_scaling_time(
             problem
         )  # Estimated time of the next step: scaling, analysis, or a factor.
         if self.seconds <= MAX_SETUP_SCALING_TIME:
@@ -101,7 +101,7 @@ class AdmmState:
             self._scale()
         if not self.is_analysed:
             self._check_deadline()
-            self.seconds = self._first_factor_time()
+            self.seconds = self._estimate_first_factor_time()
             self.is_analysed = True
         if self.factor is None:
             self.factor = self._factor()
@@ -135,7 +135,7 @@ class AdmmState:
             self.panels = Panels(*rows_of(self.matrix)[:2])
         self.is_scaled, self.seconds = True, analysis_time(problem) if problem.m else 0.0
 
-    def _first_factor_time(self) -> float:
+    def _estimate_first_factor_time(self) -> float:
         """Estimate the time [s] of the first factor from the structure; later ones take as long as the one before."""
         problem = self.problem
         if self.kind == _BODIES:
@@ -202,7 +202,7 @@ class AdmmState:
             if self.deadline.passed(_ONE_PANEL_WORK_TIME * dense_work(m)):
                 raise TooLate
             self.full = True
-            self.matrix = matrix = _fill(matrix)
+            self.matrix = matrix = _store_all_entries(matrix)
             self.panels = panels = Panels(*rows_of(matrix)[:2])
             done = _factor_panels(panels, matrix, shift, True)
         if not done:
@@ -215,7 +215,7 @@ def _is_over_bodies(problem: Problem) -> bool:
     return rows is not None and 0 < 6 * rows.n_bodies < problem.m
 
 
-def _scaling_time(problem: Problem) -> float:
+def _estimate_scaling_time(problem: Problem) -> float:
     """Estimate the time of scaling [s]."""
     if _is_over_bodies(problem):
         return (
@@ -257,7 +257,7 @@ def _factor_panels(panels: Panels, matrix: sp.csr_array, shift: float, lu: bool)
     return bool(error <= BACKWARD_TOLERANCE * ((np.abs(values).max() + shift) * np.abs(x).max() + 2.0))
 
 
-def _fill(matrix: sp.csr_array) -> sp.csr_array:
+def _store_all_entries(matrix: sp.csr_array) -> sp.csr_array:
     """Return the matrix with all entries stored."""
     n = matrix.shape[0]
     indptr, indices = np.arange(n + 1, dtype=np.int32) * n, np.tile(np.arange(n, dtype=np.int32), n)
@@ -281,11 +281,11 @@ class ADMM(Solver):
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time of `prepare` [s]; later set-up starts in `set_deadline` or `run` if it fits the limit."""
-        scaling = _scaling_time(problem)
+        scaling = _estimate_scaling_time(problem)
         return (scaling if scaling <= MAX_SETUP_SCALING_TIME else 0.0) + loading_time(*SCIPY_MODULES)
 
     def prepare(self, problem: Problem) -> AdmmState:
-        """Build the state; the problem is scaled if that takes at most `MAX_SETUP_SCALING_TIME`."""
+        """Build the state; the problem is scaled if that takes up to `MAX_SETUP_SCALING_TIME`."""
         import_numerics()
         return AdmmState(problem, self.memory, self.relaxation)
 

@@ -34,9 +34,9 @@ from math import inf, nan
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline, seconds
+from lavender.base.deadline import NEVER, Deadline, format_seconds
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.residuals import best_of_islands
+from lavender.judge.residuals import combine_best_islands
 from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
@@ -44,8 +44,8 @@ from lavender.solvers import costs
 from lavender.solvers.certify import (
     MIN_LINEAR_PROGRAM_COST,
     certify_by_least_violation,
+    certify_by_linear_programs,
     certify_infeasibility,
-    linear_programs,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.islands import count_pairs
@@ -233,10 +233,10 @@ class Tree:
             yield self.sweeps(first, "the first sweeps, before any analysis")
         self.add_row_form(ratio * self.newton if self.compiled_call_failed else self.newton)
         if not self.factorises_first and first < self.newton < inf:
-            why = f"up to {seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
+            why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
             if self.is_loose:
-                name = "nncg" if p.cones.has_more_parts else "nncg from the cone law"
+                name = "nncg" if p.cones.has_more_components else "nncg from the cone law"
                 yield self.iterations(name, self.newton, f"a loose pile, {why}")
         if p.generalized is not None and not np.all(p.compliance):
             yield from islice(self.factorisations(0.25 * ratio), 1)
@@ -274,7 +274,7 @@ class Tree:
         budget = times * self.newton
         for name, cost in self.solver_costs.items():
             if cost <= budget:
-                why = f"{times:.3g} times its estimated cost of {seconds(1e-9 * cost)}"
+                why = f"{times:.3g} times its estimated cost of {format_seconds(1e-9 * cost)}"
                 yield self.factorisation(name, times * cost, why)
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
@@ -362,7 +362,7 @@ class Auto(Solver):
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         if deadline.passed(first_sweep_time(problem)):
-            impulse[:] = best_of_islands(problem, (impulse, problem._start), (), tol)
+            impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = Tree(problem, deadline)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
@@ -412,7 +412,7 @@ def run_backends(
             if tol == 0.0:
                 break
         if error > tol > 0.0 and not log.done():
-            linear_programs(log)
+            certify_by_linear_programs(log)
     except KeyboardInterrupt:
         log.interrupted = True
     except BREAKDOWN as failure:
@@ -447,7 +447,11 @@ def solve(log: SolveLog, tree: Tree) -> None:
             break
         if stage.solver == "certificate":
             if not log.ends_late(stage.cost):
-                (linear_programs if log.problem.generalized is None else certify_by_least_violation)(log)
+                (
+                    certify_by_linear_programs
+                    if log.problem.generalized is None
+                    else certify_by_least_violation
+                )(log)
             continue
         step = steps.get(stage.solver)
         if step is None:

@@ -8,7 +8,7 @@ missed.
 
 With Coulomb friction, the convex relaxation is tried last. A direction y of the relaxation that has tangential
 components proves nothing for Coulomb's law, but it shows which blocks conflict: a compliance on the rows of y removes
-it (`conflict_of`).
+it (`find_conflict`).
 
 With J and M, the certificate is computed from the smallest violation of J v = target, which does not depend on M
 (`certify_by_least_violation`).
@@ -28,12 +28,12 @@ from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.certificates import Proof, list_conflicting_blocks, prove
+from lavender.judge.certificates import Proof, list_conflicting_blocks, prove_infeasibility
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.ordering import blocks_by_island
-from lavender.solvers.islands import islands, restrict, rows_of
+from lavender.problem.ordering import group_blocks_by_island
+from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading_time
@@ -49,16 +49,17 @@ SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
 MAX_RELAXATION_STEPS = 150  # Largest number of factorisations for a proof of the convex relaxation,
 MAX_SOFTENED_STEPS = 300  # and for the solution of a problem with additional compliance.
 TRIED_COMPLIANCES = 1e-4, 1e-2  # Additional compliances that are tried, as multiples of d.
-# Compliances of the problems whose solutions approach the smallest violation, as multiples of d.
+# Compliances that replace the rigid rows in turn, as multiples of d: the solutions then approach the motion with the
+# smallest violation.
 NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
-VIOLATION_TOLERANCE = 1e-6  # Relative residual of the solutions of these problems.
+VIOLATION_TOLERANCE = 1e-6  # Relative residual to which the problems with these compliances are solved.
 # Rows of a direction below this fraction of its largest entry in the metric of D are set to zero.
 NEGLIGIBLE_ROW_FRACTION = 1e-6
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """Conflicting constraints of a problem whose convex relaxation has no solution.
+    """Conflicting constraints of a problem without a solution of its convex relaxation.
 
     Parameters
     ----------
@@ -89,13 +90,13 @@ class Conflict:
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) -> Conflict | None:
+def find_conflict(problem: Problem, tol: float, deadline: Deadline | None = None) -> Conflict | None:
     """Return the conflicting constraints if the convex relaxation is proved to have no solution, else None."""
     inner = problem.relaxed("cone")
     claim = _run_newton(inner, MAX_RELAXATION_STEPS, tol, deadline)[1]
     if claim is None or claim.certificate is None:
         return None
-    proof = prove(inner, claim.certificate, tol, deadline)
+    proof = prove_infeasibility(inner, claim.certificate, tol, deadline)
     if proof.reason:
         return None
     joints, contacts = list_conflicting_blocks(problem, proof.y)
@@ -110,7 +111,7 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
             compliance = np.zeros(problem.m)
             compliance[rows] = fraction * problem.d[rows]
             try:
-                softer = soften(problem, compliance)
+                softer = add_compliance(problem, compliance)
             except InputError:  # A number exceeds the largest one that a problem may have.
                 continue
             if _run_newton(softer, MAX_SOFTENED_STEPS, tol, deadline)[0] <= tol:
@@ -119,7 +120,7 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
     return Conflict(proof, joints + contacts, (), 0.0, "")
 
 
-def soften(problem: Problem, compliance: FloatArray) -> Problem:
+def add_compliance(problem: Problem, compliance: FloatArray) -> Problem:
     """Return the problem with an additional compliance (m,) [1/kg]."""
     if problem.matrix is None:
         assert problem.compliance is not None
@@ -197,7 +198,7 @@ def certify_by_least_violation(log: SolveLog) -> None:
             if not outside.any():
                 break
         y[outside] = 0.0
-        if not prove(problem, y, log.tol, log.deadline).reason:
+        if not prove_infeasibility(problem, y, log.tol, log.deadline).reason:
             break
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
 
@@ -207,17 +208,17 @@ def certify_infeasibility(log: SolveLog) -> None:
     """Search for a certificate that a problem has no solution; under Coulomb's law, also for the convex relaxation."""
     problem = log.problem
     if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:
-        linear_programs(log)
+        certify_by_linear_programs(log)
     if (
         log.certificate is None
         and problem.law == "coulomb"
         and problem.m <= CERTIFICATE_ROWS
         and log.best > 1e-6
     ):
-        log.conflict = conflict_of(problem, log.tol, log.deadline)
+        log.conflict = find_conflict(problem, log.tol, log.deadline)
 
 
-def linear_programs(log: SolveLog) -> None:
+def certify_by_linear_programs(log: SolveLog) -> None:
     """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + 1e9 * loading_time("scipy.optimize")):
@@ -229,7 +230,7 @@ def linear_programs(log: SolveLog) -> None:
             return
         if not _has_simple_bounds(part):
             continue
-        y = find_direction(part, log.deadline)
+        y = find_certificate_by_linear_program(part, log.deadline)
         proof = None
         if y is not None:
             proof = np.zeros(problem.m)
@@ -243,18 +244,18 @@ def linear_programs(log: SolveLog) -> None:
 def _unsolved_islands(log: SolveLog) -> Any:
     """Yield (problem, rows) of each unsolved island, the smallest first, or the whole problem if it is one island."""
     problem = log.problem
-    count, label = islands(problem)
+    count, label = find_islands(problem)
     if count <= 1:
         yield problem, slice(None)
         return
-    blocks = blocks_by_island(count, label)
+    blocks = group_blocks_by_island(count, label)
     for i in sorted(_unsolved_labels(log, label), key=lambda i: len(blocks[i])):
-        rows = rows_of(problem, blocks[i])
-        yield restrict(problem, blocks[i], rows), rows
+        rows = get_rows_of_blocks(problem, blocks[i])
+        yield restrict_to_blocks(problem, blocks[i], rows), rows
 
 
 def _unsolved_labels(log: SolveLog, label: IntArray) -> IntArray:
-    """Return the islands whose relative residual is above the tolerance."""
+    """Return the islands with a relative residual above the tolerance."""
     own, table = by_island(log.problem.metric, log.impulse)
     if len(table) == 1:
         return np.unique(label) if table[0, 0] > log.tol else np.zeros(0, np.int32)
@@ -268,7 +269,7 @@ def _has_simple_bounds(problem: Problem) -> bool:
     return bool(np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))))
 
 
-def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
+def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> FloatArray | None:
     """Compute a direction y (m,) by a linear program; the caller checks it.
 
     Returns
@@ -286,7 +287,7 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper) & ~contact
     scale = 1.0 / np.sqrt(problem.d)
     normal = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))
-    limit = cones.reach * scale[normal] / scale
+    limit = cones.friction_coefficient * scale[normal] / scale
     rim = sp.csr_array(
         (limit[tangent], (normal[tangent], np.arange(tangent.sum()))), (problem.m, int(tangent.sum()))
     )
@@ -333,7 +334,10 @@ def check_infeasible(
     str
         Description of the solution that `auto` found instead, or empty.
     """
-    if claim.certificate is not None and not prove(problem, claim.certificate, tol, deadline).reason:
+    if (
+        claim.certificate is not None
+        and not prove_infeasibility(problem, claim.certificate, tol, deadline).reason
+    ):
         return claim, True, ""
     spec, left = get("auto"), deadline.remaining()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
@@ -342,7 +346,10 @@ def check_infeasible(
     own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
     if own_claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    if own_claim.certificate is not None and not prove(problem, own_claim.certificate, tol, deadline).reason:
+    if (
+        own_claim.certificate is not None
+        and not prove_infeasibility(problem, own_claim.certificate, tol, deadline).reason
+    ):
         message = f"{claim.message}; auto found the certificate".removeprefix("; ")
         return replace(claim, certificate=own_claim.certificate, message=message), True, ""
     relative = residual(problem, impulse, "float64").relative

@@ -32,7 +32,7 @@ from lavender.base.deadline import Deadline
 from lavender.judge.certificates import MAX_POLISHED_SLACK as CERTIFICATE_TOLERANCE
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
-from lavender.judge.solution import Claim, Status, summed
+from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
@@ -301,7 +301,7 @@ class _Run:
         self.notes = [self.state.note]
         assert isinstance(self.state.general, GeneralFactor)
         claim = self.linear_general(self.state.general)
-        return replace(claim, work=summed((claim.work, before)))
+        return replace(claim, work=sum_work((claim.work, before)))
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
 

@@ -20,7 +20,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.lazy_import import import_numerics, lapack
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.setup_times import dense_work
 from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
@@ -210,7 +210,7 @@ def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
 def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
     """Return LU with pivoting and the magnitudes of its pivots; (None, [0]) if the matrix is exactly singular."""
     try:
-        lu = sparse_lu(a)
+        lu = factor_sparse_lu(a)
         return lu, np.abs(lu.U.diagonal())
     except RuntimeError:
         return None, np.zeros(1)

@@ -13,7 +13,7 @@ from lavender_ext.core.checks import MIN_MAGNITUDE, norm_inf
 from lavender_ext.factor import graph
 
 
-def islands(problem: Problem) -> tuple[int, IntArray]:
+def find_islands(problem: Problem) -> tuple[int, IntArray]:
     """Return the number of islands and the island of each block (k,), numbered in block order.
 
     A block that is only between static bodies, or with an empty row of A, is an island by itself.
@@ -40,7 +40,7 @@ def count_pairs(problem: Problem) -> int:
     return int(np.unique(np.stack(columns), axis=1).shape[1])
 
 
-def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
+def get_rows_of_blocks(problem: Problem, blocks: IntArray) -> IntArray:
     """Return the row numbers of these blocks, in order."""
     ptr = problem.cones.ptr
     size = np.diff(ptr)[blocks]
@@ -49,12 +49,12 @@ def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
     return start + inner
 
 
-def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
+def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     """Return the problem of only these blocks, which must be complete islands.
 
     The restriction is exact, except that a b that is negligible in all rows becomes 0.
     """
-    cones = problem.cones._take_blocks(blocks)
+    cones = problem.cones._select_blocks(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows] if norm_inf(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))

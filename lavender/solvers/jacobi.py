@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from lavender.base.arrays import check_float
 from lavender.problem import Problem
-from lavender.problem.ordering import block_order
+from lavender.problem.ordering import compute_block_order
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import row_sums_time
 from lavender.solvers.sweeping import SweepSolver, SweepState, plan_of
@@ -41,7 +41,7 @@ class Jacobi(SweepSolver):
         return row_sums_time(problem)
 
     def prepare(self, problem: Problem) -> SweepState:
-        data, order = problem.csr_data, block_order(problem)
+        data, order = problem.csr_data, compute_block_order(problem)
         omega = serial.damping(data) if self.omega is None else self.omega
         return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), serial.JACOBI, omega))
 

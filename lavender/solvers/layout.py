@@ -1,6 +1,6 @@
 """Copy a problem with its rows in sweep order, so that a sweep reads memory from front to back.
 
-Blocks are in the order of the sweep, and bodies are numbered by `ordering.body_ranks`. A block reads the same values,
+Blocks are in the order of the sweep, and bodies are numbered by `ordering.rank_bodies`. A block reads the same values,
 so the impulses have the same bits; only sums over all rows have another order.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import FRICTION_LAWS, Problem
-from lavender.problem.ordering import Order, body_ranks
+from lavender.problem.ordering import Order, rank_bodies
 from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
 
@@ -51,7 +51,7 @@ class Layout:
         np.take(sweep_impulse, self.position, out=impulse, mode="clip")
 
 
-def copy_pays(problem: Problem, order: Order) -> bool:
+def is_copy_faster(problem: Problem, order: Order) -> bool:
     """Return whether the copy is faster: a large problem with a fixed order other than its own, joints first."""
     rows = problem.rows
     if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < MIN_CONTACTS_FOR_COPY:
@@ -62,7 +62,7 @@ def copy_pays(problem: Problem, order: Order) -> bool:
 def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
     """Copy `problem` with its blocks in the order `blocks` (k,), joints first.
 
-    `before` is the layout of a problem of the same structure in the same order, whose permutations are reused.
+    `before` is the layout of a problem of the same structure in the same order; its permutations are reused.
     """
     r, c = problem.rows, problem.cones
     assert r is not None
@@ -75,14 +75,14 @@ def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = No
         rows = np.arange(problem.m) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
         position = np.empty(problem.m, np.intp)
         position[rows] = np.arange(problem.m)
-        ranks = body_ranks(problem)
+        ranks = rank_bodies(problem)
     else:
         rows, position, ranks = before.rows, before.position, before.rank
     joint, contact = blocks[:kj], blocks[kj:] - kj
     rank = np.append(ranks, np.int32(-1))  # A static body, -1, stays -1.
     body = np.argsort(rank[:-1])
     arrays = _copy_to_separate_pages(
-        *c._take_blocks(blocks)._blocks.arrays, problem.b[rows],
+        *c._select_blocks(blocks)._blocks.arrays, problem.b[rows],
         r.jac[rows[:mj]], rank[r.joint_body[joint]], r.normal[contact], r.tangent[contact], r.arm_a[contact],
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],

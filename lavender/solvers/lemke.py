@@ -22,7 +22,11 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import store_result
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers.certify import CERTIFICATE_ROWS, MIN_LINEAR_PROGRAM_COST, find_direction
+from lavender.solvers.certify import (
+    CERTIFICATE_ROWS,
+    MIN_LINEAR_PROGRAM_COST,
+    find_certificate_by_linear_program,
+)
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
@@ -136,7 +140,7 @@ def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray
         1e-9 * MIN_LINEAR_PROGRAM_COST + loading_time("scipy.optimize")
     ):
         return None
-    y = find_direction(problem, deadline)
+    y = find_certificate_by_linear_program(problem, deadline)
     return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
 
 

@@ -18,8 +18,8 @@ from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
     Residual,
-    best_of_islands,
-    find_stored,
+    combine_best_islands,
+    find_stored_residual,
     judge_impulse,
     residual,
     store_result,
@@ -32,10 +32,10 @@ from lavender.judge.solution import (
     TIME_LIMIT,
     Claim,
     History,
-    summed,
+    sum_work,
 )
 from lavender.problem import Problem
-from lavender.problem.cones import project
+from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import Solver, State
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.judge.stopping_test import StoppingTest
@@ -111,7 +111,7 @@ class Loop:
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         # The impulse may be an intermediate result.
-        self.impulse[:] = best_of_islands(self.problem, (start_point,), (self.impulse,), self.tol)
+        self.impulse[:] = combine_best_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
 
     def call(self, max_iter: int, time_limit: float | None) -> Claim:
@@ -152,7 +152,7 @@ class Loop:
                 elapsed = watch.seconds
                 self.time += elapsed
                 self.done += claim.iterations
-                self.work = summed((self.work, claim.work))
+                self.work = sum_work((self.work, claim.work))
                 stopped = records and self.done == self.next_record and self._record()
                 if claim.status is not MAX_ITERATIONS:
                     break
@@ -186,7 +186,7 @@ class Loop:
         The zero impulse is only considered with `or_zero`.
         """
         problem = self.problem
-        result = find_stored(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
+        result = find_stored_residual(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
         if result.relative > self.tol:
             result = best_of(problem, result, start, self.tol, or_zero)
         store_result(problem, result)
@@ -205,11 +205,13 @@ class Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
-        last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse.copy())
+        last = find_stored_residual(self.problem, self.impulse) or judge_impulse(
+            self.problem, self.impulse.copy()
+        )
         if last.relative <= self.tol:
             store_result(self.problem, last)
         else:
-            self.impulse[:] = best_of_islands(self.problem, (best[1],), (self.impulse,), self.tol)
+            self.impulse[:] = combine_best_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
     def _record(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
@@ -243,8 +245,8 @@ def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float,
         return result
     first, own = problem._start if start is None else start, result.impulse
     with np.errstate(all="ignore"):  # Impulses that overflow are judged below.
-        inside = project(problem.cones, own)
+        inside = project_impulse(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
-    best = best_of_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
+    best = combine_best_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
     return result if same_bits(best, result.impulse) else judge_impulse(problem, best)

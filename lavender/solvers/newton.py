@@ -39,7 +39,7 @@ from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, counted, summed
+from lavender.judge.solution import Claim, Status, format_work_count, sum_work
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
@@ -278,7 +278,7 @@ class Newton(Solver):
         )
         if not compute_relative(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
-        work = summed((claim.work, second.work))
+        work = sum_work((claim.work, second.work))
         form = f"{claim.form}, then {second.form or 'impulse'}"
         total = claim.iterations + second.iterations
         return Claim(second.status, total, work, second.message, form=form, certificate=second.certificate)
@@ -313,7 +313,7 @@ class Newton(Solver):
         solve = system.solve
         factorisations = warm_factorisations + solve.done - before
         message = ", ".join(
-            counted(count, kind) for count, kind in zip(solve.counts, COUNTED, strict=True) if count
+            format_work_count(count, kind) for count, kind in zip(solve.counts, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)

@@ -3,7 +3,7 @@
     x_k = y_{k-1} + beta_{k-1} p_{k-2},    y_k = S(x_k),    g_k = x_k - y_k
     beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},    p_k = beta_k p_{k-1} - g_k,    D = diag d
 
-A sweep S replaces the gradient step, and beta is that of Fletcher and Reeves, without a line search; the method
+A sweep S replaces the gradient step, and beta is the formula of Fletcher and Reeves, without a line search; the method
 restarts if beta > 1. An iteration is one sweep and three passes over vectors. On piles it needs a third of the sweeps
 of `pgs` to reach 1e-9. With order="symmetric" an iteration is a sweep and the same sweep backwards, similar to a
 preconditioned conjugate gradient step: slower where `pgs` is fast, much faster on tall stacks and large mass ratios.

@@ -27,9 +27,9 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, summed
+from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
-from lavender.problem.cones import project
+from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import Solver
 
 # Assumed number of rows of (1) or (2) per row of the problem, and time [s] per row to build them.
@@ -56,7 +56,7 @@ class AsRows:
     def start(self, impulse: FloatArray) -> FloatArray:
         """Return a z (n,) of a feasible impulse (m,), or of its projection."""
         c, out = self.problem.cones, []
-        x, contact = project(c, impulse), c.is_contact
+        x, contact = project_impulse(c, impulse), c.is_contact
         for i, sides in _blocks(self.problem):
             j = c.ptr[i]
             if not sides:
@@ -77,7 +77,7 @@ class AsRows:
 def _blocks(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
     """Return (block, [(row offset, c_i)]) with the rows of each block that its normal impulse bounds and c_i > 0."""
     c = problem.cones
-    friction_bound = c.reach
+    friction_bound = c.friction_coefficient
     return [
         (i, [(t, float(friction_bound[j + t])) for t in range(1, end - j) if friction_bound[j + t] > 0.0])
         for i, (j, end) in enumerate(zip(c.ptr[:-1].tolist(), c.ptr[1:].tolist(), strict=True))
@@ -233,7 +233,7 @@ class ThroughRows(Solver):
         z = form.start(impulse)
         second = fallback.run(fallback.prepare(form.rows), z, max_iter, tol, deadline.remaining(1e-3))
         second = self._convert_claim(form, second, z, impulse, tol)
-        work = summed((claim.work, second.work))
+        work = sum_work((claim.work, second.work))
         message = f"{claim.message or 'no exchange helped'}, then complementary pivots"
         return replace(
             second, work=work, message=f"{message}: {second.message}" if second.message else message
@@ -243,7 +243,7 @@ class ThroughRows(Solver):
         self, form: AsRows, claim: Claim, z: FloatArray, impulse: FloatArray, tol: float
     ) -> Claim:
         """Convert a claim about z (n,) to one about the problem, and store lambda = E z in `impulse` (m,)."""
-        projected = project(form.problem.cones, form.to_impulse @ z)
+        projected = project_impulse(form.problem.cones, form.to_impulse @ z)
         if not np.isfinite(projected).all():
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
         impulse[:] = projected

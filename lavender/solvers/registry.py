@@ -86,14 +86,14 @@ class State(Protocol):
     def best(self) -> tuple[float, FloatArray | None]:
         """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) at first.
 
-        A solver whose residual may rise provides it: it becomes the result if the last iterate is worse.
+        A solver with a residual that may rise provides it: it becomes the result if the last iterate is worse.
         """
 
     @property
     def sweeps_per_decade(self) -> float:
         """Iterations in which the relative residual fell tenfold, from the last checks; NaN if it did not fall.
 
-        A solver whose iterations all cost the same provides it.
+        A solver with iterations of equal cost provides it.
         """
 
 
@@ -135,7 +135,7 @@ class Solver:
     def advance(
         self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None, left: int | None
     ) -> Claim:
-        """Run about `n` iterations for `auto`, at most `left`, continuing where the last call ended."""
+        """Run about `n` iterations for `auto`, up to `left`, continuing where the last call ended."""
         return self.run(state, impulse, n, tol, time_limit)
 
     def fallback(self) -> Solver | None:
@@ -186,7 +186,7 @@ class SolverSpec:
         that is not in `laws` is accepted only without disks (own solvers solve boxes as bounded rows:
         solvers/polyhedral.py).
     supports_rolling : bool
-        It accepts contacts with rolling friction, or with torsional friction beside several tangents.
+        It accepts contacts with rolling friction, or with torsional friction and several tangents.
     singular_programs : bool
         It accepts quadratic programs with a singular P (`Problem.from_qp`).
     external : bool
@@ -302,7 +302,7 @@ class SolverSpec:
         """Return None if the solver can run here, else the reason and what to install."""
         if not self.requires:
             return None
-        absent = [m for m in self.requires if not _importable(m)]
+        absent = [m for m in self.requires if not _is_importable(m)]
         if not absent:
             return None
         return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
@@ -324,7 +324,10 @@ class SolverSpec:
             called.
         """
         if not self.singular_programs and getattr(problem, "has_singular_program", False):
-            return f"needs a positive definite P, and P of this program is singular: use auto, or {_program_solvers()}"
+            return (
+                "needs a positive definite P, and P of this program is singular: use auto, or "
+                f"{_list_program_solvers()}"
+            )
         if self.takes_all:
             return None
         check_problem(problem)
@@ -342,7 +345,7 @@ class SolverSpec:
             )
         if law not in self.laws and not (law in self.box_friction_laws and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
-            way = _alternative_for(law, self.laws)
+            way = _suggest_alternative(law, self.laws)
             if law == "coulomb" and "cone" in self.box_friction_laws and problem.cones.is_polyhedral:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
             return f"takes laws {takes}, not {law!r}{self.bounded_hint or way}"
@@ -358,7 +361,7 @@ class SolverSpec:
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
             )
-        if problem.cones.has_more_parts and not self.supports_rolling:
+        if problem.cones.has_more_components and not self.supports_rolling:
             return (
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
@@ -398,7 +401,7 @@ class SolverSpec:
             ) from error
 
 
-def _program_solvers() -> str:
+def _list_program_solvers() -> str:
     """Return the names of installed solvers that take a singular P: "clarabel, osqp or piqp"."""
     names = sorted(
         name for name, s in specs().items() if s.singular_programs and not s.delegates and not s.missing()
@@ -406,7 +409,7 @@ def _program_solvers() -> str:
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "install osqp"
 
 
-def _alternative_for(law: str, laws: frozenset[str]) -> str:
+def _suggest_alternative(law: str, laws: frozenset[str]) -> str:
     """Return the part of an error message that says how to solve a problem of an unsupported law."""
     if law == "coulomb" and "cone" in laws:
         return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
@@ -418,7 +421,7 @@ def _alternative_for(law: str, laws: frozenset[str]) -> str:
 
 
 @cache
-def _importable(module: str) -> bool:
+def _is_importable(module: str) -> bool:
     """Return whether a module can be found, without importing it."""
     try:
         return importlib.util.find_spec(module) is not None
@@ -443,7 +446,7 @@ def _add_own(spec: SolverSpec) -> None:
     registered[spec.name] = spec
 
 
-def load() -> None:
+def load_all() -> None:
     """Fill `registered` once; other threads wait meanwhile."""
     with import_lock():
         fill()
@@ -476,7 +479,7 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
     InputError
         `spec` is not a SolverSpec, or the name is in use.
     """
-    load()
+    load_all()
     _add(spec, check_bool("replace", replace))
 
 
@@ -492,7 +495,7 @@ def _add(spec: SolverSpec, replace: bool) -> None:
 
 def specs() -> dict[str, SolverSpec]:
     """Return all registered solvers by name, installed or not."""
-    load()
+    load_all()
     return dict(registered)
 
 
@@ -522,11 +525,11 @@ def _register_by_name(name: str) -> SolverSpec | None:
 
     The file of a built-in solver is imported alone, which takes less time than the whole table.
     """
-    own: SolverSpec | None = import_locked(TABLES[0]).spec_of(name)
+    own: SolverSpec | None = import_locked(TABLES[0]).get_spec(name)
     if own is not None:
         _add_own(own)
         return own
-    load()
+    load_all()
     return registered.get(name)
 
 
@@ -570,7 +573,7 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
     ]
 
 
-def in_one_call(problem: Problem) -> list[str]:
+def list_not_resumable(problem: Problem) -> list[str]:
     """Return the names of built-in solvers that accept `problem` and are not resumable."""
     kind = (s for s in specs().values() if not (s.resumable or s.external))
     return [s.name for s in kind if not s.missing() and not s.refuses(problem)]

@@ -41,7 +41,7 @@ TIGHT_LIMIT, TIGHT_LIMIT_PER_ENTRY = 1e-2, 1e-6
 
 
 def tight_limit(problem: Problem) -> float:
-    """Return a time [s] that is about a hundred times that of the set-up and the judge, from the number of rows alone.
+    """Return a time [s] that is about a hundred times set-up and judge together, from the number of rows alone.
 
     A longer limit needs no other estimate before the solve. Estimates would take longer than a small problem.
     """
@@ -83,11 +83,13 @@ def estimate_refusal_time(problem: Problem, spec: SolverSpec) -> float:
     """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a complete matrix."""
     if not spec.external or problem.matrix is None or "_scan" in problem.__dict__:
         return 0.0
-    return residuals.setup_time(problem) + residuals.READ_TIME_PER_ENTRY * float(problem.matrix.size)
+    return residuals.estimate_judge_setup_time(problem) + residuals.READ_TIME_PER_ENTRY * float(
+        problem.matrix.size
+    )
 
 
 def loading_time(*modules: str) -> float:
-    """Estimate the time [s] to import those of the modules of SciPy that are not imported yet."""
+    """Estimate the time [s] to import the modules of SciPy that are not imported yet."""
     return IMPORT_TIME * sum(module not in sys.modules for module in modules)
 
 

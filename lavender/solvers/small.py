@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import get_reference, judge_impulse, reading_time
-from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
+from lavender.judge.residuals import estimate_pass_time, get_reference, judge_impulse
+from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES, factorisations, sweep_cost
 from lavender.solvers.decisions import DECISIONS
-from lavender.solvers.islands import islands
+from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
@@ -94,7 +94,7 @@ def time_fraction(problem: Problem, seconds: float) -> float:
     if seconds > tight_limit(problem):
         return DECISIONS.time_share
     if problem.generalized is not None:
-        set_up = 1e9 * reading_time(problem)
+        set_up = 1e9 * estimate_pass_time(problem)
     else:
         set_up = (
             ISLANDS_ROW_COST * problem.m
@@ -115,12 +115,12 @@ def prepare_call(problem: Problem) -> Any:
 def _make_call(problem: Problem) -> Small | None:
     """Build the compiled call; None for round cones, rolling or torsional friction, large islands and empty rows."""
     cones, count, label, bounded = problem.cones, 1, None, uses_pivots(problem)
-    if cones.has_round or cones.has_more_parts:
+    if cones.has_round or cones.has_more_components:
         return None
     if problem.m > SMALL_ROWS:
         if bounded:
             return None
-        count, label = islands(problem)
+        count, label = find_islands(problem)
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > DECISIONS.island_rows:
             return None
     get_reference(problem)
@@ -152,7 +152,7 @@ def describe_call(problem: Problem) -> str:
         return ""
     if uses_pivots(problem):
         return "direct (block pivots), then lemke if these do not end"
-    count = islands(problem)[0] if problem.m > SMALL_ROWS else 1
+    count = find_islands(problem)[0] if problem.m > SMALL_ROWS else 1
     return "sweeps (anderson), then newton" + (f", on each of {count} islands" if count > 1 else "")
 
 
@@ -271,7 +271,7 @@ class SmallCall:
         return Claim(
             status,
             done,
-            summed(stage.work for stage in stages),
+            sum_work(stage.work for stage in stages),
             describe_stages(stages) or no_work,
             stages=stages,
         )
@@ -319,7 +319,7 @@ def _make_stages(
 def describe_stages(stages: Sequence[SolverStage]) -> str:
     """Describe the stages that ran; consecutive stages of one solver are combined."""
     return " -> ".join(
-        describe_work(name, summed(stage.work for stage in group))
+        describe_work(name, sum_work(stage.work for stage in group))
         for name, group in groupby(stages, key=lambda stage: stage.solver)
     )
 
@@ -329,7 +329,7 @@ def describe_work(name: str, work: Mapping[str, int]) -> str:
     separator = " "
     for kind, count in work.items():
         if count:
-            name += separator + counted(count, kind)
+            name += separator + format_work_count(count, kind)
             separator = ", "
     return name
 

@@ -11,13 +11,13 @@ from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
-    best_of_islands,
+    combine_best_islands,
     find_known_relative,
-    find_stored,
+    find_stored_residual,
     judge_impulse,
     store_result,
 )
-from lavender.judge.solution import Claim, SolverStage, Status, summed
+from lavender.judge.solution import Claim, SolverStage, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 
@@ -73,12 +73,12 @@ class SolveLog:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol:
             starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
-            self.result = best_of_islands(self.problem, starts, impulses, self.tol)
+            self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
 
     def note(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""
         self.iterations += claim.iterations
-        self.work = summed((self.work, claim.work))
+        self.work = sum_work((self.work, claim.work))
         self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
         if claim.certificate is not None:
             if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
@@ -117,7 +117,7 @@ class SolveLog:
         """Return whether the best impulse is at the round-off floor."""
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
-        last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
+        last = find_stored_residual(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
         return bool(last.above_floor <= self.tol)
 
     @property

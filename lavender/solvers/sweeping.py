@@ -13,7 +13,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.ordering import Order, block_order
+from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming_time, order_time
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
@@ -90,7 +90,7 @@ def form_name(data: Any) -> str:
 
 
 class SweepSolver(Solver):
-    """A solver whose state is a `SweepState`."""
+    """A solver with a `SweepState` as its state."""
 
     def run(
         self,
@@ -126,7 +126,7 @@ class Sweeping(SweepSolver):
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
-        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
+        order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return self._state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:

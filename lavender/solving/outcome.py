@@ -11,8 +11,14 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.judge.certificates import format_lower_bound, prove
-from lavender.judge.residuals import Residual, best_of_islands, divide_by_reference, get_reference, residual
+from lavender.judge.certificates import format_lower_bound, prove_infeasibility
+from lavender.judge.residuals import (
+    Residual,
+    combine_best_islands,
+    divide_by_reference,
+    get_reference,
+    residual,
+)
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -30,12 +36,12 @@ from lavender.judge.solution import (
     Solution,
     SolverRun,
     Status,
-    counted,
-    order_name,
+    format_work_count,
+    get_order_name,
 )
 from lavender.problem import Problem
-from lavender.problem.cones import project
-from lavender.solvers.registry import SolverSpec, in_one_call
+from lavender.problem.cones import project_impulse
+from lavender.solvers.registry import SolverSpec, list_not_resumable
 from lavender_ext.judge.measure import Judged, all_finite
 
 # A lower bound of every solution's impulse is reported if it is at least this multiple of sum |b_i| / d_i, the impulse
@@ -64,7 +70,9 @@ def finish(
     claim = name_lost_row(problem, impulse, claim)
     if claim.status is INFEASIBLE and tol > 0.0:
         # An engine that applies the impulse of an infeasible step must not pull at a contact.
-        impulse = best_of_islands(problem, (problem._start,), (project(problem.cones, impulse),), tol)
+        impulse = combine_best_islands(
+            problem, (problem._start,), (project_impulse(problem.cones, impulse),), tol
+        )
     judged = residual(
         problem, impulse, "float64", tol=tol
     )  # Solvers work in float64, whatever the precision of the data.
@@ -108,7 +116,7 @@ def finish(
     elif status is INFEASIBLE and certificate is None:
         unproven = "no certificate was given"
     elif status in (INFEASIBLE, STALLED) and certificate is not None:
-        proof = prove(problem, certificate, tol)
+        proof = prove_infeasibility(problem, certificate, tol)
         certificate, bound = proof.y, proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
             message = _joined(message, proof.message)
@@ -137,7 +145,7 @@ def finish(
     unfinished = status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
-    order = order_name(options.get("order", "given")) if spec.order else ""
+    order = get_order_name(options.get("order", "given")) if spec.order else ""
     impulse.setflags(write=False)
     return Solution.of(
         {
@@ -166,7 +174,7 @@ def finish(
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     """Describe why an iteration without a message of its own found no solution; bad diagonal entries come first."""
     reason = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
-    message = f"{reason}, {counted(iterations, 'iterations')}"
+    message = f"{reason}, {format_work_count(iterations, 'iterations')}"
     if problem.matrix is None:
         return message
     diagonal = problem.matrix.diagonal()
@@ -193,7 +201,7 @@ def describe_islands(judged: Residual, tol: float) -> str:
 
 
 def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
-    """Return the claim as DIVERGED, with the first row whose impulse is not finite, if there is one."""
+    """Return the claim as DIVERGED, with the first row with a non-finite impulse, if there is one."""
     if claim.status is NUMERICAL_ERROR or all_finite(impulse):
         return claim
     row = int(np.argmin(np.isfinite(impulse)))
@@ -231,7 +239,7 @@ def _predict_iterations(problem: Problem, relative: float, tol: float, done: int
         return ""
     return (
         f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {remaining:.2g} more; "
-        f"solvers of another kind may be faster: {', '.join(in_one_call(problem))}"
+        f"solvers of another kind may be faster: {', '.join(list_not_resumable(problem))}"
     )
 
 
@@ -269,7 +277,7 @@ def decide_empty_rows(
     worst = max(impossible, key=lambda i: abs(problem.b[i]))
     y, b = np.zeros(problem.m), problem.b[worst]
     y[worst] = math.copysign(1.0, b)
-    if prove(problem, y, tol).reason:
+    if prove_infeasibility(problem, y, tol).reason:
         return None  # b is negligible.
     message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s"
     return message, y, impossible

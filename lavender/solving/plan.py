@@ -9,7 +9,7 @@ from math import inf
 from typing import Any
 
 from lavender.base.arrays import check_float
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
@@ -64,7 +64,8 @@ class Plan:
             lines.append(f"first one compiled call: {self.small}")
         if self.in_turn:  # Only backends solve programs with a singular P.
             lines.append(
-                f"newton is counted to take {seconds(1e-9 * self.newton)}, a sweep {seconds(1e-9 * self.sweep)}"
+                f"newton is counted to take {format_seconds(1e-9 * self.newton)}, "
+                f"a sweep {format_seconds(1e-9 * self.sweep)}"
             )
         for stage in self.stages:
             limit = "to its end"

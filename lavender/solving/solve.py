@@ -19,25 +19,25 @@ from lavender.base.arrays import (
     check_bool,
     check_float,
     check_int,
-    read_only,
+    mark_read_only,
 )
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerics
 from lavender.base.renamed import suggest_argument
 from lavender.external.foreign import Foreign
-from lavender.judge.certificates import prove
+from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     RESULT_TIME,
     Residual,
-    best_of_islands,
+    combine_best_islands,
     convert_from_disk,
+    estimate_judge_setup_time,
+    estimate_judging_time,
     find_known_relative,
     get_reference,
-    judging_time,
     make_residual,
     residual,
-    setup_time,
 )
 from lavender.judge.solution import (
     CONFIRMED,
@@ -50,11 +50,11 @@ from lavender.judge.solution import (
     Solution,
     SolverRun,
     Status,
-    summed,
+    sum_work,
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasible
-from lavender.solvers.islands import islands
+from lavender.solvers.islands import find_islands
 from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import (
@@ -118,8 +118,8 @@ def solve(
         Velocity error to reach on every row, whatever the relative residual; `tol` is not used. Solvers run to the
         relative residual that guarantees it (`lavender.solving.velocity`), and `success` refers to it.
     max_iter : int, optional
-        Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's
-        spec.
+        Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: the limit of the
+        solver's spec.
     time_limit : float, optional, s
         Wall-clock limit of the whole call: set-up, iterations and the judge. Steps that cannot be interrupted, such as
         a set-up or a factorisation, start only if their estimated time fits in the remaining time. The result is not
@@ -367,14 +367,14 @@ class Prepared:
             if is_tight(original, deadline):
                 # The judge measures the result, and the start if it is not zero.
                 passes = 2 if start is not None or disk.guess is not None else 1
-                judge_time = passes * judging_time(disk)
-                if deadline.passed(setup_time(disk) + judge_time) and not self.spec.external:
+                judge_time = passes * estimate_judging_time(disk)
+                if deadline.passed(estimate_judge_setup_time(disk) + judge_time) and not self.spec.external:
                     self._replace_problem(problem)
                     return create_unjudged(
                         original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
                     )
                 deadline.reserve(judge_time)
-                selection_time = SELECTION_PASSES * (judging_time(disk) - RESULT_TIME)
+                selection_time = SELECTION_PASSES * (estimate_judging_time(disk) - RESULT_TIME)
                 if self.spec.delegates and not deadline.passed(4.0 * selection_time):
                     deadline.reserve(selection_time)
             if self.solver is None:
@@ -473,10 +473,10 @@ class Prepared:
     def _without_infeasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
         """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
         assert claim.certificate is not None
-        count, label = islands(self.problem)
+        count, label = find_islands(self.problem)
         if count < 2:
             return claim
-        proof = prove(self.problem, claim.certificate, loop.tol)
+        proof = prove_infeasibility(self.problem, claim.certificate, loop.tol)
         if proof.reason:
             return claim
         _, table = by_island(self.problem.metric, loop.impulse)
@@ -499,9 +499,9 @@ class Prepared:
         solution = others.solve(
             impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(MIN_TIME_LIMIT)
         )
-        loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (solution.impulse,), loop.tol)
+        loop.impulse[:] = combine_best_islands(self.problem, (loop.impulse,), (solution.impulse,), loop.tol)
         loop.time += solution.setup_time + solution.solve_time
-        work = summed((claim.work, solution.work))
+        work = sum_work((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
@@ -515,7 +515,7 @@ class Prepared:
             original, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
             self.setup_time = watch.seconds
-            # Assigned last: a problem whose set-up raises an error does not replace the old one.
+            # Assigned last: a problem does not replace the old one if its set-up raises an error.
             self._original, self.problem = original, problem
         self._is_fresh = False
 
@@ -524,7 +524,7 @@ class Prepared:
         return partial(prepare, **self.options), (self._original, self.spec.name)
 
     def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
-        """Build the state, or update that of a problem of the same structure, if its estimated time fits."""
+        """Build the state, or update the state of a problem of the same structure, if its estimated time fits."""
         if problem.metric.reference_energy < 0.0:
             get_reference(problem)  # The judge computes its reference before a solver gets the problem.
         is_new, self._failure = is_new or bool(self._failure), ""
@@ -564,7 +564,7 @@ def create_unjudged(
     start = problem._start if problem.guess is None else problem.guess
     start = start.copy() if impulse is None else problem.impulse_array(impulse)
     late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
-    return Solution.late(read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
+    return Solution.late(mark_read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
 
 
 def _unstretched_callback(problem: Problem, stretch: FloatArray, callback: Callback) -> Callback:
@@ -745,7 +745,11 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     """
     if not is_tight(problem, deadline):
         return False
-    if problem.rows is not None and problem.cones.has_ellipse and deadline.passed(setup_time(problem)):
+    if (
+        problem.rows is not None
+        and problem.cones.has_ellipse
+        and deadline.passed(estimate_judge_setup_time(problem))
+    ):
         return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
     needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
     if (
@@ -800,7 +804,7 @@ def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Dea
 
 
 def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
-    """Return `tol` and `max_iter` as numbers; `max_iter` is that of the spec if it is None.
+    """Return `tol` and `max_iter` as numbers; `max_iter` is the spec's if it is None.
 
     Raises
     ------

@@ -292,7 +292,7 @@ def test_a_line_without_end_is_refused(tmp_path):
     with path.open("wb") as stream:
         stream.truncate(2**27)
     with pytest.raises(lv.InputError, match="has a line of more than"):
-        bench.read(path)
+        bench.read_records(path)
 
 
 @pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
@@ -398,13 +398,13 @@ def _must_not_begin(*_, **__):
         ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
-        ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve"),
+        ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve_sources"),
         ("phenomena lift --out {}/x.json", "lavender.lab.phenomena.run"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.export.library.source"),
-        ("web page {}/sub", "lavender.sim.web.pages.module"),
-        ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
-        ("report toy_stack --workers 1 --out {}/sub", "lavender.lab.bench.resolve"),
+        ("web page {}/sub", "lavender.sim.web.pages.get_module"),
+        ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve_sources"),
+        ("report toy_stack --workers 1 --out {}/sub", "lavender.lab.bench.resolve_sources"),
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )

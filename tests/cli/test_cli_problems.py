@@ -15,13 +15,13 @@ def test_a_set_is_listed_written_and_checked(lavender, tmp_path, monkeypatch):
     files = sorted((tmp_path / "set").glob("*.npz"))
     assert code == 0 and len(files) == 12 and "12 problems" in out
     names = {lv.load(path).name for path in files}
-    assert names == {e.name for e in collection.load() if e.group == "walking"}
+    assert names == {e.name for e in collection.load_manifest() if e.group == "walking"}
     assert lavender("problems", "@walking", "--check")[:2] == (0, "12 of 12 problems are the same\n")
 
-    first, *rest = (e for e in collection.load() if e.group == "walking")
-    collection.save([replace(first, sha="0" * 16), *rest], tmp_path / "other.json")
-    changed = collection.load(tmp_path / "other.json")
-    monkeypatch.setattr(collection, "load", lambda: changed)
+    first, *rest = (e for e in collection.load_manifest() if e.group == "walking")
+    collection.save_manifest([replace(first, sha="0" * 16), *rest], tmp_path / "other.json")
+    changed = collection.load_manifest(tmp_path / "other.json")
+    monkeypatch.setattr(collection, "load_manifest", lambda: changed)
     code, out, _ = lavender("problems", "--check")
     assert code == 1 and out.startswith(first.name) and "11 of 12" in out
 
@@ -45,4 +45,4 @@ def test_a_manifest_is_made_with_proofs(lavender, tmp_path, monkeypatch):
     monkeypatch.setattr(collection.suite, "SETS", {"walking": ("walking(n=4)", "walking(n=5)")})
     code, out, _ = lavender("problems", "@walking", "--certify", tmp_path / "m.json")
     assert code == 0 and out.count(": enclosed") == 2
-    assert [e.rows for e in collection.load(tmp_path / "m.json")] == [8, 10]
+    assert [e.rows for e in collection.load_manifest(tmp_path / "m.json")] == [8, 10]

@@ -98,7 +98,7 @@ def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkey
     plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
     found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
     assert len(found.cases) == 1
-    assert used[0].accepted
+    assert used[0].is_accepted
 
 
 def test_a_proven_reference_is_what_a_report_measures_motions_from(lavender, tmp_path):
@@ -183,21 +183,21 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
 
 def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):
     monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
-    with measuring.progress() as watch:
+    with measuring.show_progress() as watch:
         for done in range(3):
             watch(Event(done, 3, "stack", "newton"))
     assert capsys.readouterr().err.splitlines() == [
         f"{done} of 3, 0 s: stack newton" for done in range(3)
     ]  # and no control codes or empty lines
     monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 1e9)
-    with measuring.progress() as watch:
+    with measuring.show_progress() as watch:
         watch(Event(0, 3, "stack", "newton"))
     assert capsys.readouterr().err == ""
 
 
 def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
     monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
-    with measuring.progress() as watch:
+    with measuring.show_progress() as watch:
         watch(Event(1, 5, "timing: a setting", "", remaining=40.2))
     assert capsys.readouterr().err == "1 of 5, 0 s, about 40 s remain: timing: a setting\n"
     event = Event(20, 80, "stack", "newton")
@@ -219,7 +219,9 @@ def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
     assert code == 0 and "newton" not in out and 'data-l="newton"' not in page
     assert 'data-l="jacobi"' in page and 'data-l="pgs"' in page
     assert "We ran 2 solvers" in (tmp_path / "again" / "paper" / "method.tex").read_text(encoding="utf-8")
-    assert len(bench.read(records)) > len(bench.read(records).of_solvers(["pgs"])) > 0  # the file keeps all
+    assert (
+        len(bench.read_records(records)) > len(bench.read_records(records).of_solvers(["pgs"])) > 0
+    )  # the file keeps all
     code, _, err = lavender("report", records, "--solvers", "nncg", *again)
     assert code == cli.EXIT_BAD_INPUT
     assert "no records of solver 'nncg'; there are records of jacobi, newton, pgs" in err
@@ -234,7 +236,7 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
         "--velocity-tolerances", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0
-    records = bench.read(tmp_path / "out")
+    records = bench.read_records(tmp_path / "out")
     assert motion_tables.get_velocity_tolerances(records) == (1e-2, 1e-3)
     assert {r.solver for r in records} == {"pgs", "jacobi"}
     assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
@@ -292,12 +294,14 @@ def test_a_report_that_measured_nothing_says_why(lavender, tmp_path):
 
 def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
     """As of 60 robots whose package is not installed."""
-    monkeypatch.setattr(steps, "missing", lambda package: f"robots need {package}: pip install {package}")
+    monkeypatch.setattr(
+        steps, "explain_missing_packages", lambda package: f"robots need {package}: pip install {package}"
+    )
     code, out, _ = lavender("report", "@robots", "--out", tmp_path / "out")
     assert code == cli.EXIT_UNMET
     said = "; ".join(
         f"robots need {package}: pip install {package} ({n} cases)"
-        for package, n in Counter(map(steps.package_of, suite.names("@robots"))).items()
+        for package, n in Counter(map(steps.get_model_package, suite.names("@robots"))).items()
     )
     assert f"nothing was measured: {said}\n" in out
     summary = (tmp_path / "out" / "summary.md").read_text()
@@ -384,12 +388,12 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     assert "By structure" not in out
     code, out, _ = lavender(*words, "--tables")
     assert "By structure" in out
-    n = len(bench.read(tmp_path / "out"))
-    plain = len([r for r in bench.read(tmp_path / "out") if not r.interleave_group])
+    n = len(bench.read_records(tmp_path / "out"))
+    plain = len([r for r in bench.read_records(tmp_path / "out") if not r.interleave_group])
     assert f"{n} of {n} runs of 20" in out
     code, out, _ = lavender(*words, "--no-reuse")
     assert "reused" not in out
-    again = [r for r in bench.read(tmp_path / "out") if not r.interleave_group]
+    again = [r for r in bench.read_records(tmp_path / "out") if not r.interleave_group]
     assert len(again) == plain  # made again, they stand for the earlier ones
 
 
@@ -429,7 +433,7 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     words = ("--steps", 20, "--record-every", 5, *quick, "--out", tmp_path / "o")
     models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
     assert lavender("report", *models, *words)[0] == 0
-    found = bench.read(tmp_path / "o")
+    found = bench.read_records(tmp_path / "o")
     rows = {info.sequence: info.rows for info in found.cases.values()}
     assert set(rows) == {"h1-scene", "g1-scene"}
     assert rows["h1-scene"] > rows["g1-scene"]  # a box has more contacts than a sphere
@@ -456,10 +460,10 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
     model = (tmp_path / "box.xml", "--steps", 45)
     for _ in range(2):  # recorded, and found recorded
         code, out, _ = lavender("report", *model, *more, *shown)
-        (name,) = {info.sequence for info in bench.read(tmp_path / "o").cases.values()}
+        (name,) = {info.sequence for info in bench.read_records(tmp_path / "o").cases.values()}
         assert code == cli.EXIT_UNMET and f"steps of {name} (3 left out)" in " ".join(out.split())
         assert "step 15 is of another <problem>" in " ".join(out.split())
-        skips = [s for s in bench.read(tmp_path / "o").skips if "of another" in s.reason]
+        skips = [s for s in bench.read_records(tmp_path / "o").skips if "of another" in s.reason]
         assert [(s.sequence, s.solver) for s in skips] == [(name, "")] * 3
     assert lavender("report", tmp_path / "o" / "records.jsonl", *shown)[0] == 0  # shown again
     (folder,) = (tmp_path / "o" / "recorded").iterdir()

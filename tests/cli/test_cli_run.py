@@ -94,10 +94,10 @@ CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
 
 
 def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
-    monkeypatch.setattr(pages, "module", lambda say, name: name.encode())
+    monkeypatch.setattr(pages, "get_module", lambda say, name: name.encode())
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     with pytest.raises(LavenderError, match="in tests/sim/web of a checkout"):
-        pages.check()
+        pages.compare_with_native_kernels()
     script = tmp_path / CHECK.relative_to(ROOT)
     script.parent.mkdir(parents=True)
     script.write_text("""
@@ -108,13 +108,13 @@ process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === 
 """)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(LavenderError, match=r"node.*is not installed: install Node 18"):
-        pages.check()
+        pages.compare_with_native_kernels()
     monkeypatch.undo()
     if shutil.which("node") is None:
         pytest.skip("needs Node")
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     for data, code in ((str.encode, 0), (lambda name: b"other", 1)):
-        monkeypatch.setattr(pages, "module", lambda say, name, data=data: data(name))
+        monkeypatch.setattr(pages, "get_module", lambda say, name, data=data: data(name))
         assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
 
 

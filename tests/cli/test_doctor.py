@@ -32,7 +32,7 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert found["self_test"] == dict.fromkeys(doctor.HASHES, "same")
     assert found["versions"]["numpy"] == np.__version__
     assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
-    facts = machine.describe({}).build
+    facts = machine.describe_run({}).build
     assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
     assert {k: found["build"][k] for k in facts if k != "clock"} == {
         k: facts[k] for k in facts if k != "clock"
@@ -49,18 +49,18 @@ def test_another_bit_is_told_and_is_status_1(monkeypatch):
 
 
 def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
-    before = doctor.self_test()
-    assert before == doctor.self_test() == doctor.HASHES
+    before = doctor.run_self_test()
+    assert before == doctor.run_self_test() == doctor.HASHES
     assert len(set(before.values())) == len(before)
     monkeypatch.setattr(
         doctor, "solve", lambda *given, solve=doctor.solve, **more: solve(*given, **{**more, "max_iter": 11})
     )
-    after = doctor.self_test()
+    after = doctor.run_self_test()
     same = {name for name in before if before[name] == after[name]}
     assert same == {"stack, 60 steps", "gallery, 5 steps"}
     simulate = doctor.simulate_positions
     monkeypatch.setattr(doctor, "simulate_positions", lambda name, n: simulate(name, n - 1))
-    after = doctor.self_test()
+    after = doctor.run_self_test()
     assert all(before[name] != after[name] for name in before)
 
 
@@ -74,7 +74,7 @@ def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
     ],
 )  # fmt: skip
 def test_the_compiler_is_read_from_the_module(library, found):
-    assert machine.build_of(library) == found
+    assert machine.read_compiler_versions(library) == found
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a script in place of git")
@@ -84,4 +84,4 @@ def test_a_refusal_of_git_is_no_error_in_whatever_letters(tmp_path, monkeypatch)
     (tmp_path / "git").write_bytes(b"#!/bin/sh\necho 'dubious ownership in \xff' >&2\nexit 128\n")
     (tmp_path / "git").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    assert machine.commit_of(tmp_path) == ""
+    assert machine.get_commit(tmp_path) == ""

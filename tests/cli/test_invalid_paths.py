@@ -29,14 +29,14 @@ from lavender import bench, cli, io
 from lavender.io.stored import (
     FOLDER_LOCK,
     TEMPORARY_NAME,
-    folder_for_steps,
     lock_output,
+    open_step_folder,
     write_atomically,
     write_text,
 )
 from lavender.lab import collection
 from lavender.lab.bench import machine
-from lavender.lab.bench.record import KINDS, Skip, file_name, printable, to_json
+from lavender.lab.bench.record import KINDS, Skip, escape_unprintable, make_file_name, to_json
 from lavender.lab.bench.store import Records, Store
 from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
@@ -56,8 +56,8 @@ READERS = {
     "load film": (".film", lambda results, path: lv.engine.Film.load(path)),
     "load snapshot": (".snap", lambda results, path: lv.Snapshot.load(path)),
     "load state": (".snap", lambda results, path: lv.Simulation("stack").load(path)),
-    "read records": (".jsonl", lambda results, path: bench.read(path)),
-    "load manifest": (".json", lambda results, path: collection.load(path)),
+    "read records": (".jsonl", lambda results, path: bench.read_records(path)),
+    "load manifest": (".json", lambda results, path: collection.load_manifest(path)),
 }
 
 
@@ -341,13 +341,13 @@ def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
 
 
 def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
-    with folder_for_steps(tmp_path):
+    with open_step_folder(tmp_path):
         for replace in (False, True):
             with pytest.raises(lv.InputError, match="is being written by another command"):
                 run(lv.Simulation("stack"), 3, record=tmp_path, replace=replace)
         with pytest.raises(lv.InputError, match="is being written by another command"):
             lv.Simulation("stack").record(tmp_path, 3)
-    holder = "import os, signal, lavender.io.stored as s; s.folder_for_steps('.').__enter__(); os.kill(os.getpid(), 9)"
+    holder = "import os, signal, lavender.io.stored as s; s.open_step_folder('.').__enter__(); os.kill(os.getpid(), 9)"
     python("-c", holder, cwd=tmp_path, status=-signal.SIGKILL)
     simulation = lv.Simulation("stack")
     assert len(simulation.record(tmp_path, 2)) == 2
@@ -359,7 +359,7 @@ def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
 def test_a_new_recording_removes_the_description_of_the_old_one(tmp_path):
     for name in ("engine.jsonl", "step_1.npz"):
         (tmp_path / name).write_text("of before")
-    with folder_for_steps(tmp_path, replace=True) as folder:
+    with open_step_folder(tmp_path, replace=True) as folder:
         assert folder == tmp_path
         assert [p.name for p in tmp_path.iterdir()] == [FOLDER_LOCK]
     assert not list(tmp_path.iterdir())
@@ -518,8 +518,8 @@ def test_any_number_on_the_command_line_gives_a_documented_status(lavender, word
 
 
 def test_characters_that_cannot_be_shown_are_written_as_their_codes():
-    assert printable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
-    assert printable("a\nb\r", lines=True) == "a\nb\\r"
+    assert escape_unprintable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
+    assert escape_unprintable("a\nb\r", lines=True) == "a\nb\\r"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file names of POSIX")
@@ -549,9 +549,9 @@ def test_the_name_of_a_plug_in_is_printed_as_text(lavender, register):
 
 def test_long_names_that_differ_at_the_end_have_different_file_names():
     names = ["n" * 300 + str(i) for i in range(3)]
-    assert len({file_name(name) for name in names}) == 3
-    items = bench.resolve([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
-    assert len({file_name(item.name).lower() for item in items}) == len(items)
+    assert len({make_file_name(name) for name in names}) == 3
+    items = bench.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    assert len({make_file_name(item.name).lower() for item in items}) == len(items)
 
 
 # -- folders that a report or a check reads ----------------------------------------------------------------------
@@ -688,7 +688,7 @@ def test_a_report_with_workers_takes_files_and_folders(lavender, tmp_path):
     more = (*QUICK[:6], "--workers", 1, "--seeds", "2")
     code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
     assert (code, err.strip()) == (0, "")
-    cases = {r.case for r in bench.read("lavender-report")}
+    cases = {r.case for r in bench.read_records("lavender-report")}
     assert cases == {"x", "y", "z", "z #2", "random_spd(n=4, seed=0)", "random_spd(n=4, seed=1)"}
     code, _, err = lavender("report", "nothing.npz", *more[:-2])
     assert code == 2 and "no such file" in err
@@ -714,7 +714,7 @@ def test_a_description_of_a_recording_by_anybody_is_harmless(lavender, tmp_path,
         os.mkfifo(folder / "engine.jsonl")
     else:
         (folder / "engine.jsonl").write_text(text)
-    items = bench.resolve(folder)
+    items = bench.resolve_sources(folder)
     assert items[0].problem.m == 4 and len(items) <= 2
     assert all(item.name.isprintable() for item in items)
     code = lavender("report", folder, *QUICK, "--no-figures")[0]
@@ -734,7 +734,7 @@ HOSTILE = [
 def entries():
     """The entries of a small report with a sequence and a skip."""
     plan = bench.Plan(tolerances=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
-    cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
+    cases = [stack(name="one"), *bench.make_sequence([stack(), stack()], "walk")]
     records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
     kinds = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
     return [to_json(e) for e in kinds]
@@ -772,7 +772,7 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
         ]
         write_entries(path, changed)
         try:
-            return bench.read(path)
+            return bench.read_records(path)
         except lv.InputError:
             return None
 
@@ -809,23 +809,23 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
 def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
     (tmp_path / "records.jsonl").write_text(f"{text}\n")
     with pytest.raises(lv.InputError, match="line 1"):
-        bench.read(tmp_path)
+        bench.read_records(tmp_path)
 
 
 def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
     write_entries(tmp_path / "records.jsonl", [e for e in entries if e["kind"] != "case"])
     with pytest.raises(lv.InputError, match="record of a case that no line before it describes"):
-        bench.read(tmp_path)
+        bench.read_records(tmp_path)
 
 
 def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, monkeypatch):
     plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
     path = tmp_path / "records.jsonl"
     bench.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
-    monkeypatch.setattr(machine, "cpu_name", lambda: "another")
+    monkeypatch.setattr(machine, "get_cpu_name", lambda: "another")
     bench.run([stack(name="a")], ["pgs"], plan, path)
     monkeypatch.undo()
     bench.run([stack(8, name="b")], ["pgs"], plan, path)  # the first run again; b has changed
-    newest = bench.read(path).latest()
+    newest = bench.read_records(path).select_latest_run()
     assert sorted((r.case, newest.cases[r.case].rows) for r in newest) == [("a", 6), ("b", 8)]
     show_all(newest)

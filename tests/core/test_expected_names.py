@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.base.renamed import INSTEAD
 
 A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
 LCP = lv.Problem.lcp(A, B)
@@ -84,3 +85,23 @@ def test_a_short_b_is_blamed_instead_of_a_square_matrix(build, matrix):
         lv.InputError, match=r"^b \[m/s\] has shape \(1,\); \(2,\) is needed, as A has 2 rows"
     ):
         build(matrix, B[:1])
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "successor"),
+    [
+        (LCP.cones, "reach", "friction_coefficient"),
+        (LCP.cones, "parts", "friction_components"),
+        (LCP.cones, "take", "select"),
+        (lv.residual(LCP, np.zeros(2)), "energy_start", "energy_at_zero"),
+        (lv.residual(LCP, np.zeros(2)), "floor", "roundoff_floor"),
+    ],
+)
+def test_former_names_of_fields_suggest_the_present_one(owner, name, successor):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}'; use {successor}"):
+        getattr(owner, name)
+    assert hasattr(owner, successor)
+
+
+def test_no_former_name_is_its_own_successor():
+    assert not [name for names in INSTEAD.values() for name, successor in names.items() if name == successor]

@@ -106,8 +106,8 @@ CALLS = {
          "friction": "coulomb", "lower": np.zeros(N_JOINT_ROWS), "compliance": np.ones(N_JOINT_ROWS + 2 * N_CONTACTS)},
         accepts={"tangents": ("True",)},
     ),
-    "Batch.impulses": Call(
-        lambda given: BATCH.impulses("impulse", given), {"given": FREE}, {"given": "impulse"}, accepts_nan=True
+    "Batch.flatten_impulses": Call(
+        lambda given: BATCH.flatten_impulses("impulse", given), {"given": FREE}, {"given": "impulse"}, accepts_nan=True
     ),
     "Batch.__getitem__": Call(BATCH.__getitem__, {"i": np.array([0, 1])}, INDEX, any_length={"i"}),
     "Solutions.__getitem__": Call(BATCH_SOLUTION.__getitem__, {"i": np.array([0, 1])}, INDEX, any_length={"i"}),
@@ -126,7 +126,7 @@ CALLS = {
     "Cones.contacts, one": Call(lv.Cones.contacts, {"mu": 0.5, "count": 3}, accepts={"mu": ("True",)}),
     "Cones.free": Call(lv.Cones.free, {"m": 3}),
     "Cones.shaped": Call(lv.Cones.contacts(0.5, count=2).shaped, {"shape": "box"}),
-    "Cones.take": Call(CONTACT.cones.take, {"blocks": np.array([1, 0])}, any_length={"blocks"}),
+    "Cones.select": Call(CONTACT.cones.select, {"blocks": np.array([1, 0])}, any_length={"blocks"}),
     "Derivative.jvp": Call(
         DERIVATIVE.jvp, {"J": np.eye(2), "M": A, "v_free": B, "target": B, "lower": B, "upper": B}
     ),
@@ -310,10 +310,10 @@ NOT_CALLED = {
         "a result: the package makes it",
     ),
     **dict.fromkeys(
-        ("Batch.worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
-         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_late",
-         "Problem.on_disk", "Residuals.store", "Solution.late", "Solution.of", "Solution.unstretched",
-         "Solutions.store", "Solutions.store_late", "Solutions.start", "Batch.rows_of"),
+        ("Batch.make_kernel_worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
+         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.make_zero_impulse", "Solutions.mark_as_late",
+         "Problem.on_disk", "Residuals.store_residual", "Solution.late", "Solution.of", "Solution.unstretched",
+         "Solutions.store_solution", "Solutions.store_late_solution", "Solutions.get_start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",
     ),
     **dict.fromkeys(("Batch.count", "Batch.index", "Solutions.count", "Solutions.index"), "a sequence of Python"),

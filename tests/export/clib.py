@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from lavender.export import HEADER
-from lavender.export.header import strip_comments, struct_fields
-from lavender.export.view import METHODS, problem_view
+from lavender.export.header import parse_struct_fields, strip_comments
+from lavender.export.view import METHODS, make_problem_view
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
@@ -38,7 +38,7 @@ def functions(header):
 def _struct(name):
     kinds = {"int32_t": ct.c_int32, "uint32_t": ct.c_uint32, "uint64_t": ct.c_uint64, "double": ct.c_double}
     fields = []
-    for kind, field in struct_fields(HEADER.read_text(), name):
+    for kind, field in parse_struct_fields(HEADER.read_text(), name):
         fields.append((field, Verdict if kind == "lav_verdict" else kinds.get(kind, ct.c_void_p)))
     return type(name, (ct.Structure,), {"_fields_": fields})
 
@@ -79,7 +79,7 @@ class Library:
 
     def problem(self, given, **more):
         """A problem of the package as the library takes it, with the arrays that it points to."""
-        found, made = problem_view(given), Problem()
+        found, made = make_problem_view(given), Problem()
         made.size = ct.sizeof(Problem)
         for key, value in zip(COUNTS, found.counts, strict=True):
             setattr(made, key, value)

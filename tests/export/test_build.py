@@ -152,7 +152,9 @@ def write_vectors(out):
         *((of_matrix(given), "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
         (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
     ]  # fmt: skip
-    packed = [vectors.pack(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]
+    packed = [
+        vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given
+    ]
     (out / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(packed)
 
@@ -179,9 +181,9 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     lv.Problem.lcp(np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(2)).save(problem)
     for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
         bench.run([problem], [solver], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=repeats), records)
-    assert "LAV_NNCG" in vectors.make_files(records, None, 1)["chosen.h"]
+    assert "LAV_NNCG" in vectors.make_export_files(records, None, 1)["chosen.h"]
     with pytest.raises(lv.InputError, match="reached no tolerance in these records; available: nncg"):
-        vectors.make_files(records, "direct", 1)
+        vectors.make_export_files(records, "direct", 1)
 
 
 def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_path, monkeypatch):
@@ -190,7 +192,7 @@ def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_pat
     (python,) = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     records = tmp_path / "records.jsonl"
     bench.run(["granularF(n=3)"], ["auto"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records)
-    (tmp_path / "chosen.h").write_text(vectors.make_files(records, None, 1)["chosen.h"])
+    (tmp_path / "chosen.h").write_text(vectors.make_export_files(records, None, 1)["chosen.h"])
     (tmp_path / "drop.c").write_text(program)
     call = "  if (solve(chosen, q, impulse, &result) || !(result.verdict.relative < 1e-6)) return 2;\n"
     whole = program.replace("int main(", steps + "\nint main(").replace(
@@ -226,13 +228,13 @@ def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, comp
     plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     sizes = ("granularF(n=3)", "granular(n=3)", "granularF(n=6)")  # the last under the cone law first
     bench.run(sizes, ["auto"], plan, records)
-    made = vectors.make_files(records, None, 2)
+    made = vectors.make_export_files(records, None, 2)
     header = made["chosen.h"]
     assert "to a relative residual of 1e-06" in header and "1e-09" not in header
     assert all(step in header for step in ("LAV_ANDERSON", "LAV_NNCG"))
     for name, text in made.items():
         (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    (tmp_path / "vectors.bin").write_bytes(vectors.make_files(records, None, 3)["vectors.bin"])
+    (tmp_path / "vectors.bin").write_bytes(vectors.make_export_files(records, None, 3)["vectors.bin"])
     (tmp_path / "use.cpp").write_text(
         '#include "chosen.h"\nint main() { return lav_chosen[0].options.convex; }\n'
     )

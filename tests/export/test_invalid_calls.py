@@ -15,11 +15,13 @@ from tower import self_test_problem
 
 import lavender as lv
 from lavender.export import HEADER
-from lavender.export.header import constants, struct_fields
+from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.export.view import ARRAYS, METHODS
 
 ERRORS = {
-    value: name for name, value in constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")
+    value: name
+    for name, value in parse_enum_constants(HEADER.read_text()).items()
+    if name.startswith("LAV_ERROR")
 }
 CANARY = 0xA5
 
@@ -369,9 +371,11 @@ def test_a_budget_that_ends_within_tol_has_converged(library, method, tol):
 def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, folder):
     header = HEADER.read_text()
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
-    made += [f"{name} = {value}" for name, value in constants(header).items()]
+    made += [f"{name} = {value}" for name, value in parse_enum_constants(header).items()]
     for name in STRUCTS:
-        made += [f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(struct_fields(header, name))]
+        made += [
+            f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(parse_struct_fields(header, name))
+        ]
     kept = (Path(__file__).parent / "abi.txt").read_text().splitlines()
     lost = [line for line in kept if line not in made]
     assert not lost, "what a release had is gone or is another"

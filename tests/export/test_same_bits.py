@@ -11,8 +11,8 @@ from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
-from lavender.export.vectors import pack, run_driver
-from lavender.export.view import OTHER_BITS, NotSupported, accepts
+from lavender.export.vectors import make_test_vector, run_compiled_newton
+from lavender.export.view import OTHER_BITS, NotSupported, is_accepted_by_library
 
 
 def problems():
@@ -126,7 +126,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
                 raise  # `direct` finds an asymmetric A when it has its numbers
             continue
         if name == "newton" and given.generalized is None:
-            wanted, factorisations = run_driver(given, tol, n)
+            wanted, factorisations = run_compiled_newton(given, tol, n)
             said = solver.run(n, tol)
             assert (solver.impulse().tobytes(), said.iterations) == (wanted.tobytes(), factorisations)
             continue
@@ -190,7 +190,7 @@ def test_vectors_are_of_methods_that_the_library_takes(library):
             except lv.CapabilityError:
                 continue
             code = library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name)))
-            assert accepts(given, name) == (code == 0), (name, given.law, given.cones.kind)
+            assert is_accepted_by_library(given, name) == (code == 0), (name, given.law, given.cones.kind)
             looked.add((name, code))
     assert len(looked) > len(METHODS)
 
@@ -201,7 +201,7 @@ def test_no_vector_of_sweeps_over_a_matrix_that_the_library_does_not_form():
         rng.normal(size=(9, 12)), np.eye(12) + 0.1, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3)
     )
     with pytest.raises(NotSupported, match="formed A"):
-        pack(given, "pgs", 0.0, 5, {})
+        make_test_vector(given, "pgs", 0.0, 5, {})
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def row_of_boxes(n):
 
 def test_newton_solves_more_bodies_than_a_full_factor_would_hold(library):
     given = row_of_boxes(1600)
-    wanted, factorisations = run_driver(given, 1e-9, 400)
+    wanted, factorisations = run_compiled_newton(given, 1e-9, 400)
     solver = library.open(library.problem(given), library.options("newton"))
     result = solver.run(400, 1e-9)
     assert result.outcome == 1 and result.verdict.relative <= 1e-9

@@ -319,7 +319,7 @@ def test_a_condensed_matrix_is_at_most_as_large_as_predicted():
             mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
         file = contents(mass, h)
         label = connected_components(file.M, directed=False)[1]
-        assert file.problem().csr.nnz <= max_condensed_entries(label, file.H)
+        assert file.build_problem().csr.nnz <= max_condensed_entries(label, file.H)
 
 
 def test_dense_factors_are_rejected_and_banded_ones_are_not():
@@ -330,12 +330,12 @@ def test_dense_factors_are_rejected_and_banded_ones_are_not():
     chain = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1])
     shuffled = rng.permutation(n)
     chain = sp.csr_array(chain)[shuffled][:, shuffled]
-    got = contents(chain, h).problem(max_bytes=400_000).csr.toarray()  # 1200^2 entries: 23 MB
+    got = contents(chain, h).build_problem(max_bytes=400_000).csr.toarray()  # 1200^2 entries: 23 MB
     expected = np.linalg.inv(chain.toarray())[:3, :3]
     np.testing.assert_allclose(got, expected, rtol=1e-12)
     wild = sp.csr_array(np.eye(n) * 10.0 + np.where(rng.random((n, n)) < 5e-3, rng.random((n, n)), 0.0))
     with pytest.raises(lv.InputError, match="factors of M"):
-        contents(wild, h).problem(max_bytes=10**6)
+        contents(wild, h).build_problem(max_bytes=10**6)
 
 
 # -- damaged files -----------------------------------------------------------------------------------------------

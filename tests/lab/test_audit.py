@@ -39,17 +39,17 @@ def test_numbers_are_those_of_the_run_itself(boxes, options):
         np.testing.assert_allclose(found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12)
         pushes = [abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0 for r in want]
         np.testing.assert_allclose(found.numbers[1, world], pushes, rtol=1e-6, atol=1e-12)
-        assert found.unconverged[world].tolist() == [
+        assert found.is_unconverged[world].tolist() == [
             r.verdict in ("stopped before convergence", "wrong") for r in want
         ]
-    assert found.unconverged.any()
+    assert found.is_unconverged.any()
 
 
 def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes, monkeypatch):
     monkeypatch.setattr(module, "DEFAULT_DURATION", 0.5)
     events = []
     found = audit(boxes(EARLY), steps=20, workers=1, watch=events.append)
-    assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.judged == 20 * found.runs.worlds
+    assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.n_judged == 20 * found.runs.worlds
     assert (events[0].case, events[1].remaining) == ("timing one world", 0.5)
     assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[1:])
     assert events[-1].done == events[-1].total == 20 * found.runs.worlds
@@ -67,11 +67,11 @@ def test_the_number_of_worlds_follows_from_the_time_of_one(boxes, monkeypatch):
 
 def test_a_busy_machine_is_named_and_changes_no_error(boxes, monkeypatch):
     cores = module.os.cpu_count()
-    monkeypatch.setattr(module.machine, "running", lambda: cores + 9.0)
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: cores + 9.0)
     found = audit(boxes(EARLY), worlds=1, steps=5, workers=1)
     assert "The machine was busy" in found.busy and "errors do not depend on the load" in found.busy
     assert found.busy == found.summary_page.warning
-    monkeypatch.setattr(module.machine, "running", lambda: 2.0)  # a worker and this process
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: 2.0)  # a worker and this process
     assert not audit(boxes(EARLY), worlds=1, steps=5, workers=1).busy
 
 
@@ -90,7 +90,7 @@ def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
     found.write(tmp_path / "out")
     made = mj.MjModel.from_xml_path(str(path))
     states = np.load(tmp_path / "out" / "states.npz")
-    speeds = np.where(found.unconverged, found.numbers[0], 0.0)
+    speeds = np.where(found.is_unconverged, found.numbers[0], 0.0)
     assert states["world"].tolist() == np.argsort(-speeds.max(axis=1)).tolist()
     for i, (world, step) in enumerate(zip(states["world"], states["step"], strict=True)):
         stored = lv.io.read(tmp_path / "out" / "worst" / f"worst_{i + 1}.npz")
@@ -107,7 +107,7 @@ def frames_in_float32(planted):
     """Answers of MuJoCo rounded to float32, some of them a hundredth short."""
 
     def frames(engine, runs):
-        _, made = runs.load()
+        _, made = runs.load_model()
         data = mj.MjData(made)
         for step in range(runs.steps):
             mj.mj_forward(made, data)
@@ -133,7 +133,7 @@ def test_the_floor_of_float32_is_told_from_an_early_stop(boxes, monkeypatch):
     planted = {3, 9, 12}
     monkeypatch.setattr(module, "iterate_frames", frames_in_float32(planted))
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
-    assert set(np.flatnonzero(found.unconverged[0])) == planted
+    assert set(np.flatnonzero(found.is_unconverged[0])) == planted
     assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
 
 
@@ -141,7 +141,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
     """MJX and MuJoCo Warp go on with numbers that are not finite."""
 
     def frames(engine, runs):
-        _, made = runs.load()
+        _, made = runs.load_model()
         data = mj.MjData(made)
         for step in range(runs.steps):
             mj.mj_forward(made, data)
@@ -162,9 +162,9 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
 
     monkeypatch.setattr(module, "iterate_frames", frames)
     found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
-    assert (found.judged, found.unjudged, found.diverged) == (14, 6, 1)
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (14, 6, 1)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
-    assert "1 world diverged, in step 4 at the earliest; 6 steps were not judged" in found.head
+    assert "1 world diverged, in step 4 at the earliest; 6 steps were not judged" in found.summary_text
 
 
 def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
@@ -175,7 +175,7 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
-    assert found.stopped and found.done == 20
+    assert found.stopped and found.n_processed == 20
     assert np.isnan(found.numbers[:, 1:]).all()
     found.write(tmp_path / "out")
     assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
@@ -183,7 +183,7 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
 
 def test_what_is_close_enough_may_still_not_be_accepted(boxes):
     found = audit(boxes(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
-    assert not found.unconverged.any() and found.largest == found.numbers[0].max() > 1e-3
+    assert not found.is_unconverged.any() and found.max_velocity_error == found.numbers[0].max() > 1e-3
 
 
 def test_a_step_whose_state_is_not_finite_is_not_judged(boxes, monkeypatch):
@@ -197,8 +197,8 @@ def test_a_step_whose_state_is_not_finite_is_not_judged(boxes, monkeypatch):
     monkeypatch.setattr(module, "simulate_world", spoiled)
     found = audit(boxes(), worlds=1, steps=10, workers=1)
     assert AUDIT_VERDICTS[found.verdict[0, 5]] == "not judged" and np.isnan(found.numbers[:, 0, 5]).all()
-    assert (found.judged, found.unjudged, found.diverged) == (9, 1, 0)
-    assert found.head.endswith("1 step was not judged: the answer is not finite.")
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (9, 1, 0)
+    assert found.summary_text.endswith("1 step was not judged: the answer is not finite.")
 
 
 def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(boxes, monkeypatch):
@@ -212,14 +212,14 @@ def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(bo
     monkeypatch.setattr(mj, "mj_step", dies)
     found = audit(boxes(), worlds=1, steps=12, workers=1)
     assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
-    assert (found.judged, found.unjudged, found.diverged) == (8, 4, 1)
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (8, 4, 1)
     assert (
         "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8"
-        in found.head
+        in found.summary_text
     )
-    assert "4 steps were not judged" in found.head
+    assert "4 steps were not judged" in found.summary_text
     assert "out of memory" in found.divergences[0].cause
-    assert "outside" not in found.head  # An error of MuJoCo says nothing about the solver.
+    assert "outside" not in found.summary_text  # An error of MuJoCo says nothing about the solver.
 
 
 # A motor that drives itself: its force grows with the velocity, so that no answer of the constraint solver helps.
@@ -238,15 +238,17 @@ def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
     found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
-    assert found.diverged == 3 and found.unjudged > 0
-    assert found.judged + found.unjudged == found.verdict.size
-    assert found.judged == np.isfinite(found.numbers[0]).sum()
-    assert f"of {found.judged} steps judged" in found.head and "inf" not in found.head
-    assert np.isfinite(found.largest)
+    assert found.n_diverged == 3 and found.n_unjudged > 0
+    assert found.n_judged + found.n_unjudged == found.verdict.size
+    assert found.n_judged == np.isfinite(found.numbers[0]).sum()
+    assert f"of {found.n_judged} steps judged" in found.summary_text and "inf" not in found.summary_text
+    assert np.isfinite(found.max_velocity_error)
     exact = options == ""  # One sweep of PGS does not hold the box.
-    assert found.unconverged.any() == (not exact and threshold < 1.0)
-    assert ("outside the constraint solver" in found.head) == exact
-    assert [row[-1] for row in found.table_of_diverged.texts] == [["exact"], ["not exact"]][not exact] * 3
+    assert found.is_unconverged.any() == (not exact and threshold < 1.0)
+    assert ("outside the constraint solver" in found.summary_text) == exact
+    assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][
+        not exact
+    ] * 3
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -255,8 +257,8 @@ def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
     steps = 1 + audit("runaway.xml", worlds=1, steps=60, workers=1, spread=0.0).divergences[0].step
     found = audit("runaway.xml", worlds=1, steps=steps, workers=1, spread=0.0)
-    assert found.diverged == 1
-    assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).diverged == 0
+    assert found.n_diverged == 1
+    assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).n_diverged == 0
 
 
 def test_shares_are_never_rounded_to_nothing(boxes):
@@ -264,7 +266,7 @@ def test_shares_are_never_rounded_to_nothing(boxes):
     verdict = np.zeros((10, 320), np.int8)
     verdict[0, :3] = AUDIT_VERDICTS.index("stopped before convergence")
     many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
-    assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.head
+    assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.summary_text
 
 
 def test_rows_and_contacts_are_those_of_the_run(boxes):
@@ -278,7 +280,7 @@ def test_rows_and_contacts_are_those_of_the_run(boxes):
         acting = np.count_nonzero(data.contact.efc_address >= 0) if data.ncon else 0
         assert (found.rows[0, step], found.contacts[0, step]) == (data.nefc, acting)
         mj.mj_step(made, data)
-    assert found.sizes.is_enough and found.contacts.max() >= 8
+    assert found.judged_sizes.has_enough_contact and found.contacts.max() >= 8
     assert found.totals["contacts"]["maximum"] == found.contacts.max()
     assert found.totals["contacts"]["share"] == np.mean(found.contacts > 0)
 
@@ -288,13 +290,13 @@ def test_an_audit_of_steps_without_contact_says_so(tmp_path):
         BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20")
     )
     found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
-    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.head
+    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.summary_text
     none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
     (tmp_path / "none.xml").write_text(
         none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"')
     )
     found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
-    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.head
+    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.summary_text
 
 
 @pytest.mark.parametrize(
@@ -371,7 +373,9 @@ def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
     assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
-    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(found.largest)
+    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(
+        found.max_velocity_error
+    )
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 

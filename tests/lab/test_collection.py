@@ -12,21 +12,23 @@ import pytest
 import lavender as lv
 from lavender import bench, suite
 from lavender.lab import collection
-from lavender.lab.bench.cases import resolve
+from lavender.lab.bench.cases import resolve_sources
 
-ENTRIES = collection.load()
+ENTRIES = collection.load_manifest()
 
 
 def test_the_manifest_has_every_problem_of_every_set_in_order():
     names = [n for chosen in suite.SETS.values() for n in chosen]
-    assert [e.name for e in ENTRIES] == [n if suite.package_of(n) else suite.case(n).name for n in names]
-    assert all(e.licence and e.made for e in ENTRIES if suite.package_of(e.name))
+    assert [e.name for e in ENTRIES] == [
+        n if suite.get_model_package(n) else suite.case(n).name for n in names
+    ]
+    assert all(e.licence and e.made for e in ENTRIES if suite.get_model_package(e.name))
 
 
 @pytest.mark.parametrize("start", range(5))
 def test_problems_are_made_again_with_the_same_numbers(start):
     chosen, _ = collection.select_buildable(e for e in ENTRIES[start::15] if e.rows < 2000)
-    chosen = [e for e in chosen if e.made == suite.versions(suite.package_of(e.name))]
+    chosen = [e for e in chosen if e.made == suite.get_package_versions(suite.get_model_package(e.name))]
     assert list(collection.find_changes(chosen)) == []
     wrong = replace(chosen[0], sha="0" * 16)
     (line,) = collection.find_changes([wrong])
@@ -46,7 +48,7 @@ def test_no_problem_hangs_on_the_processor(other):
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     if "SkylakeX" in other.values() and not set(found) & set(AVX512.split()):
         pytest.skip("this processor has no AVX-512")
-    changed = "c.find_changes(e for e in c.load() if not e.made)"
+    changed = "c.find_changes(e for e in c.load_manifest() if not e.made)"
     code = f"from lavender.lab import collection as c; print(*{changed}, sep='\\n', end='')"
     assert subprocess.check_output([sys.executable, "-c", code], env=os.environ | other, text=True) == ""
 
@@ -57,7 +59,7 @@ def test_no_problem_hangs_on_the_processor(other):
 def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
     pytest.importorskip("flint")
     (case,) = suite.cases(entry.name)
-    found = collection.certify(case.problem, entry.name, entry.group)
+    found = collection.certify_problem(case.problem, entry.name, entry.group)
     assert (found.known, found.unique, found.sweeps) == (entry.known, entry.unique, entry.sweeps)
     # An answer ends where the floor of another BLAS lets it.
     assert found.radius is None or found.radius <= max(100.0 * entry.radius, 1e-9)
@@ -65,22 +67,24 @@ def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
 
 def test_the_page_is_that_of_the_manifest():
     text = (Path(__file__).resolve().parents[2] / "docs" / "catalogue.md").read_text(encoding="utf-8")
-    assert text == collection.page(ENTRIES, collection.load(collection.RECORDED))
+    assert text == collection.format_catalogue(ENTRIES, collection.load_manifest(collection.RECORDED))
 
 
 def test_a_manifest_comes_back_as_it_was_written(tmp_path):
-    collection.save(ENTRIES, tmp_path / "m.json")
-    assert collection.load(tmp_path / "m.json") == ENTRIES
+    collection.save_manifest(ENTRIES, tmp_path / "m.json")
+    assert collection.load_manifest(tmp_path / "m.json") == ENTRIES
     for text in ("{", "[1]", '[{"name": "x"}]'):
         (tmp_path / "m.json").write_text(text)
         with pytest.raises(lv.InputError, match="not a manifest"):
-            collection.load(tmp_path / "m.json")
+            collection.load_manifest(tmp_path / "m.json")
 
 
 def test_a_set_is_named_by_its_sign_wherever_cases_are():
-    assert [item.name for item in resolve("@walking")] == [e.name for e in ENTRIES if e.group == "walking"]
+    assert [item.name for item in resolve_sources("@walking")] == [
+        e.name for e in ENTRIES if e.group == "walking"
+    ]
     with pytest.raises(lv.UnknownName, match=r"unknown set .*did you mean .walking"):
-        resolve("@walkin")
+        resolve_sources("@walkin")
 
 
 def test_robots_whose_package_is_absent_are_left_out_with_what_to_install(monkeypatch):

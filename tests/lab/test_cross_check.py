@@ -29,10 +29,12 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
     honest = lv.residual(problem, wrong)
     # As if the judge had lost a factor of a thousand.
     faulty = replace(honest, error=1e-3 * honest.error, relative=1e-3 * honest.relative)
-    row = check.compare(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
+    row = check.compare_with_reference(
+        problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum
+    )
     assert row.verdict == check.BREACH
     assert row.contradicted
-    fair = check.compare(
+    fair = check.compare_with_reference(
         problem,
         "fair",
         replace(optimum, impulse=wrong, residual=honest, claim_check="confirmed", status_conflict=""),
@@ -255,14 +257,14 @@ def test_where_nothing_is_solved_nobody_agrees_and_there_is_no_reference():
     problem = lv.Problem.contact(ray @ ray.T, [0.2, -1.1, 1.4, -1.9], [0.3, 0.6])
     found = {row.verdict for row in lv.cross_check(problem, lv.available(problem, external=False))}
     assert found <= {"not solved", "no solution within rounding"}
-    assert not lv.motion.reference(problem).accepted
+    assert not lv.motion.get_reference(problem).is_accepted
 
 
 def test_an_impulse_no_better_than_none_is_excused_by_nobody():
     problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
     assert lv.residual(problem, problem.guess).roundoff_floor > 1.0
-    reference = lv.motion.adopt(problem, problem.guess)
-    assert not reference.accepted
+    reference = lv.motion.store_if_better(problem, problem.guess)
+    assert not reference.is_accepted
     assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
     assert len(lv.find_solutions(problem)) == 0
     assert lv.cross_check(problem, ["pgs"]).agreed == ()

@@ -55,32 +55,34 @@ CALLS = {
     ),
     "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
     "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
-    "bench.resolve": Call(
-        bench.resolve, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
+    "bench.resolve_sources": Call(
+        bench.resolve_sources, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
         accepts={"sequences": ("None",)},
     ),
-    "bench.resolve, a problem": Call(lambda case: bench.resolve([case]), {"case": LCP}),
-    "bench.sequence": Call(bench.sequence, {"problems": [LCP], "name": "walk"}),
+    "bench.resolve, a problem": Call(lambda case: bench.resolve_sources([case]), {"case": LCP}),
+    "bench.make_sequence": Call(bench.make_sequence, {"problems": [LCP], "name": "walk"}),
     "bench.expand_seeds": Call(
         bench.expand_seeds, {"cases": ["random_spd(n=3)"], "n": 2, "first": 0}, {"cases": "cases", "n": "n|seeds"},
         accepts={"first": ("very large",)},
     ),
-    "bench.solver_names": Call(lambda solvers: bench.solver_names(solvers), {"solvers": ["pgs"]}),
-    "bench.carry": Call(bench.carry, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}),
-    "bench.structure_of": Call(bench.structure_of, {"problem": LCP}),
+    "bench.select_solver_names": Call(lambda solvers: bench.select_solver_names(solvers), {"solvers": ["pgs"]}),
+    "bench.carry_impulses": Call(
+        bench.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
+    ),
+    "bench.classify_structure": Call(bench.classify_structure, {"problem": LCP}),
     "phenomena.select_phenomena": Call(phenomena.select_phenomena, {"names": ["slide"]}),
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),
     "suite.names": Call(suite.names, {"text": "@hard"}, {"text": "set"}),
-    "motion.adopt": Call(
-        motion.adopt, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
+    "motion.store_if_better": Call(
+        motion.store_if_better, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
         accepts={"solver": ("an object", "an ellipsis", "bytes")},
     ),
-    "motion.branch": Call(motion.branch, {"problem": LCP, "impulse": B}),
-    "motion.distance": Call(motion.distance, {"problem": LCP, "x": B, "y": B}),
-    "motion.reference": Call(motion.reference, {"problem": LCP}),
-    "motion.uniqueness": Call(motion.uniqueness, {"problem": LCP}),
+    "motion.follow_to_solution": Call(motion.follow_to_solution, {"problem": LCP, "impulse": B}),
+    "motion.measure_motion_distance": Call(motion.measure_motion_distance, {"problem": LCP, "x": B, "y": B}),
+    "motion.get_reference": Call(motion.get_reference, {"problem": LCP}),
+    "motion.prove_uniqueness": Call(motion.prove_uniqueness, {"problem": LCP}),
 }  # fmt: skip
 
 #: Public calls that are not in the table, and why.

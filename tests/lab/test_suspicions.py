@@ -11,7 +11,7 @@ from worked import after
 import lavender as lv
 from lavender import suite
 from lavender.judge.certificates import list_conflicting_blocks
-from lavender.solvers.certify import conflict_of
+from lavender.solvers.certify import find_conflict
 
 SCENES = {
     "stack": after(2, "stack", n=12, size=0.5, mass=60.0).constraint_problem(),
@@ -284,7 +284,7 @@ def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an
     """Walls leave these balls no room: several conflicts at once, of which a proof names one."""
     fights = 0
     for step, problem in Pile(17).problems(4):
-        found = conflict_of(problem, 1e-6) if step == 4 else None
+        found = find_conflict(problem, 1e-6) if step == 4 else None
         if found is not None:
             fights += 1
             assert found.blocks and "contacts" in found.advice

@@ -11,7 +11,7 @@ import lavender as lv
 from lavender.lab import tune as module
 from lavender.lab.audit import audit
 from lavender.lab.simulated_worlds import Runs, StepSizes
-from lavender.lab.tune import Measured, Setting, Stage, Tuning, grid, tune
+from lavender.lab.tune import Measured, Setting, Stage, Tuning, list_first_settings, tune
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
@@ -29,10 +29,10 @@ def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, m
     assert found.measured[0].setting == Setting()
     np.testing.assert_allclose(found.measured[0].error, whole[0::2].ravel(), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found.held[0].error, whole[1::2].ravel(), rtol=1e-6, atol=1e-12)
-    best = min(found.measured, key=lambda m: m.worst)
-    assert best.worst < 1e-6 < found.now.worst
-    assert best.worst_motion < 1e-6 < found.now.worst_motion
-    assert all(m.time > 0.0 for m in found.measured)
+    best = min(found.measured, key=lambda m: m.worst_error)
+    assert best.worst_error < 1e-6 < found.present_result.worst_error
+    assert best.worst_motion < 1e-6 < found.present_result.worst_motion
+    assert all(m.mean_step_time > 0.0 for m in found.measured)
 
 
 def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
@@ -44,17 +44,17 @@ def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
 
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
-    handle, made = runs.load()
-    stage = Stage.of(handle, made, runs, [0], 10)
-    same = stage.measure(Setting.of(handle, made, **module.CONVERGED_OPTIONS))
-    assert same.motion.max() == 0.0 and same.worst < 1e-9
+    handle, made = runs.load_model()
+    stage = Stage.from_runs(handle, made, runs, [0], 10)
+    same = stage.judge_setting(Setting.from_options(handle, made, **module.CONVERGED_OPTIONS))
+    assert same.motion.max() == 0.0 and same.worst_error < 1e-9
 
 
 def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
     runs = Runs(str(boxes()), 1, 40)
-    handle, made = runs.load()
-    stage = Stage.of(handle, made, runs, [0], 10)
-    found = [stage.measure(s) for s in (Setting(), Setting((("iterations", 5),)))]
+    handle, made = runs.load_model()
+    stage = Stage.from_runs(handle, made, runs, [0], 10)
+    found = [stage.judge_setting(s) for s in (Setting(), Setting((("iterations", 5),)))]
     rng, now = np.random.default_rng(1), 0.0
 
     def busy():
@@ -63,23 +63,25 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
         return now
 
     monkeypatch.setattr(module, "perf_counter", busy)
-    stage.time(found, 6, module.Schedule(None))
+    stage.time_settings(found, 6, module.Schedule(None))
     for m in found:
-        assert m.time == pytest.approx(1e-6, abs=1e-9)  # the clock itself rounds to 1e-14 of its 30 s
+        assert m.mean_step_time == pytest.approx(
+            1e-6, abs=1e-9
+        )  # the clock itself rounds to 1e-14 of its 30 s
 
 
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
 def test_a_line_means_in_a_model_what_was_measured(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
-    for setting in [*grid(mj, plain), *module.vary(mj, plain, Setting())]:
-        text = setting.line.removeprefix("<option").removesuffix("/>")
+    for setting in [*list_first_settings(mj, plain), *module.list_variants(mj, plain, Setting())]:
+        text = setting.option_line.removeprefix("<option").removesuffix("/>")
         names = {name for name, _ in setting.options}
         kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
         copied = mj.MjModel.from_xml_string(BOXES.format(options=f"{kept} {text}")).opt
-        tried = setting.on(mj, plain).opt
+        tried = setting.apply_to(mj, plain).opt
         for name in (*module.OPTIONS, *module.PROBLEM_OPTIONS):
             assert getattr(copied, name) == getattr(tried, name), setting
-    assert Setting.of(mj, plain, iterations=int(plain.opt.iterations)).line == ""
+    assert Setting.from_options(mj, plain, iterations=int(plain.opt.iterations)).option_line == ""
 
 
 def measured(time, error, **options):
@@ -97,9 +99,9 @@ def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enoug
     now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
     contacts = (np.arange(100) < with_contact).astype(int)
     found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
-    assert bool(found.lines) == is_enough == (not found.why_no_line)
+    assert bool(found.lines) == is_enough == (not found.reason_without_line)
     assert ("No setting is recommended: 19 of 100" in found.summary_page.head) != is_enough
-    assert "(19.0 %)" in found.why_no_line or is_enough
+    assert "(19.0 %)" in found.reason_without_line or is_enough
     # A model without geoms that can collide is judged by its rows.
     assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
     assert not replace(found, sizes=StepSizes(0 * contacts, 0 * contacts, False)).lines
@@ -112,7 +114,7 @@ def test_what_is_chosen():
     other = measured(1.0, 0.0, cone="elliptic")
     found = chosen(now, quick, loose, exact, slow, other)
     assert found.faster is quick and found.closer is exact
-    assert found.front == [loose, quick, exact, slow]
+    assert found.pareto_front == [loose, quick, exact, slow]
     assert '<option iterations="9"/>' in found.lines[0]
 
 
@@ -171,11 +173,11 @@ def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
 def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
     fewer(monkeypatch)
     cores = module.os.cpu_count()
-    monkeypatch.setattr(module.machine, "running", lambda: cores + 2.0)
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: cores + 2.0)
     page = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).summary_page
     assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in page.warning
     assert "The times are invalid" in page.warning and page.warning in page.render_html()
-    monkeypatch.setattr(module.machine, "running", lambda: 1.0)
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: 1.0)
     assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
 
 
@@ -205,16 +207,16 @@ def test_bad_words_are_told(boxes, given, words):
 
 def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeypatch):
     fewer(monkeypatch)
-    run = Stage.run
+    run = Stage.run_stretches
 
     def dies(self, model, states=None):
         if model.opt.iterations == 25:
             raise mj.FatalError("out of memory")
         return run(self, model, states)
 
-    monkeypatch.setattr(Stage, "run", dies)
+    monkeypatch.setattr(Stage, "run_stretches", dies)
     found = tune(boxes(), worlds=2, steps=10, repeats=1)
     assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
-    monkeypatch.setattr(Stage, "measure", lambda self, setting: measured(np.inf, np.inf))
+    monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)

@@ -25,7 +25,7 @@ def pages(tmp_path_factory):
     cases = ("stack(n=8)", "box_stackF(n=2)", "chain(n=5)")
     records = bench.run(
         cases, ("auto", "direct", "newton", "sequential_impulses"), plan, folder / "r.jsonl"
-    ).latest()
+    ).select_latest_run()
     generate.TOLERANCES, kept = TOLERANCES, generate.TOLERANCES
     try:
         generate.measured_page(generate.Site(folder), records, {})

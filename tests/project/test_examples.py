@@ -113,7 +113,8 @@ def test_every_motion_of_the_example_is_a_solution_and_they_differ(drawn):
     for k in (i, j):
         assert lv.residual(found["problem"], motions[k].impulse).relative < 1e-10
     assert (
-        lv.motion.distance(found["problem"], motions[i].impulse, motions[j].impulse).speed == motions.spread
+        lv.motion.measure_motion_distance(found["problem"], motions[i].impulse, motions[j].impulse).speed
+        == motions.spread
     )
     assert found["cone"].separation_speed > 0.1
 

@@ -23,7 +23,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lazy_import import spatial
 from lavender.lab.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
 from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, SPHERE, check_minimum
+from lavender.lab.suite.families import BOX, SPHERE, check_min_sizes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from random_families.wild import (
@@ -325,7 +325,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
 
     Or "rolling": worlds to tune on whose contacts resist rolling, and perhaps spin.
     """
-    check_minimum(8, rows=rows)
+    check_min_sizes(8, rows=rows)
     check_name("part", part, PART)
     title = f"drawn(seed={seed}, rows={rows}, part={part})"
     rng = np.random.default_rng([seed, 0x647261, PART.index(part)])

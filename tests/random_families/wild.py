@@ -28,12 +28,12 @@ from lavender.lab.suite.build import (
     Bodies,
     Contacts,
     add_horizontal_velocity,
-    manifold,
+    guess_static_loads,
     map_scalar,
-    static_loads,
+    place_four_corners,
 )
 from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, ROD, SPHERE, ball_joints, check_minimum
+from lavender.lab.suite.families import BOX, ROD, SPHERE, check_min_sizes, compute_ball_joint_jacobian
 from lavender.problem import Problem
 
 __all__ = ["STRUCTURES", "wild"]
@@ -114,7 +114,7 @@ def towers(rng: np.random.Generator, rows: int) -> World:
     pairs = np.stack([np.where(level == 0, -1, k - 1), k], 1)
     foot = position - np.array([0.0, 0.0, 0.5])
     if boxes:
-        return World(position, BOX).add(manifold(pairs, foot, 0.5))
+        return World(position, BOX).add(place_four_corners(pairs, foot, 0.5))
     return World(position, SPHERE).add(Contacts(pairs, foot, [0.0, 0.0, 1.0]))
 
 
@@ -142,7 +142,7 @@ def wall(rng: np.random.Generator, rows: int) -> World:
         half.append(0.5 * (1.0 - gap))
     pair, where = np.unique(np.concatenate(pairs), axis=0, return_index=True)
     return World(position, BOX).add(
-        manifold(pair, np.concatenate(centre)[where], np.concatenate(half)[where])
+        place_four_corners(pair, np.concatenate(centre)[where], np.concatenate(half)[where])
     )
 
 
@@ -215,7 +215,7 @@ STRUCTURES: dict[str, Structure] = {
 
 def wild(seed: int = 0, rows: int = 3000) -> Draft:
     """A problem drawn by `seed`: structure, masses, law and form, of some 8 to `rows` rows, even in the logarithm."""
-    check_minimum(8, rows=rows)
+    check_min_sizes(8, rows=rows)
     rng = np.random.default_rng([seed, 0x77696C64])
     name = str(rng.choice(list(STRUCTURES)))
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
@@ -246,9 +246,9 @@ def problem_of(
     """Contacts and joints of a world under a law; `soft`: compliance beside 1/mass, one problem of five has one."""
     contacts = Contacts(world.touch, world.point, world.normal)
     joints = len(world.joint)
-    made = bodies.rows(
+    made = bodies.make_rows(
         contacts,
-        jac=ball_joints(bodies.position, world.joint, world.anchor),
+        jac=compute_ball_joint_jacobian(bodies.position, world.joint, world.anchor),
         joint_ptr=np.arange(0, 3 * joints + 1, 3, dtype=np.int32),
         joint_body=np.asarray(world.joint, np.int32),
     )
@@ -265,7 +265,7 @@ def problem_of(
     problem = Problem.from_rows(made, mu=mu, tangents=2, friction=friction, compliance=np.full(m, compliance))
     if law != "box" or not count:
         return problem
-    return problem.boxed(static_loads(bodies, contacts))
+    return problem.boxed(guess_static_loads(bodies, contacts))
 
 
 def _as_matrix(rng: np.random.Generator, problem: Problem, form: str) -> Problem:

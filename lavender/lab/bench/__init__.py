@@ -6,14 +6,21 @@
 Nothing here draws or prints; `lavender.lab.report` reads the records.
 """
 
-from lavender.lab.bench.cases import Item, expand_seeds, resolve, sequence, steps_in, structure_of
-from lavender.lab.bench.machine import cpu_name
+from lavender.lab.bench.cases import (
+    Item,
+    classify_structure,
+    expand_seeds,
+    list_steps_in_folder,
+    make_sequence,
+    resolve_sources,
+)
+from lavender.lab.bench.machine import get_cpu_name
 from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, format_tolerance
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import CampaignPlan, Plan
-from lavender.lab.bench.running.runner import Event, carry, run, solver_names
-from lavender.lab.bench.running.timing import CallSpec, Task, measure, one_thread
-from lavender.lab.bench.store import Records, Store, read, write_csv, write_json
+from lavender.lab.bench.running.runner import Event, carry_impulses, run, select_solver_names
+from lavender.lab.bench.running.timing import CallSpec, Task, limit_to_one_thread, measure_task
+from lavender.lab.bench.store import Records, Store, read_records, write_csv, write_json
 
 __all__ = [
     "CallSpec",
@@ -28,19 +35,19 @@ __all__ = [
     "Skip",
     "Store",
     "Task",
-    "carry",
-    "cpu_name",
+    "carry_impulses",
+    "classify_structure",
     "expand_seeds",
     "format_tolerance",
-    "measure",
-    "one_thread",
-    "read",
-    "resolve",
+    "get_cpu_name",
+    "limit_to_one_thread",
+    "list_steps_in_folder",
+    "make_sequence",
+    "measure_task",
+    "read_records",
+    "resolve_sources",
     "run",
-    "sequence",
-    "solver_names",
-    "steps_in",
-    "structure_of",
+    "select_solver_names",
     "time_alternately",
     "write_csv",
     "write_json",

@@ -85,7 +85,7 @@ def _list_time_limited(
     ranking = rank_calls_in_time(records, single, advice.target)
     for call, choice in () if ranking is None else ranking.ranking[:MAX_CANDIDATES]:
         if choice.solved:
-            line = call.line
+            line = call.as_record
             call_specs.append(
                 CallSpec(
                     line.solver,

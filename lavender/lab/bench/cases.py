@@ -23,15 +23,15 @@ from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.lab import suite
-from lavender.lab.bench.record import CaseInfo, file_name, printable
+from lavender.lab.bench.record import CaseInfo, escape_unprintable, make_file_name
 from lavender.lab.diagnostics import diagnose
 from lavender.lab.suite import Case
-from lavender.lab.suite.case import FAMILIES, parse
+from lavender.lab.suite.case import FAMILIES, parse_case_name
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
 MAX_RANK_ROWS = 300  # The rank of A is computed up to this many rows, in a fraction of a second.
-# A singular value is zero if it is at most this fraction of the largest: far below any condition number in practice.
+# Singular values up to this fraction of the largest count as zero. No condition number in practice is so large.
 ZERO_SINGULAR_VALUE_TOL = 1e-12
 MAX_MANIFOLD_BLOCKS = 8  # Largest number of contacts between one pair of bodies.
 LARGE_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is much more accurate.
@@ -76,7 +76,7 @@ class Item:
     named: bool = False
 
     def __post_init__(self) -> None:
-        self.name, self.sequence = printable(self.name), printable(self.sequence)
+        self.name, self.sequence = escape_unprintable(self.name), escape_unprintable(self.sequence)
 
     @cached_property
     def problem(self) -> Problem:
@@ -92,7 +92,7 @@ class Item:
             return None
         return residual(self.problem, impulse, precision, threshold)
 
-    def forget(self) -> None:
+    def release_problem(self) -> None:
         """Release the memory of the problem."""
         self.__dict__.pop("problem", None)
 
@@ -109,7 +109,7 @@ def is_path(word: Source) -> bool:
 Source = str | Path | Problem | Case | Item
 
 
-def resolve(sources: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
+def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
     """Resolve files, folders (and folders in them), names and cases of the suite to items; the default suite if none.
 
     No problem is solved and usually none is loaded, but every source is checked to exist.
@@ -138,54 +138,57 @@ def resolve(sources: Source | Iterable[Source], sequences: bool | None = None) -
         else check_sequence("cases", sources, "files, folders, names or problems")
     )
     if not sources:
-        items = [_from_case(case, case.name) for case in suite.default()]
+        items = [_make_item_of_case(case, case.name) for case in suite.default()]
     for source in sources:
         if isinstance(source, Problem):
             name = source.name or f"problem {len(items)}"
-            items.append(Item(name, name, _constant(source), in_memory=source))
+            items.append(Item(name, name, _make_loader(source), in_memory=source))
         elif isinstance(source, Item):
             items.append(source)
         elif isinstance(source, Case):
-            items.append(_from_case(source, source.name))
+            items.append(_make_item_of_case(source, source.name))
         elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
             raise InputError(f"case {source!r:.60} is not a file, a name of the suite or a problem")
         elif sequences or (sequences is None and _holds_steps(Path(source))):
-            steps = _unique_sequence(steps_in(source), items)
-            name, missing = steps[0].sequence, map(_from_file, _unrecorded_steps(Path(source)))
+            steps = _rename_duplicate_sequence(list_steps_in_folder(source), items)
+            name, missing = steps[0].sequence, map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
             items += [
                 *steps,
                 *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in missing),
             ]
         elif Path(source).is_dir():
-            paths = _problem_files(Path(source))
+            paths = _list_problem_files(Path(source))
             visited.add(Path(source).resolve())
             inner = [
                 p
                 for p in sorted(Path(source).iterdir())
-                if p.is_dir() and p.resolve() not in visited and os.access(p, os.R_OK) and _problem_files(p)
+                if p.is_dir()
+                and p.resolve() not in visited
+                and os.access(p, os.R_OK)
+                and _list_problem_files(p)
             ]
             sources += inner
             if not paths and not inner:
                 records = Path(source) / "records.jsonl"
                 shown = f": {records} shows its report again" if records.is_file() else ""
                 raise InputError(f"{source} holds no problem file ({', '.join(SUFFIXES)}){shown}")
-            items += [_from_file(path) for path in (*paths, *_unrecorded_steps(Path(source)))]
-        elif Path(source).exists() or Path(source) in _unrecorded_steps(Path(source).parent):
-            items.append(replace(_from_file(Path(source)), named=True))
+            items += [_make_item_of_file(path) for path in (*paths, *_read_unrecorded_steps(Path(source)))]
+        elif Path(source).exists() or Path(source) in _read_unrecorded_steps(Path(source).parent):
+            items.append(replace(_make_item_of_file(Path(source)), named=True))
         elif is_path(source):
             raise InputError(
                 f"{source}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
         else:
-            selected = [_from_name(name) for name in suite.names(str(source))]
+            selected = [_make_item_of_name(name) for name in suite.names(str(source))]
             items += _number_as_steps(selected) if str(source).removeprefix("@") == "sequences" else selected
-    return _unique_names(items)
+    return _number_equal_names(items)
 
 
-def resolve_again(source: str | Problem, name: str, reason: str) -> Item:
+def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
     """Resolve the source of one item in another process. An error is raised when the problem is loaded."""
     try:
-        (item,) = resolve([source])
+        (item,) = resolve_sources([source])
     except Exception as error:  # The file was removed, or reading its folder raises an error.
         item = Item(name, str(source), _raise_when_loaded(error))
     return replace(item, name=name, reason=reason, sequence="", step=-1)
@@ -211,7 +214,7 @@ def expand_seeds(cases: Iterable[str], n: int, first: int = 0) -> list[str]:
         if is_path(case) or case.startswith("@"):
             out.append(case)
             continue
-        name, parameters = parse(case)
+        name, parameters = parse_case_name(case)
         if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in parameters:
             for seed in range(first, first + n):
                 inside = ", ".join(f"{k}={v}" for k, v in {**parameters, "seed": seed}.items())
@@ -221,18 +224,20 @@ def expand_seeds(cases: Iterable[str], n: int, first: int = 0) -> list[str]:
     return out
 
 
-def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
+def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     """Return consecutive problems as the steps of one sequence."""
     if not isinstance(name, str):
         raise InputError(f"name of a sequence is {name!r:.60}; a string is needed")
     items = []
     for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
         check_problem(problem)
-        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i, in_memory=problem))
+        items.append(
+            Item(f"{name}[{i}]", name, _make_loader(problem), sequence=name, step=i, in_memory=problem)
+        )
     return items
 
 
-def steps_in(folder: str | Path) -> list[Item]:
+def list_steps_in_folder(folder: str | Path) -> list[Item]:
     """Return the problem files of a folder as the steps of one sequence, in the numeric order of their names.
 
     Raises
@@ -245,7 +250,7 @@ def steps_in(folder: str | Path) -> list[Item]:
         raise InputError(
             f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
         )
-    paths = _problem_files(folder)
+    paths = _list_problem_files(folder)
     if len(paths) < 2:
         raise InputError(
             f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
@@ -253,7 +258,8 @@ def steps_in(folder: str | Path) -> list[Item]:
     _check_one_recording(folder, paths)
     name = folder.resolve().name
     return [
-        replace(_from_file(path), name=f"{name}[{i}]", sequence=name, step=i) for i, path in enumerate(paths)
+        replace(_make_item_of_file(path), name=f"{name}[{i}]", sequence=name, step=i)
+        for i, path in enumerate(paths)
     ]
 
 
@@ -265,7 +271,7 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     twice = len(numbered) > len(set(numbered))
-    listed = {str(line["file"]) for line in _engine_lines(folder)}
+    listed = {str(line["file"]) for line in _read_engine_records(folder)}
     unlisted = [p.name for p in paths if listed and p.name not in listed]
     if twice or len(series) > 1 or unlisted:
         reason = (
@@ -280,7 +286,7 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
         )
 
 
-def _engine_lines(folder: Path) -> list[dict[str, Any]]:
+def _read_engine_records(folder: Path) -> list[dict[str, Any]]:
     """Read the engine's data of the steps in a folder, each with its "file"; empty if a line cannot be read."""
     try:
         text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
@@ -290,25 +296,25 @@ def _engine_lines(folder: Path) -> list[dict[str, Any]]:
         return []
 
 
-def _unrecorded_steps(folder: Path) -> dict[Path, str]:
+def _read_unrecorded_steps(folder: Path) -> dict[Path, str]:
     """Return {file: reason} for steps that could not be recorded."""
     steps = {
         folder / Path(str(t["file"])).name: str(t["left_out"])
-        for t in _engine_lines(folder)
+        for t in _read_engine_records(folder)
         if "left_out" in t
     }
     return {path: reason for path, reason in steps.items() if not path.exists()}
 
 
-def _problem_files(folder: Path) -> list[Path]:
+def _list_problem_files(folder: Path) -> list[Path]:
     """List the problem files of a folder, in the numeric order of their names."""
     try:
-        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural_order)
+        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural_sort_key)
     except OSError as error:
         raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
 
 
-def _natural_order(path: Path) -> list[tuple[int, int | str]]:
+def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
     """Return a sort key in which numbers are ordered by value; digits such as superscripts count as letters."""
     parts = re.split(r"([0-9]{1,18})", path.name)
     return [(0, int(t)) if i % 2 else (1, t) for i, t in enumerate(parts) if t]
@@ -316,44 +322,44 @@ def _natural_order(path: Path) -> list[tuple[int, int | str]]:
 
 def _holds_steps(folder: Path) -> bool:
     """Whether a folder holds the recorded steps of one simulation."""
-    paths = _problem_files(folder) if folder.is_dir() else []
+    paths = _list_problem_files(folder) if folder.is_dir() else []
     if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
         return False
     try:
-        return _from_file(paths[0]).problem.key is not None
+        return _make_item_of_file(paths[0]).problem.key is not None
     except Exception:  # The error is reported when the case is run.
         return False
 
 
-def _unique_sequence(steps: list[Item], items: list[Item]) -> list[Item]:
+def _rename_duplicate_sequence(steps: list[Item], items: list[Item]) -> list[Item]:
     """Rename a sequence if an earlier one has its name: prefix the parent folder's name, or append a number.
 
     Figures are files named after sequences, so names must differ as file names, too.
     """
-    names = {file_name(item.sequence).lower() for item in items if item.sequence}
+    names = {make_file_name(item.sequence).lower() for item in items if item.sequence}
     name, n = steps[0].sequence, 1
-    if file_name(name).lower() in names:
+    if make_file_name(name).lower() in names:
         with_parent = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
-        name = name if file_name(with_parent).lower() in names else with_parent
-    while file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
+        name = name if make_file_name(with_parent).lower() in names else with_parent
+    while make_file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
         n += 1
     return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
 
 
-def _constant(problem: Problem) -> Callable[[], Problem]:
+def _make_loader(problem: Problem) -> Callable[[], Problem]:
     """Return a function that returns the problem."""
     return lambda: problem
 
 
-def _from_case(case: Case, source: str) -> Item:
+def _make_item_of_case(case: Case, source: str) -> Item:
     """Create the item of a case."""
-    return Item(case.name, source, _constant(case.problem), case.reason)
+    return Item(case.name, source, _make_loader(case.problem), case.reason)
 
 
-def _from_name(name: str) -> Item:
+def _make_item_of_name(name: str) -> Item:
     """Create the item of a name in the suite; if a package is missing, loading the item raises the error."""
     try:
-        return _from_case(suite.case(name), name)
+        return _make_item_of_case(suite.case(name), name)
     except SolverUnavailable as error:
         return Item(name, name, _raise_when_loaded(error))
 
@@ -377,33 +383,33 @@ def _raise_when_loaded(error: Exception) -> Callable[[], Problem]:
     return load
 
 
-def _from_file(path: Path) -> Item:
+def _make_item_of_file(path: Path) -> Item:
     """Create the item of a problem file."""
 
     def load() -> Problem:
         if path.exists() and not path.is_file():
             # A pipe may never end.
             raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
-        if not path.exists() and (reason := _unrecorded_steps(path.parent).get(path)):
+        if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
             raise InputError(f"{path}: it could not be recorded: {reason}")
         return io.load(path)
 
     return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))
 
 
-def _unique_names(items: list[Item]) -> list[Item]:
+def _number_equal_names(items: list[Item]) -> list[Item]:
     """Append numbers to equal names; figures are files named after cases, so case-insensitive names must differ."""
     used_names: set[str] = set()
     for item in items:
         name, n = item.name, 1
-        while file_name(item.name).lower() in used_names:
+        while make_file_name(item.name).lower() in used_names:
             n += 1
             item.name = f"{name} #{n}"
-        used_names.add(file_name(item.name).lower())
+        used_names.add(make_file_name(item.name).lower())
     return items
 
 
-def describe(item: Item, run: str) -> CaseInfo:
+def describe_case(item: Item, run: str) -> CaseInfo:
     """Load the problem of an item and describe it for the report."""
     p = item.problem
     contacts = int(np.count_nonzero(p.cones.is_contact))
@@ -412,15 +418,15 @@ def describe(item: Item, run: str) -> CaseInfo:
         run=run,
         case=item.name,
         source=item.source,
-        sha=fingerprint(p),
+        sha=hash_problem(p),
         law=p.law,
         rows=p.m,
         blocks=p.n_blocks,
         contacts=contacts,
         bodies=p.rows.n_bodies if p.rows is not None else 0,
         nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz),
-        mass_ratio=mass_ratio(p),
-        structure=structure_of(p),
+        mass_ratio=compute_mass_ratio(p),
+        structure=classify_structure(p),
         symmetric=p.is_symmetric,
         reason=item.reason,
         sequence=item.sequence,
@@ -430,7 +436,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         nothing_to_do=is_solved_by_zero(p),
         diagnostics=tuple(map(str, diagnose(p))),
         guess=_classify_guess(item),
-        condition=condition(p),
+        condition=compute_condition(p),
     )
 
 
@@ -444,7 +450,7 @@ def _classify_guess(item: Item) -> str:
     return "answer" if is_stored or residual(item.problem, guess).relative <= DEFAULT_SOLVE_TOL else "start"
 
 
-def fingerprint(problem: Problem) -> str:
+def hash_problem(problem: Problem) -> str:
     """Hash the numbers of a problem and the keys of its blocks; the v* of bodies is hashed as part of b."""
     digest = hashlib.sha256(problem.friction.encode())
     c, r, g = problem.cones, problem.rows, problem.generalized
@@ -466,7 +472,7 @@ def fingerprint(problem: Problem) -> str:
     return digest.hexdigest()[:16]
 
 
-def mass_ratio(problem: Problem) -> float:
+def compute_mass_ratio(problem: Problem) -> float:
     """Compute the largest mass over the smallest, or for a matrix the ratio of A's diagonal on rows and normals."""
     if problem.rows is not None:
         x = problem.rows.inv_mass
@@ -478,7 +484,7 @@ def mass_ratio(problem: Problem) -> float:
     return float(x.max() / x.min()) if len(x) else 1.0
 
 
-def structure_of(problem: Problem) -> tuple[str, ...]:
+def classify_structure(problem: Problem) -> tuple[str, ...]:
     """Return the words that describe a problem's structure, from its numbers; they decide which solver suits.
 
     - The largest connected component of the coupling graph. One moving body (in a matrix: a few blocks that are all
@@ -496,26 +502,26 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
     features = []
     mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
     if mechanical:
-        features.append(_shape(problem))
-    if _redundant(problem):
+        features.append(_classify_coupling_graph(problem))
+    if _has_redundant_rows(problem):
         features.append("redundant")
     if problem.law in ("coulomb", "cone"):
         features.append("friction")
     if problem.cones.has_ellipse:
         features.append("ellipses")
-    if mechanical and mass_ratio(problem) >= LARGE_MASS_RATIO:
+    if mechanical and compute_mass_ratio(problem) >= LARGE_MASS_RATIO:
         features.append("large mass ratio")
     if not problem.is_symmetric:
         features.append("asymmetric")
     return tuple(features)
 
 
-def _shape(problem: Problem) -> str:
+def _classify_coupling_graph(problem: Problem) -> str:
     """Return the word for the largest connected component of the coupling graph."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    n, i, j = _coupled_bodies(problem) if problem.rows is not None else _coupled_blocks(problem)
+    n, i, j = _build_body_graph(problem) if problem.rows is not None else _build_block_graph(problem)
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
     component = connected_components(graph, directed=False)[1]
     largest = np.bincount(component).argmax()
@@ -549,7 +555,7 @@ def _is_bilateral(problem: Problem) -> bool:
 Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # number of nodes, and both ends of each edge
 
 
-def _coupled_bodies(problem: Problem) -> Edges:
+def _build_body_graph(problem: Problem) -> Edges:
     """Return the graph of moving bodies that a joint or a contact connects."""
     r = problem.rows
     assert r is not None
@@ -562,7 +568,7 @@ def _coupled_bodies(problem: Problem) -> Edges:
     return max(1, len(bodies) - ground), indices[:, 0] - ground, indices[:, 1] - ground
 
 
-def _coupled_blocks(problem: Problem) -> Edges:
+def _build_block_graph(problem: Problem) -> Edges:
     """Return the graph of blocks that A couples; blocks with equal couplings are the points of one manifold."""
     import scipy.sparse as sp
 
@@ -585,22 +591,22 @@ def _coupled_blocks(problem: Problem) -> Edges:
     return len(groups), edges[0], edges[1]
 
 
-def _redundant(problem: Problem) -> bool:
+def _has_redundant_rows(problem: Problem) -> bool:
     """Whether there are fewer independent rows than rows, by the counts or by the singular values."""
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
-    values = _singular_values(problem)
+    values = _compute_singular_values(problem)
     return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])
 
 
-def condition(problem: Problem) -> float | None:
+def compute_condition(problem: Problem) -> float | None:
     """Compute the condition of A, scaled to a unit diagonal, on its range; None for A = 0 or too many rows."""
-    values = _singular_values(problem)
+    values = _compute_singular_values(problem)
     nonzero = values[values > ZERO_SINGULAR_VALUE_TOL * values.max(initial=0.0)]
     return float(f"{nonzero[0] / nonzero[-1]:.1e}") if len(nonzero) else None
 
 
-def _singular_values(problem: Problem) -> NDArray[Any]:
+def _compute_singular_values(problem: Problem) -> NDArray[Any]:
     """Compute the singular values of A, scaled to a unit diagonal; empty above MAX_RANK_ROWS rows."""
     if problem.m > MAX_RANK_ROWS:
         return np.zeros(0)

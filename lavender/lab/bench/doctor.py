@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from lavender._version import __version__
-from lavender.lab.bench.machine import build_facts, clock, cpu_name, load, memory, versions
+from lavender.lab.bench.machine import (
+    describe_build,
+    get_cpu_name,
+    get_load_average,
+    get_processor_clock,
+    get_total_memory,
+    get_versions,
+)
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 from lavender.sim.engine import Simulation
@@ -34,7 +41,7 @@ HASHES = {
 }
 
 
-def self_test() -> dict[str, str]:
+def run_self_test() -> dict[str, str]:
     """Compute the hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of scenes.
 
     `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the library.
@@ -46,9 +53,9 @@ def self_test() -> dict[str, str]:
         ("nncg", "coulomb"),
         ("anderson", "cone"),
     ):
-        results[f"{name}, {law}"] = solve(_contacts(law), name, tol=0.0, max_iter=12).impulse
+        results[f"{name}, {law}"] = solve(_build_test_contacts(law), name, tol=0.0, max_iter=12).impulse
     for name in ("sequential_impulses", "anderson"):
-        results[f"{name}, bodies"] = solve(_bodies(), name, tol=0.0, max_iter=12).impulse
+        results[f"{name}, bodies"] = solve(_build_test_bodies(), name, tol=0.0, max_iter=12).impulse
     results["stack, 60 steps"] = simulate_positions("stack", 60)
     # The starts of scenes are tested, too. The rotations of a pile are drawn by NumPy and may depend on the C library.
     gallery_scenes = [
@@ -63,13 +70,16 @@ def self_test() -> dict[str, str]:
     }
 
 
-def examine() -> dict[str, Any]:
-    """Collect all facts as plain data; `self_test` gives "same", or the expected and the actual hash, for each part."""
+def collect_installation_facts() -> dict[str, Any]:
+    """Collect facts about this installation as plain data.
+
+    `run_self_test` gives "same", or the expected and the actual hash, for each part.
+    """
     start_time = perf_counter()
     backends = {name: reason for name, reason in known().items() if specs()[name].external}
     parts = {
         n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} found"
-        for n, h in self_test().items()
+        for n, h in run_self_test().items()
     }
     affinity = getattr(os, "sched_getaffinity", None)
     return {
@@ -77,25 +87,25 @@ def examine() -> dict[str, Any]:
         "python": f"{platform.python_implementation()} {platform.python_version()}",
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "cpu": cpu_name(),
+        "cpu": get_cpu_name(),
         "cores": os.cpu_count() or 1,
         "cores_allowed": len(affinity(0)) if affinity else os.cpu_count() or 1,
-        "memory_bytes": memory(),
+        "memory_bytes": get_total_memory(),
         "threads_set": {k: v for k, v in sorted(os.environ.items()) if k.endswith("_NUM_THREADS")},
-        "versions": versions(["cython", "matplotlib", "h5py", "mujoco"]),
-        "build": build_facts() | clock(),
-        "load": load(),
+        "versions": get_versions(["cython", "matplotlib", "h5py", "mujoco"]),
+        "build": describe_build() | get_processor_clock(),
+        "load": get_load_average(),
         "extension": Path(str(serial.__file__)).name,
-        "backends": {name: reason or version_of(name) for name, reason in backends.items()},
+        "backends": {name: reason or get_backend_versions(name) for name, reason in backends.items()},
         "self_test": parts,
         "same_bits": all(x == "same" for x in parts.values()),
         "seconds": round(perf_counter() - start_time, 2),
     }
 
 
-def version_of(solver: str) -> str:
+def get_backend_versions(solver: str) -> str:
     """Return the versions of the packages that a backend needs."""
-    package_versions = versions(get(solver).requires, base=())
+    package_versions = get_versions(get(solver).requires, base=())
     return ", ".join(f"{name} {v}" for name, v in package_versions.items()) or "installed"
 
 
@@ -107,7 +117,7 @@ def simulate_positions(scene: str, n: int) -> Any:
     return positions.ravel()
 
 
-def _contacts(law: str) -> Problem:
+def _build_test_contacts(law: str) -> Problem:
     """Build eight contacts of three rows from integers and halves only, so that no library rounds the start."""
     m = 24
     i, j = np.indices((m, m))
@@ -119,7 +129,7 @@ def _contacts(law: str) -> Problem:
     return Problem.contact(a, b, mu=np.full(m // 3, 0.5), friction=law)
 
 
-def _bodies() -> Problem:
+def _build_test_bodies() -> Problem:
     """Build six boxes on each other with four contacts each, pushed sideways; every number is a dyadic fraction."""
     n, corners = 6, np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
     arm = np.repeat([[0.0, 0.0, 0.5]], 4, axis=0)

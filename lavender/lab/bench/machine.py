@@ -30,7 +30,7 @@ MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled
 BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
 
 
-def _cpuinfo(name: str) -> str:
+def _read_cpuinfo(name: str) -> str:
     """Return Linux's value of an entry for the first processor; empty on other systems."""
     with contextlib.suppress(OSError):
         text = Path("/proc/cpuinfo").read_text(errors="replace")
@@ -39,12 +39,12 @@ def _cpuinfo(name: str) -> str:
     return ""
 
 
-def cpu_name() -> str:
+def get_cpu_name() -> str:
     """Return the model of the processor, as the system names it."""
-    return _cpuinfo("model name|Model") or platform.processor() or platform.machine() or "unknown"
+    return _read_cpuinfo("model name|Model") or platform.processor() or platform.machine() or "unknown"
 
 
-def memory() -> int:
+def get_total_memory() -> int:
     """Return the memory of this machine or of its container [bytes]; 0 if it is not known."""
     found = []
     with contextlib.suppress(AttributeError, ValueError, OSError):
@@ -55,53 +55,55 @@ def memory() -> int:
     return min((n for n in found if n > 0), default=0)
 
 
-def memory_share(processes: int = 1) -> int:
+def get_memory_share(processes: int = 1) -> int:
     """Return the memory [bytes] that each of `processes` backend processes may use.
 
     It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
     machine is unknown.
     """
     return (
-        max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * memory() / max(1, processes)))
-        if memory()
+        max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * get_total_memory() / max(1, processes)))
+        if get_total_memory()
         else 0
     )
 
 
-def versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:
+def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:
     """Return the version of each installed distribution, or of a module's; missing ones are left out."""
     found = {}
     for name in sorted({*base, *packages}):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found |= {dist: metadata.version(dist) for dist in _distributions().get(name, ())[:1]}
+            found |= {
+                dist: metadata.version(dist) for dist in _map_modules_to_distributions().get(name, ())[:1]
+            }
     return found
 
 
 @cache
-def _distributions() -> Mapping[str, list[str]]:
+def _map_modules_to_distributions() -> Mapping[str, list[str]]:
     """Return {module: distributions}; it reads the file lists of all installed packages."""
     return metadata.packages_distributions()
 
 
-def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
+def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
     """Describe a run that starts now; its identity is a hash of CPU, versions and plan, not of the time."""
     facts = {
         "lavender": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "cpu": cpu_name(),
+        "cpu": get_cpu_name(),
         "cores": os.cpu_count() or 1,
         "threads": 1,
-        "versions": versions(packages),
+        "versions": get_versions(packages),
     }
     # These facts affect a single measurement; the selection of cases and solvers does not.
     identity_facts: dict[str, Any] = {
         **facts,
         "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan},
     }
-    build = build_facts()
+    build = describe_build()
     identity_facts["build"] = build
     digest = hashlib.sha256(json.dumps(identity_facts, sort_keys=True, default=str).encode()).hexdigest()[:12]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
@@ -109,24 +111,24 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
         run=digest,
         started=started,
         plan=dict(plan),
-        build=build | clock(),
-        load=load(),
+        build=build | get_processor_clock(),
+        load=get_load_average(),
         **facts,  # type: ignore[arg-type]
     )
 
 
-def load() -> float | None:
+def get_load_average() -> float | None:
     """Return the mean number of runnable processes in the last minute; None if the system does not provide it."""
     with contextlib.suppress(AttributeError, OSError):
         return float(os.getloadavg()[0])
     return None
 
 
-def running() -> float | None:
-    """Return the number of runnable processes now, including this one; other systems than Linux return `load`."""
+def count_runnable_processes() -> float | None:
+    """Return the number of runnable processes now, including this one; `get_load_average` if not on Linux."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         return float(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
-    return load()
+    return get_load_average()
 
 
 def describe_busy(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
@@ -149,9 +151,9 @@ def describe_busy(loads: Iterable[float | None], cores: int, consequence: str = 
     ).rstrip()
 
 
-def clock() -> dict[str, str]:
+def get_processor_clock() -> dict[str, str]:
     """Return the frequency of the processor and its governor, if the system provides them."""
-    mhz = _cpuinfo("cpu MHz")
+    mhz = _read_cpuinfo("cpu MHz")
     found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
     with contextlib.suppress(OSError):
         found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
@@ -159,16 +161,16 @@ def clock() -> dict[str, str]:
 
 
 @cache
-def build_facts() -> dict[str, str]:
+def describe_build() -> dict[str, str]:
     """Describe the build: commit of a checkout, hash of the kernels, compiler, flags, BLAS."""
     package = Path(__file__).resolve().parents[2]
     library = Path(str(serial.__file__))
-    found = {"commit": commit} if (commit := commit_of(package.parent)) else {}
+    found = {"commit": commit} if (commit := get_commit(package.parent)) else {}
     kernels = hashlib.sha256()
     for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
         kernels.update(path.read_bytes())
     found["kernels"] = kernels.hexdigest()[:12]
-    found |= build_of(library.read_bytes())
+    found |= read_compiler_versions(library.read_bytes())
     flags = sysconfig.get_config_var("CFLAGS")
     found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
     from threadpoolctl import threadpool_info
@@ -177,7 +179,7 @@ def build_facts() -> dict[str, str]:
     return found | {"blas": ", ".join(sorted(set(blas)))}
 
 
-def commit_of(root: Path) -> str:
+def get_commit(root: Path) -> str:
     """Return the commit of a checkout, marked if files differ from it; empty if it is not a checkout."""
     if not (root / ".git").exists():
         return ""
@@ -191,7 +193,7 @@ def commit_of(root: Path) -> str:
     return ""
 
 
-def build_of(library: bytes) -> dict[str, str]:
+def read_compiler_versions(library: bytes) -> dict[str, str]:
     """Return the compiler and the Cython version that a compiled module names, if it names them."""
     found = {}
     compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)

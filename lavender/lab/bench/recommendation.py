@@ -1,9 +1,9 @@
 """Rank solvers: for each structure and sequence, to each tolerance and within each time.
 
 To a tolerance, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
-times. Within a time, and with a budget of sweeps, they rank by the number of cases served (at most half of the start's
+times. Within a time, and with a budget of sweeps, they rank by the number of cases served (up to half of the start's
 residual is left), then by the 90th percentile of the residual; a solver is recommended only if it serves nine cases of
-ten. A case without a result in the time counts with residual 1, that of the zero impulse. A solver with a false claim
+ten. A case without a result in the time counts with residual 1, as the zero impulse. A solver with a false claim
 on one of the cases ranks behind all solvers without one.
 """
 
@@ -21,13 +21,13 @@ from lavender.lab.bench.statistics import (
     MEAN_TIME_SHIFT,
     RESIDUAL_NOISE_FACTOR,
     TIME_NOISE_FACTOR,
-    families,
-    geometric_mean,
+    collect_times_to,
+    compute_geometric_mean,
+    compute_quantile,
+    get_time_of_miss,
     get_tolerances,
+    group_cases_by_family,
     group_passes,
-    limit_of,
-    quantile,
-    times_to,
 )
 from lavender.lab.bench.store import Records
 
@@ -58,19 +58,21 @@ class Choice:
     iterations: int = 0  # of that budget, 0 without one
     overrun: float = math.nan  # 95th percentile of the call's time over its time limit
 
-    def is_for(self, share: float) -> bool:
+    def solves_share(self, share: float) -> bool:
         """Return whether it solves at least this share of the cases, and at least one case."""
         return self.solved >= max(1, share * self.cases)
 
     @classmethod
-    def of(cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any) -> Choice:
+    def from_case_values(
+        cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any
+    ) -> Choice:
         """Create it from the value of each case: a time [s] or the remaining residual [-]."""
         each = list(values.values())
         return cls(
             solver=solver,
             solved=solved,
             score=score,
-            p95=quantile(each, 0.95),
+            p95=compute_quantile(each, 0.95),
             worst=max(each),
             hardest=max(values, key=lambda c: values[c]),
             **{"cases": len(each), **more},
@@ -90,10 +92,10 @@ class Advice:
     @property
     def best(self) -> Choice | None:
         """The recommended solver; None if no solver reached the tolerance, or none serves enough cases in the time."""
-        return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.min_share) else None
+        return self.ranking[0] if self.ranking and self.ranking[0].solves_share(self.min_share) else None
 
     @property
-    def ties(self) -> tuple[str, ...]:
+    def tied_solvers(self) -> tuple[str, ...]:
         """Names of the solvers that are as good as the best, within noise."""
         return tuple(c.solver for c in self.ranking[1 : self.equal]) if self.best else ()
 
@@ -126,7 +128,7 @@ class FamilyAdvice:
     by_sweeps: Mapping[float, Advice]
 
     @property
-    def size(self) -> int:
+    def n_cases(self) -> int:
         """Number of cases."""
         return len(self.cases)
 
@@ -153,7 +155,10 @@ def recommend_from_single_runs(records: Records, times: Sequence[float] = ()) ->
                 for n, some in by_sweeps.items()
             },
         )
-        for is_sequence, families_of in ((False, families(records)), (True, group_steps(records)))
+        for is_sequence, families_of in (
+            (False, group_cases_by_family(records)),
+            (True, group_steps(records)),
+        )
         for name, cases in families_of.items()
     ]
 
@@ -192,7 +197,7 @@ def _group_runs(records: Records) -> RunGroups:
             tol, budget = (r.tol, 0) if r.mode == "tol" else (0.0, r.max_iter)
             new = _RunGroup(r.solver, f"{r.target}, {r.start}", budget, tol)
             group = groups.setdefault((r.solver, r.target, r.start), new)
-        group.runs.setdefault(r.case, []).extend([r] if r.usable else [])
+        group.runs.setdefault(r.case, []).extend([r] if r.is_usable else [])
     return groups
 
 
@@ -201,7 +206,7 @@ def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
     groups: dict[int, dict[tuple[str, str, str], _RunGroup]] = defaultdict(dict)
     for r in records:
         compared = (
-            r.order == "given" and not r.interleave_group and r.start in ("cold", "carried") and r.usable
+            r.order == "given" and not r.interleave_group and r.start in ("cold", "carried") and r.is_usable
         )
         if compared and r.mode == "budget" and counts_sweeps(r):
             start = "" if r.step < 0 else r.start
@@ -225,10 +230,10 @@ def rank_to_tolerance(
 ) -> Advice:
     """Rank the solvers that bring these cases, or steps, to a tolerance.
 
-    Steps of several sequences count together, by calls with at most this tolerance or with a budget. `groups` spares a
-    pass over the records.
+    Steps of several sequences count together, by calls with this or a tighter tolerance, or with a budget. If `groups`
+    is given, the records are not grouped again.
     """
-    limit, liars = limit_of(records), _list_false_claims(records, cases)
+    limit, liars = get_time_of_miss(records), _list_false_claims(records, cases)
     choices: list[RankedChoice] = []
     for group in _select_groups(cases, _group_runs(records) if groups is None else groups):
         if group.tol > tolerance:
@@ -236,10 +241,14 @@ def rank_to_tolerance(
         runs = {c: _select_fastest(group.runs.get(c, ()), tolerance) for c in cases}
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
-        score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
-        choice = Choice.of(group.solver, times, len(solved), score, **group.describe_budget(solved))
+        score = compute_geometric_mean(
+            [t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT
+        )
+        choice = Choice.from_case_values(
+            group.solver, times, len(solved), score, **group.describe_budget(solved)
+        )
         choices.append(((group.solver in liars, -len(solved)), choice))
-    return rank_choices(family, tolerance, _keep_best_of_each(choices), TIME_NOISE_FACTOR)
+    return rank_choices(family, tolerance, _keep_best_of_each_solver(choices), TIME_NOISE_FACTOR)
 
 
 def rank_in_time(
@@ -258,16 +267,20 @@ def rank_in_time(
         residuals = {c: 1.0 if r is None else min(max(r.relative, 1e-17), 1.0) for c, r in runs.items()}
         served = sum(x <= SERVED_RESIDUAL for x in residuals.values())
         budget = group.describe_budget([r for r in runs.values() if r is not None])
-        score = quantile(list(residuals.values()), SERVED_QUANTILE)
-        return (group.solver in liars, -served), Choice.of(group.solver, residuals, served, score, **budget)
+        score = compute_quantile(list(residuals.values()), SERVED_QUANTILE)
+        return (group.solver in liars, -served), Choice.from_case_values(
+            group.solver, residuals, served, score, **budget
+        )
 
-    choices = _keep_best_of_each(rank_group(group, limit) for group in selected)
+    choices = _keep_best_of_each_solver(rank_group(group, limit) for group in selected)
     advice = rank_choices(family, limit, choices, RESIDUAL_NOISE_FACTOR)
     # Solvers that serve fewer cases have a residual of 1 at the 90th percentile, so that noise would rank them.
     advice = replace(advice, min_share=SERVED_QUANTILE)
     if advice.best is None or math.isinf(limit):
         return advice
-    late_choices = _keep_best_of_each(rank_group(group, TIME_NOISE_FACTOR * limit) for group in selected)
+    late_choices = _keep_best_of_each_solver(
+        rank_group(group, TIME_NOISE_FACTOR * limit) for group in selected
+    )
     late = {c.solver: (key, c.score) for key, c in late_choices}
     first = min(key for key, _ in choices)
     best = min(c.score for c in advice.ranking[: advice.equal])
@@ -304,7 +317,7 @@ def choose_time_budgets(records: Records) -> tuple[float, ...]:
     """Return three decades of time [s] about the median of the fastest times to the middle tolerance."""
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
-    fastest = [min(by.values()) for by in times_to(records, tolerance).values() if by]
+    fastest = [min(by.values()) for by in collect_times_to(records, tolerance).values() if by]
     for passes in group_passes(records).values():
         reached = [
             median(w.times[start])
@@ -323,7 +336,7 @@ def counts_sweeps(r: Record) -> bool:
     return 0 < r.work.get("sweeps", 0) <= r.max_iter
 
 
-def _keep_best_of_each(choices: Iterable[RankedChoice]) -> list[RankedChoice]:
+def _keep_best_of_each_solver(choices: Iterable[RankedChoice]) -> list[RankedChoice]:
     """Keep the best entry of each solver."""
     first: dict[str, RankedChoice] = {}
     for entry in sorted(choices, key=lambda pair: (pair[0], pair[1].score)):
@@ -343,7 +356,7 @@ class Subject:
 
 
 def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
-    """Return the subject of single cases, then that of sequences, each only if there are any."""
+    """Return the subject of single cases and the subject of sequences; a subject without cases is left out."""
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
     times = tuple(times) or choose_time_budgets(records)

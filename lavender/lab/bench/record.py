@@ -31,7 +31,7 @@ def describe_target(mode: str, tol: float, max_iter: int) -> str:
 MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
 
 
-def file_name(name: str) -> str:
+def make_file_name(name: str) -> str:
     """Convert a name to one that every file system and URL fragment accepts; a hash keeps long names distinct."""
     short = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
     if len(short) <= MAX_FILE_NAME_LENGTH:
@@ -47,7 +47,7 @@ _UNPRINTABLE = re.compile(
 _ESCAPE_SEQUENCES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
-def printable(text: str, lines: bool = False) -> str:
+def escape_unprintable(text: str, lines: bool = False) -> str:
     """Replace characters that a terminal, file or page cannot show by their codes.
 
     A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With `lines`,
@@ -70,7 +70,7 @@ def printable(text: str, lines: bool = False) -> str:
 def _make_printable(value: Any, lines: bool = False) -> Any:
     """Make all texts in a value printable."""
     if isinstance(value, str):
-        return printable(value, lines)
+        return escape_unprintable(value, lines)
     if isinstance(value, Mapping):
         return {_make_printable(k): _make_printable(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -337,7 +337,7 @@ class Record(_PrintableEntry):
     @property
     def key(self) -> tuple[Any, ...]:
         """Key that is equal for records of the same measurement."""
-        return measurement_key(self)
+        return make_measurement_key(self)
 
     @property
     def target(self) -> str:
@@ -346,12 +346,12 @@ class Record(_PrintableEntry):
         return describe_target(self.mode, self.tol, self.max_iter) + order
 
     @property
-    def usable(self) -> bool:
+    def is_usable(self) -> bool:
         """Whether the run returned a finite residual and a time."""
         return math.isfinite(self.relative) and math.isfinite(self.time_min)
 
 
-def measurement_key(measurement: Any) -> tuple[Any, ...]:
+def make_measurement_key(measurement: Any) -> tuple[Any, ...]:
     """Return the key of a measurement from its `Task` or its `Record`."""
     m = measurement
     options = repr(sorted(to_jsonable(m.options).items()))

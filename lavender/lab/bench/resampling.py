@@ -26,7 +26,7 @@ from lavender.lab.bench.recommendation import (
     recommend_from_single_runs,
 )
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_tolerances, limit_of
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_time_of_miss, get_tolerances
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
@@ -57,17 +57,17 @@ class TimedCall:
     guessed: bool
 
     @property
-    def line(self) -> Record:
+    def as_record(self) -> Record:
         """A record that has the arguments of the call."""
         return next(iter(self.runs.values()))
 
     @property
-    def code(self) -> tuple[str, ...]:
+    def code_lines(self) -> tuple[str, ...]:
         """The call as lines of Python."""
-        return format_call(self.line, self.guessed)
+        return format_call(self.as_record, self.guessed)
 
     @property
-    def time(self) -> float:
+    def mean_time(self) -> float:
         """Geometric mean over the cases of the lower quartile of the repetitions [s], shifted by `MEAN_TIME_SHIFT`."""
         each = [float(np.quantile(r.times or (r.time_min,), TIME_QUANTILE)) for r in self.runs.values()]
         return float(np.exp(np.mean(np.log(np.array(each) + MEAN_TIME_SHIFT))) - MEAN_TIME_SHIFT)
@@ -90,7 +90,7 @@ class ResampledRanking:
     loss: float
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def named_calls(self) -> tuple[str, ...]:
         """The recommended solver and the equally good ones; the second one if the first is not certain."""
         solvers = [choice.solver for _, choice in self.ranking]
         others = [s for s, share in zip(solvers[1:], self.shares[1:], strict=True) if share >= EQUAL_SHARE]
@@ -124,21 +124,21 @@ def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -
         return calls
     # A batch of some of the cases cannot be compared with a call on all of them.
     complete = {
-        (f.line.solver, *sorted(f.runs)) for one in ("call", "steps") for f in select_calls(records, one)
+        (f.as_record.solver, *sorted(f.runs)) for one in ("call", "steps") for f in select_calls(records, one)
     }
-    return [f for f in calls if (f.line.solver, *sorted(f.runs)) in complete]
+    return [f for f in calls if (f.as_record.solver, *sorted(f.runs)) in complete]
 
 
 STARTS = {"cold": "cold", "carried": "warm from the previous step"}
 
 
-def _keep_best_of_each(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
+def _keep_best_of_each_solver(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
     """Keep one call of each solver: the start that brings more cases to the tolerance, then the faster one."""
     best: dict[str, TimedCall] = {}
     for call in sorted(
-        calls, key=lambda f: (sum(not r.relative <= tolerance for r in f.runs.values()), f.time)
+        calls, key=lambda f: (sum(not r.relative <= tolerance for r in f.runs.values()), f.mean_time)
     ):
-        best.setdefault(call.line.solver, call)
+        best.setdefault(call.as_record.solver, call)
     return list(best.values())
 
 
@@ -149,12 +149,12 @@ def rank_calls_to_tolerance(
 
     `cases` is the number of all cases, if calls were timed on fewer. Returns None without such a call.
     """
-    calls = _keep_best_of_each(
-        [f for f in calls if f.line.mode == "tol" and f.line.tol <= tolerance], tolerance
+    calls = _keep_best_of_each_solver(
+        [f for f in calls if f.as_record.mode == "tol" and f.as_record.tol <= tolerance], tolerance
     )
     if not calls:
         return None
-    limit, names = limit_of(records), _list_cases(calls)
+    limit, names = get_time_of_miss(records), _list_cases(calls)
     missed = np.array(
         [[c not in f.runs or not f.runs[c].relative <= tolerance for c in names] for f in calls]
     )
@@ -172,9 +172,11 @@ def rank_calls_to_tolerance(
         each = np.where(missed[i], math.inf, np.quantile(times[i], TIME_QUANTILE, axis=1))
         by_case = dict(zip(names, each.tolist(), strict=True))
         solved = int((~missed[i]).sum())
-        return Choice.of(calls[i].line.solver, by_case, solved, value, cases=max(cases, len(by_case)))
+        return Choice.from_case_values(
+            calls[i].as_record.solver, by_case, solved, value, cases=max(cases, len(by_case))
+        )
 
-    return _resample(records, calls, names, charged, missed, score, choose)
+    return _rank_by_resampling(records, calls, names, charged, missed, score, choose)
 
 
 def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[FamilyAdvice]:
@@ -212,10 +214,15 @@ def recommend_for_cases(
         return alone
     hows = {c.solver: c.how for c in alone.ranking}
     interleaved = [
-        replace(c, how=f"{f.line.target}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
+        replace(
+            c,
+            how=f"{f.as_record.target}, {f.as_record.start}"
+            if f.as_record.step >= 0
+            else hows.get(c.solver, ""),
+        )
         for f, c in resampled.ranking
     ]
-    named = resampled.named
+    named = resampled.named_calls
     interleaved.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(interleaved))
     known = {c.solver for c in interleaved}
     rest = [c for c in alone.ranking if c.solver not in known]
@@ -231,7 +238,9 @@ def rank_calls_in_time(
     start's residual. Returns None if no call has a budget or a shorter time limit.
     """
     calls = [
-        f for f in calls if f.line.mode == "budget" or (f.line.mode == "time" and f.line.time_limit < limit)
+        f
+        for f in calls
+        if f.as_record.mode == "budget" or (f.as_record.mode == "time" and f.as_record.time_limit < limit)
     ]
     if not calls:
         return None
@@ -250,8 +259,8 @@ def rank_calls_in_time(
 
     def choose(i: int, value: float) -> Choice:
         """Create the choice of call i with the score `value`."""
-        line, each = calls[i].line, np.quantile(in_time[i], IN_TIME_SHARE, axis=1, method="lower")
-        return Choice.of(
+        line, each = calls[i].as_record, np.quantile(in_time[i], IN_TIME_SHARE, axis=1, method="lower")
+        return Choice.from_case_values(
             line.solver,
             dict(zip(names, each.tolist(), strict=True)),
             int(served[i].sum()),
@@ -262,12 +271,12 @@ def rank_calls_in_time(
             overrun=float(np.nanquantile(times[i], IN_TIME_SHARE, method="lower")) / limit,
         )
 
-    return _resample(records, calls, names, in_time, ~served, score, choose)
+    return _rank_by_resampling(records, calls, names, in_time, ~served, score, choose)
 
 
 def compute_serving_time(call: TimedCall) -> float:
     """Return the time [s] in which a call with a budget serves nine cases of ten (`rank_calls_in_time`); else inf."""
-    if call.line.mode != "budget":
+    if call.as_record.mode != "budget":
         return math.inf
     times = _stack_repetitions([call], list(call.runs), lambda r: r.times or (r.time_min,))[0]
     residuals = np.array([r.relative for r in call.runs.values()])
@@ -323,7 +332,7 @@ def _draw_samples(
             yield np.array(case_indices), np.array(repetitions)
 
 
-def _resample(
+def _rank_by_resampling(
     records: Records,
     calls: Sequence[TimedCall],
     names: Sequence[str],
@@ -359,8 +368,8 @@ def _resample(
         key=lambda i: (
             shares[i] < CERTAIN_SHARE * shares.max(),
             -shares[i] if shares[i] < CERTAIN_SHARE * shares.max() else 0.0,
-            calls[i].line.solver != PREFERRED_SOLVER,
-            calls[i].line.solver,
+            calls[i].as_record.solver != PREFERRED_SOLVER,
+            calls[i].as_record.solver,
             scores[i],
         ),
     )

@@ -9,8 +9,8 @@ solved from a cold start by both solvers to the same judged residual:
 Building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of several repetitions
 that alternate.
 
-`measure_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the impulses of the
-last step, matched by key; MuJoCo has its own tolerance.
+`measure_model_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the
+impulses of the last step, matched by key. MuJoCo has its own tolerance.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lavender.io import mujoco as adapter
 from lavender.io.recording import make_controller
 from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Solution
-from lavender.lab.bench.running.runner import carry
+from lavender.lab.bench.running.runner import carry_impulses
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
@@ -96,7 +96,7 @@ def copy_cold(problem: Problem) -> Problem:
     return replace(problem, guess=None, copy=False)
 
 
-def min_time(run: Callable[[], Any], repeats: int = N_REPEATS) -> float:
+def measure_min_time(run: Callable[[], Any], repeats: int = N_REPEATS) -> float:
     """Return the minimum time of several runs [s]."""
     best = np.inf
     for _ in range(repeats):
@@ -119,7 +119,7 @@ def time_engine(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
         accepted = tolerance, residual(problem, adapter.impulse(model, data)).relative
         if accepted[1] <= TARGET_RESIDUAL:
             break
-    seconds = min_time(lambda: mj.mj_fwdConstraint(model, data), 4 * N_REPEATS)
+    seconds = measure_min_time(lambda: mj.mj_fwdConstraint(model, data), 4 * N_REPEATS)
     return accepted[0], seconds, accepted[1]
 
 
@@ -147,7 +147,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
     return single_time, float(batch_time), float(residual_found)
 
 
-def _recorded_problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
+def _iterate_problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
     """Yield number, data and problem of each `every`-th step under random controls; None for problems without rows."""
     data, drive = mj.MjData(model), make_controller(model, "random", 0)
     for step in range(steps):
@@ -163,11 +163,11 @@ def _recorded_problems(mj: Any, path: Path, model: Any, steps: int, every: int) 
             )
 
 
-def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
+def measure_model(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     """Measure steps of one model under random controls, except those without constraints or with a zero solution."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
-    for step, data, problem in _recorded_problems(mj, path, model, 20 * steps * every, every):
+    for step, data, problem in _iterate_problems(mj, path, model, 20 * steps * every, every):
         if problem is None or get_reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = time_engine(mj, model, data, problem)
@@ -201,18 +201,18 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     return out
 
 
-def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
+def measure_model_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
     """Measure consecutive steps of one model under random controls, each solved warm by both solvers."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     out: list[WarmStep] = []
     before: tuple[Problem, Any] | None = None
-    for step, data, problem in _recorded_problems(mj, path, model, steps, 1):
+    for step, data, problem in _iterate_problems(mj, path, model, steps, 1):
         if problem is None:
             before = None
             continue
-        engine = min_time(partial(mj.mj_fwdConstraint, model, data))
-        start = problem.start() if before is None else carry(*before, problem)
+        engine = measure_min_time(partial(mj.mj_fwdConstraint, model, data))
+        start = problem.start() if before is None else carry_impulses(*before, problem)
         ours, solution = time_one_call(problem, start)
         before = problem, solution.impulse
         if get_reference(problem)[1] < 1e-9:

@@ -1,6 +1,6 @@
 """Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
-The time to a tolerance is the shortest time of all runs with a judged residual of at most this tolerance. Runs are
+The time to a tolerance is the shortest time of all runs with a judged residual of up to this tolerance. Runs are
 compared by the residual that they reached, not by the tolerance that they were given.
 """
 
@@ -27,7 +27,7 @@ TIME_NOISE_FACTOR = (
 RESIDUAL_NOISE_FACTOR = (
     2.0  # Residuals within this factor are equal: one run more or less in a time changes as much.
 )
-MEAN_TIME_SHIFT = 1e-5  # s, added to times in geometric means: below it, Python's share of a call decides.
+MEAN_TIME_SHIFT = 1e-5  # [s] Added to times in geometric means, since Python dominates shorter calls.
 
 
 def get_tolerances(records: Records) -> tuple[float, ...]:
@@ -38,7 +38,7 @@ def get_tolerances(records: Records) -> tuple[float, ...]:
     return tuple(sorted({r.tol for r in records if r.mode == "tol"}, reverse=True)) or (1e-3, 1e-6, 1e-9)
 
 
-def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
+def group_runs_by_pair(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
     """Group runs in the given order of blocks by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
@@ -47,7 +47,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
     return dict(groups)
 
 
-def families(records: Records) -> dict[str, list[str]]:
+def group_cases_by_family(records: Records) -> dict[str, list[str]]:
     """Group cases by structure. A case is in the family of every word that describes it.
 
     A structure with cases of several laws is a family for each law: "pile, coulomb". Words that describe the same
@@ -79,7 +79,7 @@ def drop_idle_cases(records: Records) -> Records:
     if not idle:
         return records
     remaining = (r for r in records if r.case not in idle)
-    return records.having(remaining, lambda entry: getattr(entry, "case", None) not in idle)
+    return records.with_records(remaining, lambda entry: getattr(entry, "case", None) not in idle)
 
 
 # -- single cases ------------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class Spread:
     roundoff_floor: float = 0.0  # Residuals below it are rounding errors.
 
     @property
-    def factor(self) -> float:
+    def worst_to_best_ratio(self) -> float:
         """Ratio of the worst to the best order, with residuals below the floor raised to it."""
         values = [
             max(v, self.roundoff_floor) for v in self.by_order.values() if max(v, self.roundoff_floor) > 0.0
@@ -198,12 +198,12 @@ class Spread:
         return max(values) / min(values) if values else 1.0
 
 
-def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
+def compute_reaches(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
     """Return one row for each case, solver and start, in the order of the records."""
     tolerances = get_tolerances(records) if tolerances is None else tuple(tolerances)
     out = []
-    for (case, solver, start), group in pairs(records).items():
-        good = [r for r in group if r.usable]
+    for (case, solver, start), group in group_runs_by_pair(records).items():
+        good = [r for r in group if r.is_usable]
         best = min(good, key=lambda r: (r.relative, r.time_min), default=None)
         to_tolerance = [r for r in group if r.mode == "tol"] or group
         last = to_tolerance[-1]
@@ -229,16 +229,16 @@ def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list
     return out
 
 
-def _is_again(r: Record) -> bool:
+def _repeats_earlier_run(r: Record) -> bool:
     """Return whether an interleaved run repeats an earlier one; runs with a time limit have no earlier one."""
     return bool(r.interleave_group) and r.mode != "time"
 
 
-def failures(records: Records) -> list[Record]:
+def list_failures(records: Records) -> list[Record]:
     """Return runs that missed their tolerance above the round-off floor, crashes, and false claims."""
     out = []
     for r in records:
-        if _is_again(r):
+        if _repeats_earlier_run(r):
             continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.roundoff_floor)
         proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
@@ -248,7 +248,7 @@ def failures(records: Records) -> list[Record]:
     return out
 
 
-def difficulties(records: Records) -> list[Difficulty]:
+def compute_difficulties(records: Records) -> list[Difficulty]:
     """Return the difficulty of each case, from runs with a cold start."""
     out = []
     for name, info in records.cases.items():
@@ -278,11 +278,11 @@ def difficulties(records: Records) -> list[Difficulty]:
     return out
 
 
-def claims(records: Records) -> list[Claims]:
+def count_claims(records: Records) -> list[Claims]:
     """Count the correct and wrong claims of each solver."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        runs = [r for r in records if r.solver == solver and not _is_again(r)]
+        runs = [r for r in records if r.solver == solver and not _repeats_earlier_run(r)]
         to_tolerance = [r for r in runs if r.mode == "tol"]
         out.append(
             Claims(
@@ -298,7 +298,7 @@ def claims(records: Records) -> list[Claims]:
     return out
 
 
-def spreads(records: Records) -> list[Spread]:
+def compute_order_spreads(records: Records) -> list[Spread]:
     """Return the residual of each sweep order for budgets that were run in several orders."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
@@ -312,7 +312,7 @@ def spreads(records: Records) -> list[Spread]:
     ]
 
 
-def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
+def group_runs_by_budget(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
     """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
@@ -352,7 +352,7 @@ class Change:
         return "faster" if self.new < self.old else "slower"
 
 
-def changes(old: Records, new: Records) -> list[Change]:
+def compare_times(old: Records, new: Records) -> list[Change]:
     """Compare times to each tolerance of two runs, on cases with the same numbers in both.
 
     Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
@@ -360,25 +360,25 @@ def changes(old: Records, new: Records) -> list[Change]:
     """
     tolerances = get_tolerances(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
-    before = {(r.case, r.solver, r.start): r for r in reaches(old, tolerances)}
+    before = {(r.case, r.solver, r.start): r for r in compute_reaches(old, tolerances)}
     jitter: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
     for records in (old, new):
-        for key, group in pairs(records).items():
+        for key, group in group_runs_by_pair(records).items():
             for r in group:
-                if r.usable and r.time_min > 0.0:
+                if r.is_usable and r.time_min > 0.0:
                     jitter[key] = max(jitter[key], r.time_median / r.time_min)
     out = []
-    for row in reaches(new, tolerances):
+    for row in compute_reaches(new, tolerances):
         key = (row.case, row.solver, row.start)
         if row.case not in same or key not in before:
             continue
-        worth = drift(old, new, row.case)
+        worth = compute_machine_drift(old, new, row.case)
         noise = max(TIME_NOISE_FACTOR, 1.0 + 2.0 * (jitter[key] - 1.0))
         out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in tolerances]
     return out
 
 
-def drift(old: Records, new: Records, case: str = "") -> float:
+def compute_machine_drift(old: Records, new: Records, case: str = "") -> float:
     """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
     medians = []
     for records in (old, new):
@@ -398,23 +398,23 @@ class Profile:
     measure: str = "time"
 
 
-def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
+def compute_geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
     """Return exp(mean(log(x + shift))) - shift; nan without values."""
     if not values:
         return math.nan
     return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
 
 
-def quantile(values: Sequence[float], q: float) -> float:
+def compute_quantile(values: Sequence[float], q: float) -> float:
     """Return the smallest value that at least a share q of the values does not exceed."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]
 
 
-def times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+def collect_times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the time [s] to a tolerance from a cold start by case and solver, inf if missed, without refused cases."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
-    for reach in reaches(records, [tolerance]):
+    for reach in compute_reaches(records, [tolerance]):
         if reach.start == "cold":
             out[reach.case][reach.solver] = reach.times[tolerance]
     return out
@@ -437,9 +437,13 @@ def count_matrix_passes(record: Record) -> float:
 def matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
 
-    Only solvers whose runs do no other work are compared (`count_matrix_passes`); fewer than one pass counts as one.
+    Solvers with other work in their runs are left out (`count_matrix_passes`). Less than one pass counts as one.
     """
-    groups = {k[:2]: [r for r in group if r.usable] for k, group in pairs(records).items() if k[2] == "cold"}
+    groups = {
+        k[:2]: [r for r in group if r.is_usable]
+        for k, group in group_runs_by_pair(records).items()
+        if k[2] == "cold"
+    }
     excluded = {
         s for (_, s), group in groups.items() if any(math.isnan(count_matrix_passes(r)) for r in group)
     }
@@ -451,28 +455,28 @@ def matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, 
     return out
 
 
-def limit_of(records: Records) -> float:
+def get_time_of_miss(records: Records) -> float:
     """Return the time [s] that a missed tolerance counts with: the time limit."""
     return max((r.time_limit for r in records), default=1.0)
 
 
-def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
+def compute_geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
     """Return (shifted geometric mean [s], solved, cases) by law, tolerance and solver; a miss takes the time limit.
 
     A law's table has the solvers that accept every case of it.
     """
-    limit = limit_of(records)
+    limit = get_time_of_miss(records)
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
-    for law, cases in _laws(records).items():
+    for law, cases in _group_cases_by_law(records).items():
         out[law] = {}
         for tolerance in get_tolerances(records):
-            times = times_to(records, tolerance)
+            times = collect_times_to(records, tolerance)
             by: dict[str, tuple[float, int, int]] = {}
-            for solver in _complete_solvers(times, cases):
+            for solver in _select_solvers_with_all_times(times, cases):
                 t = [times[c][solver] for c in cases]
                 solved = sum(map(math.isfinite, t))
                 by[solver] = (
-                    geometric_mean([x if math.isfinite(x) else limit for x in t], MEAN_TIME_SHIFT),
+                    compute_geometric_mean([x if math.isfinite(x) else limit for x in t], MEAN_TIME_SHIFT),
                     solved,
                     len(cases),
                 )
@@ -503,14 +507,14 @@ class Backend:
     wins: int
 
 
-def backends(records: Records) -> list[Backend]:
+def compare_backend_times(records: Records) -> list[Backend]:
     """Return solvers with both times, sorted by the time of their own interface."""
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
     best: dict[tuple[str, str], Record] = {}
     for r in records:
         key = (r.solver, r.case)
-        reached = r.usable and r.relative <= tolerance and r.start == "cold" and not r.interleave_group
+        reached = r.is_usable and r.relative <= tolerance and r.start == "cold" and not r.interleave_group
         if reached and (key not in best or r.time_min < best[key].time_min):
             best[key] = r
     ours: dict[str, float] = {}
@@ -521,21 +525,21 @@ def backends(records: Records) -> list[Backend]:
     for solver in sorted({r.solver for r in best.values() if r.backend_time_min is not None}):
         mine = {c: r for (s, c), r in best.items() if s == solver and r.backend_time_min is not None}
         backend_times = {c: r.backend_time_min or 0.0 for c, r in mine.items()}
-        total_time = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
+        total_time = compute_geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
         wins = sum(t < ours.get(c, math.inf) for c, t in backend_times.items())
         out.append(
             Backend(
                 solver,
                 len(mine),
                 total_time,
-                geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT),
+                compute_geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT),
                 wins,
             )
         )
     return sorted(out, key=lambda b: b.backend_time)
 
 
-def _laws(records: Records) -> dict[str, list[str]]:
+def _group_cases_by_law(records: Records) -> dict[str, list[str]]:
     """Group the cases that ran by law."""
     ran = {r.case for r in records if r.step < 0}
     out: dict[str, list[str]] = defaultdict(list)
@@ -545,13 +549,15 @@ def _laws(records: Records) -> dict[str, list[str]]:
     return dict(out)
 
 
-def _complete_solvers(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> list[str]:
+def _select_solvers_with_all_times(
+    times: Mapping[str, Mapping[str, float]], cases: Sequence[str]
+) -> list[str]:
     """Return the solvers that have a time on every case."""
     everyone = sorted({s for c in cases for s in times.get(c, {})})
     return [s for s in everyone if all(s in times.get(c, {}) for c in cases)]
 
 
-def profiles(records: Records, measure: str = "time") -> list[Profile]:
+def compute_profiles(records: Records, measure: str = "time") -> list[Profile]:
     """Compute the share of cases that a solver solves within `ratio` times the best; a miss is infinite.
 
     The cases have one law and are of one run (`Records.latest`); a case that no solver solves is a miss of all.
@@ -564,9 +570,9 @@ def profiles(records: Records, measure: str = "time") -> list[Profile]:
     """
     check_choice("measure", measure, ("time", "work"))
     out = []
-    for law, cases in _laws(records).items():
+    for law, cases in _group_cases_by_law(records).items():
         for tolerance in get_tolerances(records):
-            times = (times_to if measure == "time" else matrix_passes_to)(records, tolerance)
+            times = (collect_times_to if measure == "time" else matrix_passes_to)(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []
@@ -600,13 +606,13 @@ class Robustness:
     hardest: str  # case with the largest residual of its best run
 
 
-def robustness(records: Records) -> list[Robustness]:
+def compute_robustness(records: Records) -> list[Robustness]:
     """Count solved cases, false claims and crashes by structure and solver, with residuals by budget."""
     tolerances = get_tolerances(records)
-    groups = {k[:2]: g for k, g in pairs(records).items() if k[2] == "cold"}
+    groups = {k[:2]: g for k, g in group_runs_by_pair(records).items() if k[2] == "cold"}
     solvers = sorted({solver for _, solver in groups})
     out = []
-    for family, cases in families(records).items():
+    for family, cases in group_cases_by_family(records).items():
         for solver in solvers:
             groups_of_case = {c: groups[c, solver] for c in cases if (c, solver) in groups}
             if not groups_of_case:
@@ -626,7 +632,7 @@ def robustness(records: Records) -> list[Robustness]:
                     reached={x: sum(v <= x for v in best.values()) for x in tolerances},
                     wrong=sum(bool(r.status_conflict) for r in runs),
                     died=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
-                    budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
+                    budgets={n: (median(v), compute_quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
                     hardest=max(best, key=lambda c: best[c]),
                 )
             )
@@ -662,16 +668,16 @@ class Pass:
         return "carried" if "carried" in self.times else "cold"
 
     @property
-    def time(self) -> dict[str, float]:
+    def total_times(self) -> dict[str, float]:
         """Time of all steps [s] by start."""
         return {start: sum(times) for start, times in self.times.items()}
 
-    def middle(self, start: str) -> float:
+    def get_median_residual(self, start: str) -> float:
         """Median residual over the steps."""
         return median(self.residuals[start]) if self.residuals.get(start) else math.nan
 
     @property
-    def gain(self) -> float:
+    def carried_gain(self) -> float:
         """Median over the steps of cold over carried residual; nan without both."""
         cold, carried = self.residuals.get("cold"), self.residuals.get("carried")
         if not cold or not carried:
@@ -681,7 +687,7 @@ class Pass:
         return median(c / w for c, w in pairs) if pairs else math.nan
 
 
-def passes(records: Records) -> list[Pass]:
+def group_runs_by_pass(records: Records) -> list[Pass]:
     """Group the runs over sequences: times, iterations and residuals of each step, carried and cold."""
     groups: dict[tuple[str, str, str, float, int], dict[str, list[Record]]] = defaultdict(
         lambda: defaultdict(list)
@@ -700,7 +706,7 @@ def passes(records: Records) -> list[Pass]:
                 *key,
                 steps=steps[key[0]],
                 left_out=len(lost.get(key[0], ())),
-                times={s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
+                times={s: tuple(_get_step_time(r) for r in g) for s, g in by_start.items()},
                 iterations={s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 residuals={s: tuple(r.relative for r in g) for s, g in by_start.items()},
             )
@@ -708,7 +714,7 @@ def passes(records: Records) -> list[Pass]:
     return out
 
 
-def _step_time(r: Record) -> float:
+def _get_step_time(r: Record) -> float:
     """Return the time of a step: its limit if it has no result."""
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
@@ -716,6 +722,6 @@ def _step_time(r: Record) -> float:
 def group_passes(records: Records) -> dict[str, list[Pass]]:
     """Group passes by sequence."""
     out: dict[str, list[Pass]] = defaultdict(list)
-    for one in passes(records):
+    for one in group_runs_by_pass(records):
         out[one.sequence].append(one)
     return dict(out)

@@ -21,9 +21,9 @@ from lavender.base.errors import InputError
 from lavender.io.stored import (
     MAX_BYTES,
     as_path,
-    destination,
     lock_output,
     make_folder,
+    resolve_destination,
     write_atomically,
     write_text,
 )
@@ -95,7 +95,7 @@ class Records:
     def __len__(self) -> int:
         return len(self.records)
 
-    def latest(self) -> Records:
+    def select_latest_run(self) -> Records:
         """Return the records of the run that wrote last, of cases with unchanged numbers.
 
         Times are compared only within one run, and a file that has changed is another problem.
@@ -111,9 +111,11 @@ class Records:
         newest = next((r.interleave_group for r in reversed(mine) if r.interleave_group), "")
         mine = [r for r in mine if r.interleave_group in ("", newest)]
         cases = {r.case for r in mine}
-        return self.having(mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases))
+        return self.with_records(
+            mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases)
+        )
 
-    def having(
+    def with_records(
         self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
     ) -> Records:
         """Return other records of the same runs, with the descriptions and notes that `keep` accepts."""
@@ -136,12 +138,12 @@ class Records:
         for name in wanted:
             if name not in known:
                 raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
-        return self.having(
+        return self.with_records(
             (r for r in self.records if r.solver in wanted),
             lambda e: not isinstance(e, Skip) or e.solver in ("", *wanted),
         )
 
-    def success(self, record: Record) -> bool | None:
+    def is_successful(self, record: Record) -> bool | None:
         """Return whether a run succeeded, or None if the zero impulse solves the case."""
         info = self.cases.get(record.case)
         return None if info is not None and info.nothing_to_do else record.success
@@ -153,7 +155,7 @@ class Records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
             row = {f.name: getattr(r, f.name) for f in fields(r) if f.name != "sha"}
             row |= {
-                "success": self.success(r),
+                "success": self.is_successful(r),
                 "nothing_to_do": bool(info and info.nothing_to_do),
                 "law": info.law if info else "",
                 "rows": info.rows if info else 0,
@@ -204,12 +206,12 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, self._real = as_path(path), destination(path)
+        self.path, self._real = as_path(path), resolve_destination(path)
         make_folder(self.path.parent)
         with contextlib.ExitStack() as held:
             held.enter_context(lock_output(self.path))
             try:
-                self.records = read(self.path) if self.path.exists() else Records()
+                self.records = read_records(self.path) if self.path.exists() else Records()
                 _cut_torn_line(self.path)
                 self.file = self.path.open("a", encoding="utf-8")
             except OSError as error:
@@ -260,7 +262,7 @@ class Store:
 
 
 @contextlib.contextmanager
-def opened(store: Store | str | Path | None) -> Iterator[Store | None]:
+def open_store(store: Store | str | Path | None) -> Iterator[Store | None]:
     """Yield a store, or open the store of a path and close it at the end."""
     if store is None or isinstance(store, Store):
         yield store
@@ -279,8 +281,8 @@ def _cut_torn_line(path: Path) -> None:
             f.truncate(whole)
 
 
-def read(path: str | Path) -> Records:
-    """Read a `records.jsonl`, or that of a folder, without an incomplete last line.
+def read_records(path: str | Path) -> Records:
+    """Read a file `records.jsonl`, or the one in a folder, without an incomplete last line.
 
     Raises
     ------
@@ -293,7 +295,7 @@ def read(path: str | Path) -> Records:
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is not a file; a records.jsonl is needed")
     found = Records(source=str(path))
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(_read_lines(path), 1):
         if not line.strip():
             continue
         try:
@@ -316,7 +318,7 @@ def read(path: str | Path) -> Records:
     return found
 
 
-def _lines(path: Path) -> Iterator[str]:
+def _read_lines(path: Path) -> Iterator[str]:
     """Yield the lines of a file without byte order marks, and without an incomplete last line."""
     try:
         size = path.stat().st_size
@@ -370,7 +372,7 @@ def write_json(records: Records, path: str | Path) -> None:
         "cases": as_dicts(records.cases.values()),
         "skips": as_dicts(records.skips),
         "records": [
-            {**entry, "success": records.success(r)}
+            {**entry, "success": records.is_successful(r)}
             for entry, r in zip(as_dicts(records.records), records.records, strict=True)
         ],
     }

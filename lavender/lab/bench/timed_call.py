@@ -11,7 +11,7 @@ COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # removes the guess of a p
 CARRIED_START = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
-    "    start = problem.start() if impulse is None else lv.bench.carry(before, impulse, problem)",
+    "    start = problem.start() if impulse is None else lv.bench.carry_impulses(before, impulse, problem)",
 )
 
 
@@ -37,7 +37,7 @@ def make_call_arguments(measurement: Any, iterations: int) -> dict[str, Any]:
     return arguments
 
 
-def _exact(x: float, short: str) -> str:
+def _format_exactly(x: float, short: str) -> str:
     """Return a number's short form if it is exact, else all of its digits."""
     return short if float(short) == x else repr(x)
 
@@ -49,7 +49,7 @@ def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
     """
     arguments = make_call_arguments(record, record.iterations)
     text = {
-        name: str(x) if name == "max_iter" else _exact(x, format_tolerance(x) if x else "0")
+        name: str(x) if name == "max_iter" else _format_exactly(x, format_tolerance(x) if x else "0")
         for name, x in arguments.items()
     }
     argument_text = ", ".join(f"{name}={value}" for name, value in text.items())

@@ -1,6 +1,6 @@
 """Possible mistakes in a problem's data, reported as diagnostics and never as errors.
 
-A solver converges on a problem whose normal points the wrong way as well as on any other. `diagnose` checks relations
+A solver also converges on a problem in which a normal points the wrong way. `diagnose` checks relations
 that hold for the data of real bodies:
 
     centres     c_b - c_a = arm_a - arm_b for every contact of a pair; n points from a to b:
@@ -29,7 +29,7 @@ from lavender.problem import Problem, check_problem
 
 __all__ = ["Diagnostic", "diagnose"]
 
-CHECKS = (*blocks.CHECKS, *motion.CHECKS, *bodies.CHECKS, blocks.conflict)
+CHECKS = (*blocks.CHECKS, *motion.CHECKS, *bodies.CHECKS, blocks.diagnose_conflict)
 
 
 def diagnose(
@@ -75,14 +75,14 @@ def diagnose(
     ['friction', 'tangents first']
     """
     check_problem(problem)
-    state = motion.state_before(problem, velocity, gap, dt)
+    state = motion.check_state_arguments(problem, velocity, gap, dt)
     solution = problem.guess if impulse is None else problem.impulse_array(impulse)
     with np.errstate(all="ignore"):  # comparisons with numbers beyond float64 are false
         cached = problem.derived.cache.get(__name__)
         if cached is None:
             cached = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))
         diagnostics = [replace(s, data=dict(s.data)) for s in cached]
-        diagnostics += motion.check_state(problem, *state)
+        diagnostics += motion.diagnose_state(problem, *state)
         if solution is not None:
-            diagnostics += blocks.check_impulses(problem, solution)
+            diagnostics += blocks.diagnose_impulses(problem, solution)
     return tuple(diagnostics)

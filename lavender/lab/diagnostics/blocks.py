@@ -8,20 +8,20 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import residual
-from lavender.lab.diagnostics.bodies import are_grouped
+from lavender.lab.diagnostics.bodies import are_normals_first
 from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
-from lavender.solvers.certify import conflict_of
+from lavender.solvers.certify import find_conflict
 
-MAX_PLAUSIBLE_FRICTION = 10.0  # -, no pair of materials has a larger friction coefficient
+MAX_PLAUSIBLE_FRICTION = 10.0  # [-] No pair of materials has a larger friction coefficient.
 MAX_CONFLICT_ROWS = (
     1000  # Larger problems are not searched for a proof that no solution exists: it takes seconds.
 )
-CONFLICT_TOL = 1e-6  # -, the proof must exclude answers with this relative residual
+CONFLICT_TOL = 1e-6  # [-] The proof must exclude answers with this relative residual.
 
 
-def friction(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if friction coefficients exceed those of materials."""
+def diagnose_friction(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if friction coefficients exceed the values of materials."""
     c = p.cones
     mu = c.coefficients.max(axis=1)
     blocks = np.flatnonzero(mu > MAX_PLAUSIBLE_FRICTION)
@@ -32,7 +32,7 @@ def friction(p: Problem) -> Iterator[Diagnostic]:
         )
 
 
-def keys(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_keys(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if several blocks have the same key."""
     if p.key is None:
         return
@@ -44,13 +44,13 @@ def keys(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "duplicate keys", reason + f"the key of block {first[worst]}", blocks)
 
 
-def order_of_rows(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_row_order(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if the rows of contacts do not have the order normal, tangent, tangent."""
     c = p.cones
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
-    if are_grouped(p):
+    if are_normals_first(p):
         reason = "J has the rows of rigid bodies if all normals come first; the order is contact by contact: normal, "
         yield make_diagnostic(
             p, "all normals first", reason + "tangent, tangent, then the next contact", full
@@ -83,7 +83,7 @@ def order_of_rows(p: Problem) -> Iterator[Diagnostic]:
         )
 
 
-def duplicate_rows(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about contacts with equal rows, or with opposite rows that cannot both hold."""
     c = p.cones
     contacts = np.flatnonzero(c.is_contact)
@@ -112,7 +112,7 @@ def duplicate_rows(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "opposed normals", reason, opposed)
 
 
-def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
+def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
     """Yield a diagnostic if impulses (m,) [N s] are implausibly large."""
     r = residual(p, impulse)
     b = float(np.max(np.abs(p.b), initial=0.0))
@@ -127,7 +127,7 @@ def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
         return
     row_velocity = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)
     i = int(np.argmax(row_velocity))
-    # At the foot of a stack of n bodies, impulses are n times those of one body.
+    # At the foot of a stack of n bodies, impulses are n times as large as for one body.
     if row_velocity[i] > 1e4 * b * max(1.0, p.m / 100):
         reason = f"an impulse of {impulse[i]:.3g} N s changes its row by {row_velocity[i]:.3g} m/s, while b is at most "
         yield make_diagnostic(
@@ -139,11 +139,11 @@ def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
         )
 
 
-def conflict(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic that names the conflicting blocks if the problem provably has no solution."""
     if not 0 < p.m <= MAX_CONFLICT_ROWS or not np.isfinite(p.b).all():
         return
-    proof = conflict_of(p, CONFLICT_TOL)
+    proof = find_conflict(p, CONFLICT_TOL)
     if proof is not None:
         law = "Of the convex relaxation, " if p.law == "coulomb" else ""
         reason = law + proof.proof.message + (f"; {proof.advice}" if proof.advice else "")
@@ -153,4 +153,4 @@ def conflict(p: Problem) -> Iterator[Diagnostic]:
         )
 
 
-CHECKS = (friction, keys, order_of_rows, duplicate_rows)
+CHECKS = (diagnose_friction, diagnose_keys, diagnose_row_order, diagnose_duplicate_contacts)

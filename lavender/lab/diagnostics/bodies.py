@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
@@ -25,15 +25,15 @@ MAX_CENTRE_DISTANCE = (
 )
 
 
-def bodies_of(p: Problem) -> Rows | None:
+def reconstruct_bodies(p: Problem) -> Rows | None:
     """Return the contacts as `Rows`, also for J and M of free rigid bodies; None if they are not rigid bodies."""
     if __name__ not in p.derived.cache:
-        p.derived.cache[__name__] = _bodies_of(p)
+        p.derived.cache[__name__] = _reconstruct_bodies(p)
     return p.derived.cache[__name__]
 
 
-def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
-    """Compute `bodies_of`. `rows` (c, 3): rows of J of each contact, if they differ from those of the cones."""
+def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+    """Compute the result of `reconstruct_bodies`; `rows` (c, 3): rows of J of each contact, if not the cones'."""
     g, c = p.generalized, p.cones
     contact = c.is_contact
     if g is None or g.nv > MAX_DENSE_VELOCITIES or not contact.any() or np.any(c.n_tangents[contact] != 2):
@@ -42,7 +42,7 @@ def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | N
         rows = c.ptr[:-1][contact][:, None] + np.arange(3)
     mass, part = g.mass.toarray(), g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
-    for j in free_bodies(mass):  # the angular velocity of a ball has equal masses, too
+    for j in find_free_bodies(mass):  # the angular velocity of a ball has equal masses, too
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
             six.append(np.arange(j, j + 6))
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
@@ -71,26 +71,26 @@ def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | N
     )  # fmt: skip
 
 
-def are_grouped(p: Problem) -> bool:
+def are_normals_first(p: Problem) -> bool:
     """Return whether J has the rows of rigid bodies with all normals first, and not in the order of the cones."""
     contact = p.cones.is_contact
     k = int(np.count_nonzero(contact))
     if (
         p.generalized is None
         or k < 2
-        or bodies_of(p) is not None
+        or reconstruct_bodies(p) is not None
         or 3 * k != np.count_nonzero(p.cones.contact_rows)
     ):
         return False
     first = int(p.cones.ptr[:-1][contact][0])
     i = np.arange(k)[:, None]
     each, alike = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
-    return any(_bodies_of(p, first + order) is not None for order in (each, alike))
+    return any(_reconstruct_bodies(p, first + order) is not None for order in (each, alike))
 
 
-def geometry(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about normals, arms and centres that contradict each other."""
-    r = bodies_of(p)
+    r = reconstruct_bodies(p)
     if r is None or not r.n_contacts:
         return
     blocks = np.flatnonzero(p.cones.is_contact)
@@ -114,7 +114,7 @@ def geometry(p: Problem) -> Iterator[Diagnostic]:
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
         yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
     if p.rows is None:
-        return  # `blocks.duplicate_rows` compares the rows of J
+        return  # `blocks.diagnose_duplicate_contacts` compares the rows of J
     again, opposed = _find_coincident(r, size)
     if len(again):
         reason = f"{len(again)} contacts are at the position of another contact of the pair"
@@ -123,7 +123,7 @@ def geometry(p: Problem) -> Iterator[Diagnostic]:
         reason = "two contacts of a pair at one position have opposite normals"
         yield make_diagnostic(p, "opposed normals", reason, blocks[opposed])
     moving = np.flatnonzero((a >= 0) & (b >= 0))
-    off = _centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    off = _compute_centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
     wrong = moving[off > MAX_CENTRE_DISTANCE * size[moving]]
     if len(wrong) and len(wrong) <= 0.2 * len(moving):
         i = int(wrong[0])
@@ -159,7 +159,7 @@ def _find_coincident(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]
     return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
 
 
-def _centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
+def _compute_centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
     """Return |c_b - c_a - between| (e,) [m] for the centres c (n, 3) that minimise the sum of these distances.
 
     The minimum of a sum of distances isolates a few wrong pairs. Iteratively reweighted least squares, 8 iterations.
@@ -183,15 +183,15 @@ def _centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
     for _ in range(8):
         entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
         normal = sp.csc_array((entries, positions), shape=(n, n))
-        centre = sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
+        centre = factor_sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
         off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
         weight = 1.0 / (off + 1e-4)
     return scale * off
 
 
-def masses(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about masses and inertias that no real body has."""
-    r = bodies_of(p)
+    r = reconstruct_bodies(p)
     if r is None or not r.n_bodies:
         return
     turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
@@ -200,7 +200,7 @@ def masses(p: Problem) -> Iterator[Diagnostic]:
         reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
         yield make_diagnostic(p, "masses", reason, bodies=still.tolist())
     eigen = np.linalg.eigvalsh(r.inv_inertia)
-    size = _sizes(r)
+    size = _compute_longest_arms(r)
     known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
     if not len(known):
         return
@@ -232,7 +232,7 @@ def masses(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "masses", reason, density=float(density))
 
 
-def _sizes(r: Any) -> FloatArray:
+def _compute_longest_arms(r: Any) -> FloatArray:
     """Return the longest arm of each body (n,) [m] over contacts and joint rows with a linear part."""
     size = np.zeros(r.n_bodies)
     joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
@@ -246,18 +246,18 @@ def _sizes(r: Any) -> FloatArray:
     return size
 
 
-def inverse(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_inverted_matrices(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
     g = p.generalized
     if g is None or not 3 <= g.nv <= MAX_DENSE_VELOCITIES:
         return
     mass = g.mass.toarray()
-    given = free_bodies(mass)
+    given = find_free_bodies(mass)
     if (
         p.m == g.nv
         and len(given)
-        and not _orthogonal(p, g.jac, given)
-        and _orthogonal(p, g.jac.T.tocsr(), given)
+        and not _are_contact_rows_orthogonal(p, g.jac, given)
+        and _are_contact_rows_orthogonal(p, g.jac.T.tocsr(), given)
     ):
         reason = (
             "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
@@ -273,7 +273,7 @@ def inverse(p: Problem) -> Iterator[Diagnostic]:
     if len(given) and not wide > 2.0:
         return
     inverse = np.linalg.inv(mass)
-    other = free_bodies(inverse)
+    other = find_free_bodies(inverse)
     if len(other) and not len(given):
         reason = "three uncoupled velocities have equal masses in the inverse of M but not in M: was M^-1 given for M?"
         yield make_diagnostic(p, "masses", reason, velocities=other)
@@ -283,7 +283,7 @@ def inverse(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
 
 
-def free_bodies(mass: FloatArray) -> list[int]:
+def find_free_bodies(mass: FloatArray) -> list[int]:
     """Return the first of each three uncoupled velocities of equal mass: the linear velocities of a free body."""
     n = len(mass)
     d = mass.diagonal()
@@ -294,7 +294,7 @@ def free_bodies(mass: FloatArray) -> list[int]:
     return [int(i) for i in np.flatnonzero(equal & (off <= size))]
 
 
-def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
+def _are_contact_rows_orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
     """Return whether most contacts move some free body along three orthogonal unit vectors."""
     c = p.cones
     first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
@@ -307,4 +307,4 @@ def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
     return False
 
 
-CHECKS = (geometry, masses, inverse)
+CHECKS = (diagnose_geometry, diagnose_masses, diagnose_inverted_matrices)

@@ -23,7 +23,7 @@ class Diagnostic:
     blocks : tuple of int
         Blocks concerned; empty if the whole problem is.
     names : tuple of str
-        Names of these blocks, at most 100.
+        Names of these blocks, up to 100.
     data : dict
         Numbers that led to the diagnostic.
     """

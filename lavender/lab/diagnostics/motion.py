@@ -10,24 +10,26 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, check_float
 from lavender.base.errors import InputError
-from lavender.lab.diagnostics.bodies import MAX_DENSE_VELOCITIES, bodies_of, free_bodies
+from lavender.lab.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies, reconstruct_bodies
 from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
 G = 9.81  # m/s^2
-MAX_SEPARATION_TARGET = 30.0  # m/s, a larger target would separate bodies by more than 6 cm in a step of 2 ms
+# [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
+MAX_SEPARATION_TARGET = 30.0
 MAX_APPROACH_TARGET = (
     1000.0  # m/s, a larger target would allow an approach of more than 2 m in a step of 2 ms
 )
-MIN_RESTITUTION = 0.05  # -, below it, targets are not a bounce; targets with a factor dt too many are below
+MIN_RESTITUTION = 0.05  # [-] Smaller ratios are not a bounce but targets with a factor dt too many.
 RESTITUTION_ROUNDING = (
     1e-6  # -, equal coefficients of restitution differ by less when computed from velocities
 )
-SUSPICIOUS_APPROACH = 30.0, 1e4  # m/s, range of approach speeds without dt; larger speeds are in other units
+# [m/s] Approach speeds in this range suggest a target without dt; larger speeds are in other units.
+SUSPICIOUS_APPROACH = 30.0, 1e4
 
 
-def motion_of(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def get_motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return J v* (m,) and target (m,) [m/s], and v*; None for a problem in matrix form."""
     if p.rows is not None:
         v = p.rows.v_free
@@ -42,10 +44,10 @@ def motion_of(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     return u, target, v
 
 
-def targets(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about implausible targets of contacts."""
     c = p.cones
-    motion = motion_of(p)
+    motion = get_motion(p)
     contact = c.is_contact
     if motion is None or not contact.any():
         return
@@ -69,8 +71,8 @@ def targets(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "tangents first", reason + "of a contact are normal, tangent, tangent", full)
         return
     un, tn = u[normal], target[normal]
-    r = bodies_of(p)
-    speed = None if r is None or not _at_rest(r) else np.linalg.norm(r.v_free[:, :3], axis=1)
+    r = reconstruct_bodies(p)
+    speed = None if r is None or not _are_at_rest(r) else np.linalg.norm(r.v_free[:, :3], axis=1)
     limit = MAX_SEPARATION_TARGET if speed is None else max(1.0, 20.0 * float(speed.max()))
     wild = (tn > limit) | (tn < -MAX_APPROACH_TARGET)
     if wild.any():
@@ -91,9 +93,9 @@ def targets(p: Problem) -> Iterator[Diagnostic]:
             yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
 
 
-def speeds(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if v* looks like an acceleration."""
-    motion, r = motion_of(p), bodies_of(p)
+    motion, r = get_motion(p), reconstruct_bodies(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
@@ -113,13 +115,13 @@ def speeds(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
 
 
-def flipped_normals(p: Problem) -> Iterator[Diagnostic]:
+def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if static bodies push falling bodies further down.
 
     Checked if most bodies have the same v*, the velocity change of gravity in one step: static bodies then support them
     from below.
     """
-    r = bodies_of(p)
+    r = reconstruct_bodies(p)
     if r is None or np.count_nonzero(r.inv_mass) < 2:
         return
     still = np.flatnonzero((r.contact_body < 0).any(axis=1))
@@ -136,7 +138,7 @@ def flipped_normals(p: Problem) -> Iterator[Diagnostic]:
         )
 
 
-def _at_rest(r: Rows) -> bool:
+def _are_at_rest(r: Rows) -> bool:
     """Return whether all bodies have about the same v* and touch another: bodies at rest after a step of gravity."""
     moving = r.inv_mass > 0.0
     if not np.isin(np.flatnonzero(moving), r.contact_body).all() or not moving.any():
@@ -146,11 +148,11 @@ def _at_rest(r: Rows) -> bool:
     return bool(np.linalg.norm(v - fall, axis=1).max() <= 0.1 * np.linalg.norm(fall))
 
 
-def state_before(
+def check_state_arguments(
     p: Problem, velocity: Any, gap: Any, dt: float | None
 ) -> tuple[FloatArray | None, FloatArray | None, float]:
     """Validate velocity, gap and dt of `diagnose`."""
-    motion = None if velocity is None and gap is None else motion_of(p)
+    motion = None if velocity is None and gap is None else get_motion(p)
     if motion is None and (velocity is not None or gap is not None):
         raise InputError(
             "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
@@ -164,9 +166,9 @@ def state_before(
     return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
 
 
-def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
+def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
     """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
-    motion = None if velocity is None and gap is None else motion_of(p)
+    motion = None if velocity is None and gap is None else get_motion(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
@@ -180,7 +182,7 @@ def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diag
         change = np.abs(of_normals(step))
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= MAX_DENSE_VELOCITIES:
-            push = np.array([step[j : j + 3] for j in free_bodies(g.mass.toarray())]).reshape(-1, 3)
+            push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
         # Use free bodies if there are any: the light links of a robot are accelerated more.
         fall = np.linalg.norm(push, axis=1) if len(push) else change
         fall = fall[fall > 0.01 * fall.max()]  # ignore bodies on which no force acts
@@ -221,4 +223,4 @@ def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool
     return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
 
 
-CHECKS = (targets, speeds, flipped_normals)
+CHECKS = (diagnose_targets, diagnose_free_velocities, diagnose_flipped_normals)

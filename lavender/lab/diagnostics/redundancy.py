@@ -6,8 +6,8 @@ elimination of the rows before it,
 
     p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
 
-is at most `tol`^2 A_ii: sqrt(p_i / A_ii) is the new fraction of its direction, in the metric of the masses. If J is
-known, this fraction is computed from J, and a direction that is new in J alone counts, too: next to a body that is
+does not exceed `tol`^2 A_ii: sqrt(p_i / A_ii) is the new fraction of its direction, in the metric of the masses. If J
+is known, this fraction is computed from J, and a direction that is new in J alone counts, too: next to a body that is
 1e25 times heavier, the masses hide it. If only A is known, its rounding hides fractions below MIN_NEW_FRACTION_OF_A.
 """
 
@@ -26,7 +26,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender.problem.operators import analyze_panels, has_shifted_cholesky
-from lavender.problem.ordering import rows_by_island
+from lavender.problem.ordering import group_rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
 # Smallest new fraction of a row's direction that differs from rounding of A. A holds squares of fractions, and rounding
@@ -43,12 +43,12 @@ PIVOT_TOL_PER_ROW = 1e-12
 # 822.
 LEFT_OUT_PIVOTS = (1e-2, 1e-4, 1e-6)
 N_PROBE_VECTORS = 3  # Products with this many random vectors show which of the rows left out are new.
-# If A_ii is at most this fraction of the largest entry of its row, d is that entry and A_ii is examined separately.
+# Up to this fraction of the largest entry of its row, A_ii is examined separately, and d is that entry.
 MAX_HIDDEN_DIAGONAL = 1e-10
-# If A_ii is at most this fraction of a d that two rows share, the units of the two rows differ.
+# If A_ii does not exceed this fraction of a d that two rows share, the units of the two rows differ.
 MAX_SHARED_SCALE_FRACTION = 1e-3
 SEMIDEFINITE_SLACK = 1e-8  # A counts as semidefinite in a row if |A_ij| / sqrt(A_ii A_jj) <= 1 + this.
-NULL_VECTOR_TOL = 1e-9  # A row with entries of at most this in all unit null vectors is not moved by them.
+NULL_VECTOR_TOL = 1e-9  # A row with entries of up to this in all unit null vectors is not moved by them.
 
 
 IndexArray = npt.NDArray[np.intp]
@@ -64,7 +64,7 @@ class Redundancy:
     rank : int
         Rank of A.
     tol : float
-        Largest threshold that was used: a row is redundant if the new fraction of its direction is at most this.
+        Largest threshold that was used: a row is redundant if the new fraction of its direction does not exceed this.
     method : str
         Description of the decompositions.
     rows : tuple of int
@@ -136,7 +136,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     Parameters
     ----------
     tol : float, default 1e-12
-        A row is redundant if the new fraction of its direction, in the metric of the masses, is at most this.
+        A row is redundant if the new fraction of its direction, in the metric of the masses, does not exceed this.
 
     Returns
     -------
@@ -160,30 +160,30 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     used, methods = tol, set()
     with np.errstate(all="ignore"):  # Numbers that are not finite are reported below.
         scale = 1.0 / np.sqrt(problem.csr_data.d)
-        unit = _unit_diagonal_factors(problem, scale)
+        unit = _compute_unit_diagonal_factors(problem, scale)
         scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
         # A is zero if J has no column.
         has_jacobian = m and problem.matrix is None and problem.jacobian.shape[1]
-        roots = _unit_row_roots(problem) if has_jacobian and not np.any(problem.compliance) else ()
+        roots = _build_unit_row_roots(problem) if has_jacobian and not np.any(problem.compliance) else ()
     if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
         raise CapabilityError(
             "the rank cannot be computed: rows of unit size exceed float64 (give the problem in other units)"
         )
-    for island in rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
+    for island in group_rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
         a = scaled[island][:, island]
         sound = problem.is_semidefinite or (problem.is_symmetric and has_shifted_cholesky(a))
         if problem.is_symmetric and len(island) <= MAX_DENSE_ISLAND_ROWS:
-            dependent_rows, limit, descriptions = _dense_island(
+            dependent_rows, limit, descriptions = _find_dependent_rows_densely(
                 a.toarray(), [root[island] for root in roots], tol, sound
             )
             used = max(used, limit)
             if len(dependent_rows):
-                basis = _null_basis(a.toarray(), dependent_rows)
+                basis = _compute_null_basis(a.toarray(), dependent_rows)
                 if unit is not scale:  # to the metric of d
                     basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
                 unique[island] = np.abs(basis).max(axis=1) <= NULL_VECTOR_TOL
         else:
-            dependent_rows, limit, descriptions = _other_island(a, sound, tol)
+            dependent_rows, limit, descriptions = _find_dependent_rows_of_large_island(a, sound, tol)
             used = max(used, limit)
             unique[island] = len(dependent_rows) == 0
         methods.update(descriptions)
@@ -198,7 +198,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     )
 
 
-def _dense_island(
+def _find_dependent_rows_densely(
     a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
 ) -> tuple[IndexArray, float, list[str]]:
     """Find the dependent rows of a symmetric island; if A is `sound`, each depends on rows before it.
@@ -208,38 +208,44 @@ def _dense_island(
     rows, threshold of the new fraction of a direction that was used, descriptions of the methods
     """
     if not sound:
-        return _dependent_columns_by_qr(_equilibrate(a), tol), tol, [f"QR with pivoting, {tol:.0e}"]
+        return _find_dependent_columns_by_qr(_equilibrate(a), tol), tol, [f"QR with pivoting, {tol:.0e}"]
     if not roots:
         tol = max(tol, MIN_NEW_FRACTION_OF_A)
-        tail, descriptions = _dependent_rows_by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
+        tail, descriptions = _find_dependent_rows_by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
         # Keep the columns that the island uses, at least one.
         own = [root[:, np.unique(np.append(root.indices, 0))] for root in roots]
-        tails = [_dependent_columns_by_qr(root.toarray().T, tol) for root in own]
+        tails = [_find_dependent_columns_by_qr(root.toarray().T, tol) for root in own]
         tail, descriptions = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
         if len({len(t) for t in tails}) > 1:
             descriptions.append(
                 f"of {len(a)} rows {len(a) - len(tails[0])} by the masses and "
                 f"{len(a) - len(tails[1])} without them: the larger number counts"
             )
-    return _dependent_on_earlier_rows(a, tail, max(tol, MIN_NEW_FRACTION_OF_A)), tol, descriptions
+    return _find_rows_dependent_on_earlier(a, tail, max(tol, MIN_NEW_FRACTION_OF_A)), tol, descriptions
 
 
-def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[IndexArray, float, list[str]]:
+def _find_dependent_rows_of_large_island(
+    a: sp.csr_array, sound: bool, tol: float
+) -> tuple[IndexArray, float, list[str]]:
     """Find the dependent rows of a large or asymmetric island; return (rows, threshold, texts)."""
     n = a.shape[0]
     if sound:
         limit = max(tol, math.sqrt(PIVOT_TOL_PER_ROW * n))
-        return _dependent_rows_by_sparse_cholesky(a, limit**2), limit, [f"sparse Cholesky, {limit:.0e}"]
+        return _find_dependent_rows_by_sparse_cholesky(a, limit**2), limit, [f"sparse Cholesky, {limit:.0e}"]
     if n > MAX_DENSE_ISLAND_ROWS:
         raise CapabilityError(
             f"A is asymmetric or indefinite and {n} of its rows are coupled; the rank of at most "
             f"{MAX_DENSE_ISLAND_ROWS} coupled rows can be computed: pass a smaller problem, or the symmetric part of A"
         )
-    return _dependent_columns_by_qr(_equilibrate(a.toarray().T), tol), tol, [f"QR with pivoting, {tol:.0e}"]
+    return (
+        _find_dependent_columns_by_qr(_equilibrate(a.toarray().T), tol),
+        tol,
+        [f"QR with pivoting, {tol:.0e}"],
+    )
 
 
-def _unit_diagonal_factors(problem: Problem, scale: FloatArray) -> FloatArray:
+def _compute_unit_diagonal_factors(problem: Problem, scale: FloatArray) -> FloatArray:
     """Compute factors (m,) that scale the diagonal of A to one.
 
     They are d^-1/2, unless d differs from a sound A_ii. Next to rows of very much heavier bodies (1e20 times and more),
@@ -266,7 +272,7 @@ def _unit_diagonal_factors(problem: Problem, scale: FloatArray) -> FloatArray:
     return np.where(hidden & (share <= 1.0 + SEMIDEFINITE_SLACK), diagonal_scale, scale)
 
 
-def _unit_row_roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
+def _build_unit_row_roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
     """Build two matrices of unit rows that have the rank of A: J M^-1/2, and J with unit masses in place of M.
 
     Each hides what is small in it: the first hides motion that only heavy bodies have, the second small entries of J.
@@ -300,8 +306,8 @@ def _unit_row_roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
     return root_of_a, root_without_masses
 
 
-def _dependent_columns_by_qr(a: FloatArray, tol: float) -> IndexArray:
-    """Find columns of `a` that depend on the others: their remainder in QR with pivoting is at most `tol` relative."""
+def _find_dependent_columns_by_qr(a: FloatArray, tol: float) -> IndexArray:
+    """Find columns of `a` that depend on the others, by QR with pivoting and the relative threshold `tol`."""
     from scipy.linalg import qr
 
     r, order = qr(a, mode="r", pivoting=True)
@@ -318,14 +324,14 @@ def _equilibrate(a: FloatArray) -> FloatArray:
     return a
 
 
-def _dependent_rows_by_cholesky(a: FloatArray, tol: float) -> IndexArray:
+def _find_dependent_rows_by_cholesky(a: FloatArray, tol: float) -> IndexArray:
     """Find rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
     # Rounding alone leaves a pivot of about len(a) 2^-53.
     _, order, rank, _ = lapack.dpstrf(a, tol=max(tol**2, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
 
 
-def _dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> IndexArray:
+def _find_dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> IndexArray:
     """Return the dependent rows of a large semidefinite `a` (unit diagonal), by a sparse factor without pivoting.
 
     Rows N with small pivots are left out. Their Schur complement on the other rows, B, is
@@ -366,11 +372,11 @@ def _dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> IndexAr
     block = block[np.ix_(block.diagonal() > limit, block.diagonal() > limit)]
     if not len(maybe_new):
         return left
-    dependent = _dependent_rows_by_cholesky(np.asfortranarray(0.5 * (block + block.T)), math.sqrt(limit))
+    dependent = _find_dependent_rows_by_cholesky(np.asfortranarray(0.5 * (block + block.T)), math.sqrt(limit))
     return np.delete(left, np.delete(maybe_new, dependent))
 
 
-def _dependent_on_earlier_rows(a: FloatArray, tail: IndexArray, tol: float) -> IndexArray:
+def _find_rows_dependent_on_earlier(a: FloatArray, tail: IndexArray, tol: float) -> IndexArray:
     """Return as many rows as `tail` has, each dependent on rows before it; `tail` itself if the numbers differ."""
     if len(tail) == 0:
         return tail
@@ -382,7 +388,7 @@ def _dependent_on_earlier_rows(a: FloatArray, tail: IndexArray, tol: float) -> I
     return dependent_rows if len(dependent_rows) == len(tail) else tail
 
 
-def _null_basis(a: FloatArray, dependent_rows: IndexArray) -> FloatArray:
+def _compute_null_basis(a: FloatArray, dependent_rows: IndexArray) -> FloatArray:
     """Compute orthonormal null vectors from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
     independent_rows = np.setdiff1d(np.arange(len(a)), dependent_rows)
     vectors = np.zeros((len(a), len(dependent_rows)))

@@ -8,19 +8,25 @@ lv.find_solutions(problem).spread                             # m/s that Coulomb
 """
 
 from lavender.lab.motion.bound import Witness
-from lavender.lab.motion.error import MotionError, measure
+from lavender.lab.motion.error import MotionError, measure_distance
 from lavender.lab.motion.multiple_solutions import (
     Motion,
     SolutionSet,
-    branch,
-    distance,
     find_solutions,
+    follow_to_solution,
     get_solutions,
+    measure_distance_to_nearest,
+    measure_motion_distance,
     motion_error,
-    nearest,
 )
-from lavender.lab.motion.reference import Reference, adopt, load_reference, reference, save_reference
-from lavender.lab.motion.unique import uniqueness
+from lavender.lab.motion.reference import (
+    Reference,
+    get_reference,
+    load_reference,
+    save_reference,
+    store_if_better,
+)
+from lavender.lab.motion.unique import prove_uniqueness
 
 __all__ = [
     "Motion",
@@ -28,16 +34,16 @@ __all__ = [
     "Reference",
     "SolutionSet",
     "Witness",
-    "adopt",
-    "branch",
-    "distance",
     "find_solutions",
+    "follow_to_solution",
+    "get_reference",
     "get_solutions",
     "load_reference",
-    "measure",
+    "measure_distance",
+    "measure_distance_to_nearest",
+    "measure_motion_distance",
     "motion_error",
-    "nearest",
-    "reference",
+    "prove_uniqueness",
     "save_reference",
-    "uniqueness",
+    "store_if_better",
 ]

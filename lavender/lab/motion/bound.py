@@ -20,7 +20,7 @@ infimum of the dual unattained, y* is a minimising sequence, along which velocit
 good y makes both numbers small.
 
 Half the square of (2) is the energy of the difference of velocities plus the difference of energy stored in compliance.
-The kinetic part of a difference is at most the sum, which bounds the speed of every body: 1/2 m |dv|^2 <= E^2.
+The kinetic part of a difference does not exceed the sum, which bounds the speed of every body: 1/2 m |dv|^2 <= E^2.
 
 Rounding goes outward: w, p, |x - y|_A and |e|_A are computed with bounds of their float64 rounding errors, so (2) holds
 for real numbers, with A = J M^-1 J^T + diag(theta) of the numbers as stored. For a witness at its round-off floor, the
@@ -75,26 +75,26 @@ class Witness:
     shift: FloatArray
 
 
-def witness(problem: Problem, operator: Operator, impulse: FloatArray) -> Witness:
+def compute_witness(problem: Problem, operator: Operator, impulse: FloatArray) -> Witness:
     """Compute the witness (2) of an impulse y (m,) [N s]; law linear, lcp or cone, and `operator.refusal()` None."""
     d = problem.d
-    w, off = operator.slack(impulse)
+    w, off = operator.compute_slack(impulse)
     e = np.empty(problem.m)
     measure.score(problem.metric, impulse, w, e)
-    uncertainty = _rounding_of_projection(problem, impulse, w)
-    radius = operator.size(e, uncertainty).upper_bound
+    uncertainty = _bound_projection_rounding(problem, impulse, w)
+    radius = operator.compute_energy_norm(e, uncertainty).upper_bound
     shift = d * e
     moved = float(np.max(np.abs(shift) * (1.0 + 4.0 * U) + d * uncertainty + off, initial=0.0))
     return Witness(impulse, radius, moved, shift)
 
 
-def difference(operator: Operator, x: FloatArray, y: FloatArray) -> tuple[FloatArray, Size]:
+def subtract_impulses(operator: Operator, x: FloatArray, y: FloatArray) -> tuple[FloatArray, Size]:
     """Compute x - y (m,) [N s] and its energy norm, including the rounding of the subtraction."""
     delta = x - y
-    return delta, operator.size(delta, U * np.abs(delta))
+    return delta, operator.compute_energy_norm(delta, U * np.abs(delta))
 
 
-def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> FloatArray:
+def _bound_projection_rounding(problem: Problem, y: FloatArray, w: FloatArray) -> FloatArray:
     """Bound (m,) [N s] the rounding of e = y - Pi(y - w / d) of the numbers y, w, d from above."""
     d, c = problem.d, problem.cones
     size = np.abs(y) + np.abs(w) / d
@@ -115,18 +115,18 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
     return uncertainty
 
 
-def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
+def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
     """Compute |Delta|_A [sqrt J] of two judged answers and the largest value that (3), (4) allow, with rounding."""
     delta = problem.on_disk(one.impulse - two.impulse)
     eps = problem.on_disk(one.residual.error - two.residual.error)
     problem = problem.disk
     d: Any = problem.d
-    a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
+    a_delta, a_eps = _multiply_by_a(problem, delta), _multiply_by_a(problem, eps)
     delta_norm = float(np.sqrt(max(delta @ a_delta, 0.0)))
     # The errors e are known up to the round-off floors of both residuals, in the norm of D.
     uncertainty = float(sum(s.residual.floor_energy for s in (one, two)))
     root = 1.0 / np.sqrt(d)
-    max_stiffness = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
+    max_stiffness = float(np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0)))
     eps_d = float(np.sqrt(np.sum(d * eps * eps))) + uncertainty
     eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + max_stiffness * uncertainty
     delta_d = float(np.sqrt(np.sum(d * delta * delta)))
@@ -142,7 +142,7 @@ def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
     return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
 
 
-def _apply(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
+def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
     """Compute A x (m,) without forming A if J and M are known; with transform=abs, a bound of abs(A) x for x >= 0."""
     if problem.generalized is not None:
         y = transform(problem.whitened)

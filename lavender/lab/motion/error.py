@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.lab.motion.bound import difference
+from lavender.lab.motion.bound import subtract_impulses
 from lavender.lab.motion.operator import U
-from lavender.lab.motion.reference import Reference, motion_cache
+from lavender.lab.motion.reference import Reference, get_motion_cache
 from lavender.problem import Problem
 
 # Motions at a distance below this fraction of the constraints' own motion count as the same: a residual of 1e-10
@@ -44,7 +44,7 @@ class MotionError:
     energy : float or None, sqrt J
         The same plus the energy stored in compliance.
     relative : float or None
-        `kinetic` (or `energy`) divided by that of the constraints' own motion M^-1 J^T lambda*.
+        `kinetic` (or `energy`) divided by the norm of the constraints' own motion M^-1 J^T lambda*.
     speed : float or None, m/s
         Velocity error of the body with the largest one; m/s or rad/s of a generalised velocity.
     spin : float or None, rad/s
@@ -112,7 +112,9 @@ class MotionError:
     def _name_body(self, body: int) -> str:
         """Return the name of a body or generalised velocity; empty for -1."""
         return (
-            motion_cache(self._problem).operator.name(body) if self._problem is not None and body >= 0 else ""
+            get_motion_cache(self._problem).operator.get_name(body)
+            if self._problem is not None and body >= 0
+            else ""
         )
 
     @property
@@ -148,7 +150,7 @@ class MotionError:
         return f"{text}; {self.note}" if self.note else text
 
 
-def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
+def measure_distance(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
     """Compute the distance of an impulse x (m,) [N s] from one reference; numbers beyond float64 are None."""
     error = drop_non_finite(_compute_error(problem, x, reference), MOTION_ERROR_FIELDS)
     if error.relative == math.inf:
@@ -169,41 +171,41 @@ def drop_non_finite(error: MotionError, names: Sequence[str]) -> MotionError:
 
 def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
     """Compute all numbers of a `MotionError` for which the reference suffices."""
-    operator = motion_cache(problem).operator
-    delta, size = difference(operator, x, reference.impulse)
+    operator = get_motion_cache(problem).operator
+    delta, size = subtract_impulses(operator, x, reference.impulse)
     notes = [reference.refusal and f"{reference.refusal}: no energies"]
-    energies = reference.accepted and not reference.refusal
-    if not reference.accepted:
+    energies = reference.is_accepted and not reference.refusal
+    if not reference.is_accepted:
         notes.append("nothing reached the floor: no estimate")
     values: dict[str, Any] = dict.fromkeys((*MOTION_ERROR_FIELDS, "relative"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
-    velocity = operator.velocity(delta, U * np.abs(delta))
+    velocity = operator.compute_velocity(delta, U * np.abs(delta))
     speed = max_speed = np.zeros(0)
     spin: FloatArray | None = None
     max_spin: FloatArray | None = None
     if velocity is not None:
-        speed, spin = operator.lengths(velocity[0])
-        max_speed, max_spin = operator.lengths(np.abs(velocity[0]) + velocity[1])
+        speed, spin = operator.compute_speeds(velocity[0])
+        max_speed, max_spin = operator.compute_speeds(np.abs(velocity[0]) + velocity[1])
     if energies:
-        own = operator.size(reference.impulse, np.zeros(problem.m))
+        own = operator.compute_energy_norm(reference.impulse, np.zeros(problem.m))
         values |= {"kinetic": size.kinetic, "energy": size.energy}
         values["relative"] = (
-            _ratio(size.energy, own.energy)
+            _divide(size.energy, own.energy)
             if size.kinetic is None or own.kinetic is None
-            else _ratio(size.kinetic, own.kinetic)
+            else _divide(size.kinetic, own.kinetic)
         )
-    if reference.accepted:
+    if reference.is_accepted:
         if velocity is not None:
             values["body"], values["speed"] = _index_and_max(speed)
             if spin is not None:
                 values["spin_body"], values["spin"] = _index_and_max(spin)
-        values["row"], values["rows"] = _index_and_max(np.abs(operator.slack(delta)[0] + problem.b))
+        values["row"], values["rows"] = _index_and_max(np.abs(operator.compute_slack(delta)[0] + problem.b))
     proof = reference.witness
     if proof is None and not reference.refusal:
         notes.append("no bound under Coulomb's law")
     if proof is not None:
         values["bound"], values["moved"] = size.upper_bound + proof.radius, proof.moved
-        max_from_witness = operator.max_speeds(proof.radius)
+        max_from_witness = operator.bound_speeds(proof.radius)
         if max_from_witness is not None:
             values["bound_speed"] = float(max_speed.max(initial=0.0)) * (1.0 + 8.0 * U) + max_from_witness[0]
             if max_spin is not None and max_from_witness[1] is not None:
@@ -213,17 +215,19 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
     return MotionError(**values, reference=reference, note="; ".join(n for n in notes if n), _problem=problem)
 
 
-def in_rows_of_ellipses(problem: Problem, x: FloatArray, error: MotionError) -> MotionError:
+def convert_to_ellipse_rows(problem: Problem, x: FloatArray, error: MotionError) -> MotionError:
     """Convert `rows` and `row` of an error on the disks to the problem's ellipses; x (m,) [N s] is on the disks."""
     if error.rows is None:
         return error
     delta = x - error.reference.impulse
-    w = (motion_cache(problem.disk).operator.slack(delta)[0] + problem.disk.b) / problem.cones.stretch
+    w = (
+        get_motion_cache(problem.disk).operator.compute_slack(delta)[0] + problem.disk.b
+    ) / problem.cones.stretch
     row, rows = _index_and_max(np.abs(w))
     return drop_non_finite(replace(error, row=row, rows=rows), ("rows",))
 
 
-def _ratio(x: float, reference: float) -> float:
+def _divide(x: float, reference: float) -> float:
     """Divide; 0 / 0 is 0 and x / 0 is inf."""
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 

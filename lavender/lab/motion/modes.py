@@ -30,7 +30,7 @@ MAX_SINGULAR_MODES = 300
 INEQUALITY_TOL = (
     1e-9  # Rounding may violate an inequality by this fraction of the largest number of a system.
 )
-# Singular values of a scaled system count as zero if they are at most this fraction of the largest.
+# Singular values of a scaled system count as zero if they do not exceed this fraction of the largest.
 NULL_VALUE_TOL = 1e-11
 
 
@@ -80,12 +80,12 @@ def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
         b = scale * problem.b
         unit = float(np.abs(b).max(initial=0.0)) or 1.0  # [sqrt J] scales the largest number of a system to 1
         b, scale = b / unit, unit * scale
-        block_modes = [w for i in range(c.n_blocks) for w in _block_modes(problem, i, a, b, scale)]
+        block_modes = [w for i in range(c.n_blocks) for w in _list_block_modes(problem, i, a, b, scale)]
     if not all(np.isfinite(field).all() for modes in block_modes for field in modes):
         return None
     impulses, complete = [], True
     remaining_singular = MAX_SINGULAR_MODES
-    for equal, rhs, above, bound in _mode_systems(block_modes):
+    for equal, rhs, above, bound in _build_mode_systems(block_modes):
         value = np.linalg.svd(equal, compute_uv=False)
         regular = value[:, -1] > NULL_VALUE_TOL * value[:, 0]
         x = np.linalg.solve(equal[regular], rhs[regular][:, :, None])[:, :, 0]
@@ -105,14 +105,14 @@ def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
             remaining_singular -= null.shape[1] > 1
             if remaining_singular < 0:
                 return impulses, False
-            y = _feasible_point(above[i] @ null, bound[i] - above[i] @ x[i] - INEQUALITY_TOL)
+            y = _find_feasible_point(above[i] @ null, bound[i] - above[i] @ x[i] - INEQUALITY_TOL)
             if y is not None:
                 complete &= bool(np.abs(a @ null).max() <= INEQUALITY_TOL)
                 impulses.append(scale * (x[i] + null @ y))
     return impulses, complete
 
 
-def _block_modes(
+def _list_block_modes(
     problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: FloatArray
 ) -> Iterator[_BlockModes]:
     """Yield the modes of each row of a block, or of the contact."""
@@ -175,7 +175,7 @@ def _to_arrays(mode_list: list[Any], m: int) -> _BlockModes:
     return out
 
 
-def _mode_systems(block_modes: list[_BlockModes]) -> Iterator[tuple[FloatArray, ...]]:
+def _build_mode_systems(block_modes: list[_BlockModes]) -> Iterator[tuple[FloatArray, ...]]:
     """Yield E (k, m, m), e, F and f of all modes, MODES_PER_BATCH at a time."""
     counts = [len(w.rhs) for w in block_modes]
     for first in range(0, int(np.prod(counts)), MODES_PER_BATCH):
@@ -186,8 +186,8 @@ def _mode_systems(block_modes: list[_BlockModes]) -> Iterator[tuple[FloatArray, 
         )
 
 
-def _feasible_point(g: FloatArray, h: FloatArray) -> FloatArray | None:
-    """Return a y with G y >= h, or None if there is none."""
+def _find_feasible_point(g: FloatArray, h: FloatArray) -> FloatArray | None:
+    """Return a y with G y >= h, or None if no y has this property."""
     if g.shape[1] == 1:
         slope = g[:, 0]
         low = np.max(h[slope > NULL_VALUE_TOL] / slope[slope > NULL_VALUE_TOL], initial=-np.inf)

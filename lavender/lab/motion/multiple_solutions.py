@@ -1,8 +1,8 @@
 """The motions that solve one problem: under Coulomb's law there may be several, and no solver accuracy selects one.
 
 Runs from different starts, in different orders and by different solvers end at solutions; solutions with equal motions
-are one motion. A search finds motions but does not prove that there are no others: `uniqueness` can, and problems of up
-to eight contacts with one tangent are enumerated completely (`lavender/lab/motion/modes.py`).
+count as one motion. A search finds motions but does not prove that no others exist. `prove_uniqueness` can prove
+it, and problems of up to eight contacts with one tangent are enumerated completely (`lavender/lab/motion/modes.py`).
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.judge.residuals import residual
-from lavender.judge.solution import uninterrupted
-from lavender.lab.motion.bound import difference
+from lavender.judge.solution import raise_if_interrupted
+from lavender.lab.motion.bound import subtract_impulses
 from lavender.lab.motion.error import (
     SAME_MOTION_FRACTION,
     MotionError,
+    convert_to_ellipse_rows,
     drop_non_finite,
-    in_rows_of_ellipses,
-    measure,
+    measure_distance,
 )
 from lavender.lab.motion.modes import enumerate_modes
-from lavender.lab.motion.reference import Reference, as_reference, make_reference, motion_cache
-from lavender.lab.motion.reference import reference as reference_of
-from lavender.lab.motion.unique import uniqueness
+from lavender.lab.motion.reference import Reference, as_reference, get_motion_cache, make_reference
+from lavender.lab.motion.reference import get_reference as reference_of
+from lavender.lab.motion.unique import prove_uniqueness
 from lavender.problem import Problem, check_problem
-from lavender.problem.cones import project
-from lavender.solvers.certify import soften
+from lavender.problem.cones import project_impulse
+from lavender.solvers.certify import add_compliance
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
@@ -211,7 +211,10 @@ class SolutionSet:
 
     def nearest(self, impulse: FloatArray) -> Motion:
         """Return the motion at the smallest distance from an impulse (m,) [N s]."""
-        return min(self.motions, key=lambda motion: distance(self.problem, impulse, motion.impulse).energy)
+        return min(
+            self.motions,
+            key=lambda motion: measure_motion_distance(self.problem, impulse, motion.impulse).energy,
+        )
 
     def picks(
         self, solvers: Iterable[str] | None = None, *, tol: float = 1e-9, max_iter: int = SWEEP_RANGE[1]
@@ -232,13 +235,13 @@ class SolutionSet:
         for name in available(p) if solvers is None else check_sequence("solvers", solvers, "names"):
             try:
                 budget = max_iter if get(name).resumable else None
-                result = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
+                result = raise_if_interrupted(solve(p, name, tol=tol, max_iter=budget))
             except CapabilityError:
                 continue
             out[name] = None
             if self.motions and (result.success or result.residual.at_floor):
                 near = self.nearest(result.impulse)
-                off = distance(p, result.impulse, near.impulse)
+                off = measure_motion_distance(p, result.impulse, near.impulse)
                 out[name] = Pick(self.motions.index(near), off.speed)
         return out
 
@@ -287,23 +290,26 @@ def find_solutions(
     """
     check_problem(problem)
     n, seed, always = check_int("n", n), check_int("seed", seed, high=None), check_bool("always", always)
-    proof = uniqueness(problem)
+    proof = prove_uniqueness(problem)
     reference = reference_of(problem)
-    solutions = [(reference, "auto")] if reference.accepted else []
-    failed = 0 if reference.accepted else 1
+    solutions = [(reference, "auto")] if reference.is_accepted else []
+    failed = 0 if reference.is_accepted else 1
     complete = bool(proof)
     if (always or not proof) and (modes := enumerate_modes(problem)) is not None:
         best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
         # Modes with the same motion have one entry.
-        distinct = {_motion_key(problem, x): x for x in best_last}
+        distinct = {_make_motion_key(problem, x): x for x in best_last}
         ends = [
             make_reference(problem, x, "every mode") for x in list(distinct.values())[:MAX_COMPARED_MOTIONS]
         ]
-        solved = [end for end in ends if end.accepted]
+        solved = [end for end in ends if end.is_accepted]
         solutions += [(end, "every mode") for end in solved]
         # An impulse that passes an inequality only by rounding must be next to a solution; else the list has a gap.
         distances = (
-            min((distance(problem, e.impulse, s.impulse).relative_distance for s in solved), default=1.0)
+            min(
+                (measure_motion_distance(problem, e.impulse, s.impulse).relative_distance for s in solved),
+                default=1.0,
+            )
             for e in ends
         )
         complete |= (
@@ -312,9 +318,9 @@ def find_solutions(
             and max(distances, default=1.0) < NEAR_SOLUTION_FRACTION
         )
     if always or not complete:
-        for label, impulse in search(problem, reference, n, seed):
+        for label, impulse in search_solutions(problem, reference, n, seed):
             candidate = make_reference(problem, impulse, label)
-            if candidate.accepted:
+            if candidate.is_accepted:
                 solutions.append((candidate, label))
             else:
                 failed += 1
@@ -322,7 +328,7 @@ def find_solutions(
     speed, energy = 0.0, 0.0
     for i, first in enumerate(merged):
         for second in merged[:i]:
-            pair_distance = distance(problem, first.impulse, second.impulse)
+            pair_distance = measure_motion_distance(problem, first.impulse, second.impulse)
             speed, energy = max(speed, pair_distance.speed), max(energy, pair_distance.energy)
     result = SolutionSet(
         problem=problem,
@@ -334,11 +340,11 @@ def find_solutions(
         failed=failed,
         all=complete,
     )
-    motion_cache(problem).motions = result
+    get_motion_cache(problem).motions = result
     return result
 
 
-def _motion_key(problem: Problem, x: FloatArray) -> bytes:
+def _make_motion_key(problem: Problem, x: FloatArray) -> bytes:
     """Return a key of a motion: w rounded to 1e-9 of the largest |b|, in m/s and in sqrt(J).
 
     The second scale distinguishes slow motions of heavy bodies.
@@ -352,10 +358,10 @@ def _motion_key(problem: Problem, x: FloatArray) -> bytes:
 
 def get_solutions(problem: Problem, n: int = N_SEARCH_RUNS) -> SolutionSet:
     """Return the motions of an earlier search, whatever its number of runs, or search with `n` runs."""
-    return motion_cache(problem).motions or find_solutions(problem, n)
+    return get_motion_cache(problem).motions or find_solutions(problem, n)
 
 
-def branch(problem: Problem, impulse: Any) -> Reference:
+def follow_to_solution(problem: Problem, impulse: Any) -> Reference:
     """Return the solution that an impulse (m,) [N s] leads to: by sweeps to the floor, then by `newton` if they stall.
 
     If Coulomb's law has several motions, this is the one that a solver stopped early would have reached. It is not
@@ -367,7 +373,7 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     for name in ("anderson", "newton"):
         if name not in available(problem):
             continue
-        end = uninterrupted(solve(problem, name, impulse=x, tol=SEARCH_TOL))
+        end = raise_if_interrupted(solve(problem, name, impulse=x, tol=SEARCH_TOL))
         new = (
             make_reference(problem, end.impulse, f"{name} from it")
             if np.isfinite(end.impulse).all()
@@ -375,7 +381,7 @@ def branch(problem: Problem, impulse: Any) -> Reference:
         )
         if new is not None and (best is None or new.residual.relative < best.residual.relative):
             best = new
-        if best is not None and best.accepted:
+        if best is not None and best.is_accepted:
             break
     return reference_of(problem) if best is None else best
 
@@ -385,13 +391,17 @@ def solve_with_vanishing_compliance(problem: Problem) -> FloatArray:
     x, s = problem.start(), LARGEST_COMPLIANCE_FRACTION
     while s >= SMALLEST_COMPLIANCE_FRACTION:
         x = np.array(
-            uninterrupted(solve(soften(problem, s * problem.d), "auto", impulse=x, tol=1e-12)).impulse
+            raise_if_interrupted(
+                solve(add_compliance(problem, s * problem.d), "auto", impulse=x, tol=1e-12)
+            ).impulse
         )
         s *= COMPLIANCE_STEP
-    return np.array(uninterrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)
+    return np.array(raise_if_interrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)
 
 
-def search(problem: Problem, reference: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
+def search_solutions(
+    problem: Problem, reference: Reference, n: int, seed: int
+) -> Iterator[tuple[str, FloatArray]]:
     """Run n solves; yield the label of each and the impulse (m,) [N s] at which it ended."""
     here = set(available(problem))
     solvers = [name for name in SEARCH_SOLVERS if name in here] or ["auto"]
@@ -411,10 +421,10 @@ def search(problem: Problem, reference: Reference, n: int, seed: int) -> Iterato
                 options["seed"] = int(rng.integers(2**31))
         # The first two cycles start from rest, in different orders; a solver without orders gets a new start each
         # cycle.
-        start = _start(problem, reference, rng, max(cycle - spec.order, 0))
+        start = _make_start(problem, reference, rng, max(cycle - spec.order, 0))
         limit = budget if spec.resumable else spec.max_iter
         try:
-            end = uninterrupted(
+            end = raise_if_interrupted(
                 solve(problem, spec.name, impulse=start[1], tol=SEARCH_TOL, max_iter=limit, **options)
             )
         except LavenderError:  # The solver rejected the numbers of this problem.
@@ -423,7 +433,7 @@ def search(problem: Problem, reference: Reference, n: int, seed: int) -> Iterato
             yield f"{label} from {start[0]}", end.impulse
 
 
-def _start(
+def _make_start(
     problem: Problem, reference: Reference, rng: np.random.Generator, i: int
 ) -> tuple[str, FloatArray]:
     """Return start i and its name: first the guess (or the zero impulse), then random changes of the reference."""
@@ -439,7 +449,7 @@ def _start(
     normal, tangents = c.normal_rows, c.friction_rows
     x[normal] = np.maximum(x[normal], size * rng.random(len(normal)))
     x[tangents] = size * rng.normal(size=int(tangents.sum()))
-    return "a random start", project(c, x)
+    return "a random start", project_impulse(c, x)
 
 
 def _merge_equal_motions(problem: Problem, solutions: list[tuple[Reference, str]]) -> list[Motion]:
@@ -448,7 +458,7 @@ def _merge_equal_motions(problem: Problem, solutions: list[tuple[Reference, str]
     for first in solutions:
         for group in groups:
             if (
-                distance(problem, first[0].impulse, group[0][0].impulse).relative_distance
+                measure_motion_distance(problem, first[0].impulse, group[0][0].impulse).relative_distance
                 <= SAME_MOTION_FRACTION
             ):
                 group.append(first)
@@ -482,22 +492,24 @@ def _make_motion(problem: Problem, reference: Reference, labels: tuple[str, ...]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # Impulses may be at the limit of float64.
-def distance(problem: Problem, x: ArrayLike, y: ArrayLike) -> Distance:
+def measure_motion_distance(problem: Problem, x: ArrayLike, y: ArrayLike) -> Distance:
     """Compute the distance between the motions of two impulses (m,) [N s]."""
-    cache = motion_cache(problem)
+    cache = get_motion_cache(problem)
     operator = cache.operator
     x, y = problem.impulse_array(x, "x"), problem.impulse_array(y, "y")
-    delta, size = difference(operator, x, y)
-    velocity = operator.velocity(delta, np.zeros(problem.m))
-    rows = np.abs(operator.slack(delta)[0] + problem.b)
-    speed = rows if velocity is None else operator.lengths(velocity[0])[0]
+    delta, size = subtract_impulses(operator, x, y)
+    velocity = operator.compute_velocity(delta, np.zeros(problem.m))
+    rows = np.abs(operator.compute_slack(delta)[0] + problem.b)
+    speed = rows if velocity is None else operator.compute_speeds(velocity[0])[0]
     max_speed = float(np.max(speed, initial=0.0))
     if cache.refusal:
         energy = float(np.max(rows, initial=0.0))
-        largest = max(float(np.max(np.abs(operator.slack(z)[0] + problem.b), initial=0.0)) for z in (x, y))
+        largest = max(
+            float(np.max(np.abs(operator.compute_slack(z)[0] + problem.b), initial=0.0)) for z in (x, y)
+        )
     else:
         energy = size.energy
-        largest = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
+        largest = max(operator.compute_energy_norm(z, np.zeros(problem.m)).energy for z in (x, y))
     return Distance(
         max_speed, energy, energy / largest if largest > 0.0 else (0.0 if energy == 0.0 else np.inf)
     )
@@ -546,29 +558,29 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
             reference = problem.on_disk(impulse_of_reference)
         error = motion_error(problem.disk, x, reference)
         with np.errstate(over="ignore", invalid="ignore"):
-            return in_rows_of_ellipses(problem, x, error)
+            return convert_to_ellipse_rows(problem, x, error)
     with np.errstate(over="ignore", invalid="ignore"):  # `note` names numbers that are not finite.
         if reference is not None:
-            return measure(problem, x, as_reference(problem, reference))
+            return measure_distance(problem, x, as_reference(problem, reference))
         if problem.law != "coulomb":
-            return measure(problem, x, reference_of(problem))
-        return nearest(problem, x, get_solutions(problem))
+            return measure_distance(problem, x, reference_of(problem))
+        return measure_distance_to_nearest(problem, x, get_solutions(problem))
 
 
-def nearest(problem: Problem, x: FloatArray, solutions: SolutionSet) -> MotionError:
+def measure_distance_to_nearest(problem: Problem, x: FloatArray, solutions: SolutionSet) -> MotionError:
     """Compute the distance of an impulse x (m,) from the nearest of several motions and of the one that it leads to."""
     references = [motion.reference for motion in solutions]
     spread, energy = solutions.spread, solutions.spread_energy
     if not solutions.unique:
-        own = branch(problem, x)
-        distances = [distance(problem, own.impulse, motion.impulse) for motion in solutions]
-        if own.accepted and all(d.relative_distance > SAME_MOTION_FRACTION for d in distances):
+        own = follow_to_solution(problem, x)
+        distances = [measure_motion_distance(problem, own.impulse, motion.impulse) for motion in solutions]
+        if own.is_accepted and all(d.relative_distance > SAME_MOTION_FRACTION for d in distances):
             references.append(own)
             spread = max([spread, *(d.speed for d in distances)])
             energy = None if energy is None else max([energy, *(d.energy for d in distances)])
     if not references:
-        return measure(problem, x, reference_of(problem))
-    best = min((measure(problem, x, reference) for reference in references), key=_error_key)
+        return measure_distance(problem, x, reference_of(problem))
+    best = min((measure_distance(problem, x, reference) for reference in references), key=_error_key)
     nearest_error = replace(
         best, spread=energy, spread_speed=spread, count=len(references), unique=solutions.unique
     )

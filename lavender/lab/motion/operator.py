@@ -57,45 +57,47 @@ class Operator:
         self.asymmetry = 0.0 if problem.is_symmetric else problem.asymmetry
         self.a = a if problem.asymmetry == 0.0 else sp.csr_array(0.5 * (a + a.T))
         self.abs_a = abs(self.a)
-        self.slack_gamma = _gamma(int(np.diff(self.a.indptr).max(initial=0)) + 3)
+        self.slack_gamma = _bound_sum_rounding(int(np.diff(self.a.indptr).max(initial=0)) + 3)
         self.semidefinite = problem.is_semidefinite
 
-    def refusal(self) -> str | None:
+    def explain_refusal(self) -> str | None:
         """Return the reason why (1) is not an energy, or None if it is."""
         if self.asymmetry > 0.0:
             return f"A is not symmetric (by {self.asymmetry:.1e})"
         return None if self.semidefinite else "A is not positive semidefinite"
 
-    def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compute_slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Compute w = A x - b (m,) [m/s] and a bound of its rounding."""
         return self.a @ x - self.b, self.slack_gamma * (self.abs_a @ np.abs(x) + np.abs(self.b))
 
-    def size(self, x: FloatArray, uncertainty: FloatArray) -> Size:
+    def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
         """Compute the energy norm of x, every entry of which is uncertain by `uncertainty` (m,)."""
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
-        rounding = (self.slack_gamma + _gamma(len(x) + 1)) * float(y @ (self.abs_a @ y))
+        rounding = (self.slack_gamma + _bound_sum_rounding(len(x) + 1)) * float(y @ (self.abs_a @ y))
         uncertain_part = float(uncertainty @ (self.abs_a @ uncertainty))
         upper_bound = (
             np.sqrt(0.5)
             * (np.sqrt(square + rounding) + np.sqrt(uncertain_part))
-            * (1.0 + _gamma(len(x) + 64))
+            * (1.0 + _bound_sum_rounding(len(x) + 64))
         )
         return Size(None, float(np.sqrt(0.5 * square)), float(upper_bound))
 
-    def velocity(self, x: FloatArray, uncertainty: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    def compute_velocity(
+        self, x: FloatArray, uncertainty: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
         """Compute M^-1 J^T x, (n, 6) or (nv,) [m/s, rad/s], and a bound of its error; None if M is not known."""
         return None
 
-    def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    def compute_speeds(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         """Compute speed and spin of each body, or (magnitude of each generalised velocity, None)."""
         raise NotImplementedError
 
-    def name(self, i: int) -> str:
+    def get_name(self, i: int) -> str:
         """Return the name of body or generalised velocity i."""
         return ""
 
-    def max_speeds(self, energy: float) -> tuple[float, float | None] | None:
+    def bound_speeds(self, energy: float) -> tuple[float, float | None] | None:
         """Return the largest speed and spin of a body (or velocity, None) at a kinetic energy of energy^2 [J]."""
         return None
 
@@ -123,11 +125,11 @@ class _Factored(Operator):
             int(np.diff(x.indptr).max(initial=0)) for x in (self.jac_t, self.jac, minv)
         )
         # Numbers of operations on one entry of J^T x, of M^-1 J^T x, and of J M^-1 J^T x + theta x - b.
-        self.wrench_gamma = _gamma(column + 1)
-        self.velocity_gamma = _gamma(column + minv_entries + 1)
-        self.slack_gamma = _gamma(column + row + minv_entries + 5)
+        self.wrench_gamma = _bound_sum_rounding(column + 1)
+        self.velocity_gamma = _bound_sum_rounding(column + minv_entries + 1)
+        self.slack_gamma = _bound_sum_rounding(column + row + minv_entries + 5)
 
-    def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compute_slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         w = self.jac @ (self.minv @ (self.jac_t @ x)) + self.theta * x - self.b
         y = np.abs(x)
         g = self.abs_jac_t @ y
@@ -136,24 +138,28 @@ class _Factored(Operator):
             off += 1.01 * (self.abs_jac @ (self.off @ g))
         return w, off
 
-    def size(self, x: FloatArray, uncertainty: FloatArray) -> Size:
+    def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
         g = self.jac_t @ x
         h = np.abs(g)
         off = self.abs_jac_t @ (self.wrench_gamma * np.abs(x) + 1.01 * uncertainty)  # of g
         square = max(float(g @ (self.minv @ g)), 0.0)
-        rounding = _gamma(self.nv + 4) * float(h @ (self.abs_minv @ h))
+        rounding = _bound_sum_rounding(self.nv + 4) * float(h @ (self.abs_minv @ h))
         if self.off is not None:
             rounding += 1.01 * float(h @ (self.off @ h))
         uncertain_part = float(off @ (self.abs_minv @ off))
         elastic = float(np.sum(self.theta * x * x))
         max_elastic = float(np.sum(self.theta * (np.abs(x) + uncertainty) ** 2))
         root = np.sqrt(square + rounding) + np.sqrt(uncertain_part)
-        upper_bound = np.sqrt(0.5 * (root * root + max_elastic)) * (1.0 + _gamma(len(x) + self.nv + 64))
+        upper_bound = np.sqrt(0.5 * (root * root + max_elastic)) * (
+            1.0 + _bound_sum_rounding(len(x) + self.nv + 64)
+        )
         return Size(
             float(np.sqrt(0.5 * square)), float(np.sqrt(0.5 * (square + elastic))), float(upper_bound)
         )
 
-    def velocity(self, x: FloatArray, uncertainty: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    def compute_velocity(
+        self, x: FloatArray, uncertainty: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
         y = np.abs(x)
         g = self.abs_jac_t @ y
         off = self.abs_minv @ (self.velocity_gamma * g + self.abs_jac_t @ (1.01 * uncertainty))
@@ -185,19 +191,19 @@ class _Bodies(_Factored):
             else False
         )
 
-    def refusal(self) -> str | None:
+    def explain_refusal(self) -> str | None:
         return "an inverse inertia has a negative eigenvalue" if self.indefinite else None
 
     def _reshape(self, v: FloatArray) -> FloatArray:
         return v.reshape(-1, 6)
 
-    def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    def compute_speeds(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         return np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
 
-    def name(self, i: int) -> str:
+    def get_name(self, i: int) -> str:
         return f"body {i}"
 
-    def max_speeds(self, energy: float) -> tuple[float, float | None] | None:
+    def bound_speeds(self, energy: float) -> tuple[float, float | None] | None:
         # 1/2 m |v|^2 <= E^2 holds for every body; 1e-9 covers the rounding of eigenvalues.
         return self.speed_per_root_energy * energy * (1.0 + 1e-9), self.spin_per_root_energy * energy * (
             1.0 + 1e-9
@@ -223,7 +229,9 @@ class _Velocities(_Factored):
             m = mass[indices][:, indices].toarray()
             x = np.linalg.inv(m)
             x = 0.5 * (x + x.T)
-            remainder = np.abs(np.eye(len(m)) - m @ x) + _gamma(len(m) + 2) * (np.abs(m) @ np.abs(x))
+            remainder = np.abs(np.eye(len(m)) - m @ x) + _bound_sum_rounding(len(m) + 2) * (
+                np.abs(m) @ np.abs(x)
+            )
             off = 2.0 * np.abs(x) @ remainder  # |X| |R| / (1 - |R|), |R| <= 1/2
             blocks.append(x)
             offs.append(off if remainder.sum(axis=1).max(initial=0.0) <= 0.5 else np.full_like(off, np.inf))
@@ -241,20 +249,20 @@ class _Velocities(_Factored):
         super().__init__(problem, minv, off)
         self.velocity_per_root_energy = np.sqrt(2.0 * (minv.diagonal() + off.diagonal()))
 
-    def refusal(self) -> str | None:
+    def explain_refusal(self) -> str | None:
         return None if np.isfinite(self.velocity_per_root_energy).all() else "M is singular to rounding"
 
-    def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    def compute_speeds(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         return np.abs(velocity), None
 
-    def name(self, i: int) -> str:
+    def get_name(self, i: int) -> str:
         return self.general.velocity_name(i)
 
-    def max_speeds(self, energy: float) -> tuple[float, float | None] | None:
+    def bound_speeds(self, energy: float) -> tuple[float, float | None] | None:
         # v_i^2 <= (M^-1)_ii |v|_M^2
         return float(self.velocity_per_root_energy.max(initial=0.0)) * energy * (1.0 + 1e-9), None
 
 
-def _gamma(n: int) -> float:
+def _bound_sum_rounding(n: int) -> float:
     """Bound n u / (1 - n u) from above for every n below 1e13."""
     return 1.01 * n * U

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only
+from lavender.base.arrays import FloatArray, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io import npz
 from lavender.io.stored import check_writable, write_bytes
 from lavender.judge.residuals import Residual, residual
-from lavender.judge.solution import Solution, uninterrupted
+from lavender.judge.solution import Solution, raise_if_interrupted
 from lavender.lab.motion import operator as operators
-from lavender.lab.motion.bound import Witness, witness
+from lavender.lab.motion.bound import Witness, compute_witness
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
@@ -60,17 +60,17 @@ class Reference:
     witness: Witness | None = field(repr=False)
 
     @property
-    def accepted(self) -> bool:
+    def is_accepted(self) -> bool:
         """Whether distances to it are reported: its relative residual is at most 1e-10, or at its floor."""
         return self.residual.relative <= REFERENCE_MAX_RESIDUAL or self.residual.at_floor
 
     @property
-    def enclosed(self) -> bool:
+    def is_enclosed(self) -> bool:
         """Whether it is an exact solution, rounded, that was enclosed with a proof."""
         return self.solver.startswith(PROOF)
 
     def __str__(self) -> str:
-        quality = "" if self.accepted else ", no solution"
+        quality = "" if self.is_accepted else ", no solution"
         residual = self.residual
         return (
             f"{self.solver}, relative {residual.relative:.1e}, floor {residual.roundoff_floor:.1e}{quality}"
@@ -87,7 +87,7 @@ class MotionCache:
     motions: Any = None
 
 
-def motion_cache(problem: Problem) -> MotionCache:
+def get_motion_cache(problem: Problem) -> MotionCache:
     """Return the motion cache of a problem; it is created at the first call.
 
     Raises
@@ -104,25 +104,25 @@ def motion_cache(problem: Problem) -> MotionCache:
         cache = problem.derived.cache.get(__name__)
         if cache is None:
             operator = operators.make_operator(problem)
-            cache = problem.derived.cache[__name__] = MotionCache(operator, operator.refusal() or "")
+            cache = problem.derived.cache[__name__] = MotionCache(operator, operator.explain_refusal() or "")
         return cache
 
 
-def reference(problem: Problem) -> Reference:
+def get_reference(problem: Problem) -> Reference:
     """Return the problem's reference; `auto` solves for it at the first call, and it is stored with the problem.
 
-    It is the best impulse that was found, even if it is not a solution: see `Reference.accepted`.
+    It is the best impulse that was found, even if it is not a solution: see `Reference.is_accepted`.
     """
-    cache = motion_cache(problem)
+    cache = get_motion_cache(problem)
     if cache.reference is None:
-        best = uninterrupted(solve(problem, REFERENCE_SOLVER, tol=REFERENCE_TOL))
+        best = raise_if_interrupted(solve(problem, REFERENCE_SOLVER, tol=REFERENCE_TOL))
         cache.reference = make_reference(problem, best.impulse, f"{REFERENCE_SOLVER}: {best.message}")
     return cache.reference
 
 
-def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
+def store_if_better(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
     """Judge an impulse (m,) [N s] and store it as the problem's reference if it is better than the stored one."""
-    cache = motion_cache(problem)
+    cache = get_motion_cache(problem)
     new = make_reference(problem, problem.impulse_array(impulse, "reference"), solver)
     if cache.reference is None or new.residual.relative < cache.reference.residual.relative:
         cache.reference = new
@@ -132,11 +132,11 @@ def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
 @np.errstate(over="ignore", invalid="ignore")  # Impulses may be at the limit of float64.
 def make_reference(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
     """Judge an impulse (m,) [N s], finite and of the right length, and build its `Reference`."""
-    cache = motion_cache(problem)
-    impulse = read_only(np.array(impulse))
+    cache = get_motion_cache(problem)
+    impulse = mark_read_only(np.array(impulse))
     proof = None
     if not cache.refusal and problem.law in CONVEX_LAWS:
-        proof = witness(problem, cache.operator, impulse)
+        proof = compute_witness(problem, cache.operator, impulse)
     return Reference(impulse, residual(problem, impulse, "float64"), solver, cache.refusal, proof)
 
 
@@ -156,7 +156,7 @@ def as_reference(problem: Problem, value: Any) -> Reference:
 # -- files ------------------------------------------------------------------------------------------------
 
 
-def _reference_path(path: str | PathLike[str]) -> Path:
+def _make_reference_path(path: str | PathLike[str]) -> Path:
     """Return the path of the reference file of a problem's file."""
     path = Path(path)
     return path.with_name(path.name + REFERENCE_SUFFIX)
@@ -170,11 +170,11 @@ def save_reference(
     The reference is `impulse` (m,) [N s] with its `source`, or by default the stored one, which is solved for if there
     is none. Raises InputError if nothing solved the problem.
     """
-    out = check_writable(_reference_path(path))
+    out = check_writable(_make_reference_path(path))
     if impulse is not None:
-        motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
-    best = reference(problem.disk)
-    if not best.accepted:
+        get_motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
+    best = get_reference(problem.disk)
+    if not best.is_accepted:
         raise InputError(f"{path}: nothing reached the floor ({best}); there is no reference to write")
     buffer = BytesIO()
     np.savez(buffer, impulse=best.impulse, solver=np.array(best.solver))
@@ -187,12 +187,12 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
 
     Returns None if there is no file, or if the impulse solves another problem: the reference is then solved for again.
     """
-    location, problem = _reference_path(path), problem.disk
+    location, problem = _make_reference_path(path), problem.disk
     if not location.is_file():
         return None
     try:
         with closing(npz.Archive(location)) as data:
-            impulse, solver = np.asarray(data["impulse"], float), str(data.scalar("solver"))
+            impulse, solver = np.asarray(data["impulse"], float), str(data.read_scalar("solver"))
     except (InputError, ValueError, TypeError) as error:
         raise InputError(
             f"{str(location)!r} holds no reference ({error}); delete it, or write it again with `lavender reference`"
@@ -200,7 +200,7 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
     if impulse.shape != (problem.m,) or not np.isfinite(impulse).all():
         return None
     best = make_reference(problem, impulse, solver)
-    if not best.accepted:
+    if not best.is_accepted:
         return None
-    motion_cache(problem).reference = best
+    get_motion_cache(problem).reference = best
     return best

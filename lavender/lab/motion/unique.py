@@ -13,7 +13,7 @@ unique if one of these holds:
     friction is small    kappa < 1, below: a contraction has one fixed point
     nothing slides       a solution has w = 0 on all rows and so much unused friction that no other can exist, (3)
 
-De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem whose normal targets
+De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem in which the normal targets
 are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
 Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu) on the
 friction rows (mu r on torsional rows, mu_r on rolling rows), and any positive diagonal T (one entry a contact),
@@ -48,10 +48,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.lab.motion.reference import motion_cache, reference
+from lavender.lab.motion.reference import get_motion_cache, get_reference
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
-from lavender.problem.ordering import rows_by_island
+from lavender.problem.ordering import group_rows_by_island
 
 MAX_DENSE_PROOF_ROWS = 600  # (1) is tested on islands of up to this many rows, as dense matrices.
 UNCOUPLED_TOL = 1e-14  # A_tn is pure rounding up to this fraction of sqrt(d_t d_n).
@@ -63,7 +63,7 @@ MIN_DEFINITE_EIGENVALUE = 1e-10
 
 @dataclass(frozen=True)
 class Uniqueness:
-    """Result of `uniqueness`: whether one motion alone is proved to solve a problem.
+    """Result of `prove_uniqueness`: whether one motion alone is proved to solve a problem.
 
     Parameters
     ----------
@@ -85,23 +85,23 @@ class Uniqueness:
         return f"unique: {self.reason}" if self.proved else f"not proved to be unique: {self.reason}"
 
 
-def uniqueness(problem: Problem) -> Uniqueness:
+def prove_uniqueness(problem: Problem) -> Uniqueness:
     """Prove that a problem has one motion; return the criterion that holds, or the first contact at which none does.
 
     For the last criterion, a problem with friction that is not small is solved by `auto`, once. Islands of more
     than 600 rows with friction are not proved.
     """
-    refusal = motion_cache(problem).refusal
+    refusal = get_motion_cache(problem).refusal
     if refusal:
         return Uniqueness(False, refusal, np.inf)
     if problem.law != "coulomb":
         return Uniqueness(True, "the law is convex", 0.0)
     c = problem.cones
-    friction = c.reach > 0.0
+    friction = c.friction_coefficient > 0.0
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
     reasons, kappa = [], 0.0
-    for island in rows_by_island(problem, c.ptr):
+    for island in group_rows_by_island(problem, c.ptr):
         if not friction[island].any():
             continue
         reason, k = _prove_island(problem, island, friction[island])
@@ -125,38 +125,40 @@ def _prove_island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> t
     if not np.isfinite(a).all() or not scale.all():
         return None, np.inf
     others = a[np.ix_(~friction, ~friction)]
-    if np.all(np.abs(a[np.ix_(friction, ~friction)]) <= UNCOUPLED_TOL) and _definite(others):
+    if np.all(np.abs(a[np.ix_(friction, ~friction)]) <= UNCOUPLED_TOL) and _is_definite(others):
         return "normals feel no friction", 0.0
-    if not _definite(a):
+    if not _is_definite(a):
         return None, np.inf
     try:
         with np.errstate(all="ignore"):
-            kappa, inverse_diagonal = _contraction_number(problem, rows, friction, a, scale)
+            kappa, inverse_diagonal = _compute_contraction_number(problem, rows, friction, a, scale)
     except np.linalg.LinAlgError:  # Products of the numbers overflow.
         return None, np.inf
     if kappa < 1.0 - CRITERION_MARGIN:
         return "friction is small", kappa
-    return ("nothing slides" if _nothing_slides(problem, rows, kappa, inverse_diagonal) else None), kappa
+    return ("nothing slides" if _can_nothing_slide(problem, rows, kappa, inverse_diagonal) else None), kappa
 
 
-def _nothing_slides(problem: Problem, rows: np.ndarray, kappa: float, inverse_diagonal: FloatArray) -> bool:
+def _can_nothing_slide(
+    problem: Problem, rows: np.ndarray, kappa: float, inverse_diagonal: FloatArray
+) -> bool:
     """Whether (3) holds for the reference; `inverse_diagonal` (k,) [kg] is Z_ii of the contacts with friction."""
-    solution = reference(problem)
+    solution = get_reference(problem)
     c, x = problem.cones, solution.impulse
     w = problem.slack(x)[rows]
     at_rest = ZERO_SLACK_FRACTION * float(np.max(np.abs(problem.b[rows]), initial=0.0))
-    if not solution.accepted or np.max(np.abs(w), initial=0.0) > at_rest:
+    if not solution.is_accepted or np.max(np.abs(w), initial=0.0) > at_rest:
         return False
     block = np.unique(np.searchsorted(c.ptr, rows, side="right") - 1)
     bounded = rows[~c.is_contact[np.searchsorted(c.ptr, rows, side="right") - 1]]
     if np.any(c.lower[bounded] > 0.0) or np.any(c.upper[bounded] < 0.0):
         return False
-    components, unused_friction = _friction_components(c), []
+    components, unused_friction = _list_friction_components(c), []
     for i in block.tolist():
         if i not in components:
             continue
         friction_used = max(
-            float(np.linalg.norm(x[rows_of_component])) / c.reach[rows_of_component[0]]
+            float(np.linalg.norm(x[rows_of_component])) / c.friction_coefficient[rows_of_component[0]]
             for rows_of_component in components[i]
         )
         unused_friction.append(x[c.ptr[i]] - friction_used)  # (1 - sigma) lambda_n
@@ -167,7 +169,7 @@ def _nothing_slides(problem: Problem, rows: np.ndarray, kappa: float, inverse_di
     )
 
 
-def _contraction_number(
+def _compute_contraction_number(
     problem: Problem, rows: np.ndarray, friction: np.ndarray, a: FloatArray, scale: FloatArray
 ) -> tuple[float, FloatArray]:
     """Compute kappa of (1), and Z_ii (k,) [kg] of the contacts that have friction."""
@@ -177,10 +179,10 @@ def _contraction_number(
     tangents = np.flatnonzero(friction)
     contacts, contact_index = np.unique(block[tangents], return_inverse=True)
     normals = np.searchsorted(rows, c.ptr[contacts])
-    size = c.reach[rows[tangents]] / scale[tangents]
+    size = c.friction_coefficient[rows[tangents]] / scale[tangents]
     sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
     inverse_on_normals = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
-    components = _friction_components(c)
+    components = _list_friction_components(c)
     n_components = float(max(len(components[i]) for i in contacts.tolist()))
     max_sliding = np.zeros(len(contacts))
     np.maximum.at(max_sliding, contact_index, np.diagonal(sliding))
@@ -194,17 +196,17 @@ def _contraction_number(
     return best, np.diagonal(inverse_on_normals)
 
 
-def _friction_components(c: Cones) -> dict[int, list[IntArray]]:
+def _list_friction_components(c: Cones) -> dict[int, list[IntArray]]:
     """Return the friction components of each contact that have a non-zero bound."""
     components: dict[int, list[IntArray]] = {}
-    reach = c.reach
-    for i, rows_of_component in c.parts():
+    reach = c.friction_coefficient
+    for i, rows_of_component in c.friction_components():
         if reach[rows_of_component[0]] > 0.0:
             components.setdefault(i, []).append(rows_of_component)
     return components
 
 
-def _definite(a: FloatArray) -> bool:
+def _is_definite(a: FloatArray) -> bool:
     """Whether a matrix of unit diagonal is positive definite with a margin."""
     try:
         np.linalg.cholesky(a - MIN_DEFINITE_EIGENVALUE * np.eye(len(a)))

@@ -10,7 +10,7 @@ from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.parts import GRAVITY
 
 
-def pendulum_period(inertia: float, torque: float, angle: float) -> float:
+def compute_period_of_pendulum(inertia: float, torque: float, angle: float) -> float:
     """Compute the period [s] of a pendulum of `inertia` about its hinge [kg m^2], released at `angle` [rad] from below.
 
     From I phi'^2/2 = m g l (cos phi - cos phi0), `torque` = m g l [N m]:
@@ -22,7 +22,7 @@ def pendulum_period(inertia: float, torque: float, angle: float) -> float:
     return 4.0 * math.sqrt(inertia / torque) * float(ellipk(math.sin(0.5 * angle) ** 2))
 
 
-def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
+def compute_period_of_flip(inertia: FloatArray, omega: FloatArray) -> float:
     """Compute the period [s] after which the angular velocity of a free body repeats, in the body's axes.
 
     Euler's equations with energy E and momentum L have Jacobi's elliptic functions as solutions (Landau, Lifshitz,
@@ -41,7 +41,7 @@ def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
     return 4.0 * float(ellipk(k2)) * math.sqrt(i1 * i2 * i3 / moment)
 
 
-def tipping_time(width: float, height: float, slope: float, angle: float) -> float:
+def compute_tipping_time(width: float, height: float, slope: float, angle: float) -> float:
     """Compute the time [s] in which a box on a slope tips by `angle` [rad] about its lower edge; inf if it stands.
 
     With r half the diagonal, beta = atan(w/h) the lean at which it balances and eps = atan(slope) - beta:
@@ -62,7 +62,7 @@ def tipping_time(width: float, height: float, slope: float, angle: float) -> flo
     return float(0.5 * math.sqrt(angle) * (weights * 2.0 * u / speed).sum())
 
 
-def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
+def compute_arch_thrust_bounds(stones: int, lean: float, thick: float) -> tuple[float, float]:
     """Compute the smallest and the largest thrust at the apex of a pointed arch, divided by the weight of a stone.
 
     All joints bear a thrust between these. A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from
@@ -72,7 +72,7 @@ def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
 
         H >= (D tan a - t)/2,        H (D cos a - t sin a) <= D (D sin a + t cos a)/2
 
-    Below the angle of friction nothing slides: the angle between resultant and axis is at most the lean.
+    Below the angle of friction nothing slides: the angle between resultant and axis does not exceed the lean.
     """
     s, c = math.sin(lean), math.cos(lean)
     d = np.arange(1, stones + 1, dtype=float)
@@ -81,11 +81,11 @@ def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
     return max(0.0, float(((d * math.tan(lean) - thick) / 2.0).max())), float(largest_thrust.min())
 
 
-def thinnest_arch(stones: int, lean: float) -> float:
-    """Compute the thickness, in lengths of a stone, below which `arch_thrust` leaves no thrust, by bisection."""
+def compute_min_arch_thickness(stones: int, lean: float) -> float:
+    """Compute the thickness [stone lengths] below which no thrust holds the arch (`compute_arch_thrust_bounds`)."""
     low, high = 0.0, float(stones)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        smallest_thrust, largest_thrust = arch_thrust(stones, lean, middle)
+        smallest_thrust, largest_thrust = compute_arch_thrust_bounds(stones, lean, middle)
         low, high = (low, middle) if smallest_thrust <= largest_thrust else (middle, high)
     return high

@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantity, Track, Values, crossing
+from lavender.lab.phenomena.parts import (
+    GRAVITY,
+    Parameter,
+    Phenomenon,
+    Quantity,
+    Track,
+    Values,
+    find_crossing_time,
+)
 from lavender.sim.scene import Scene
 
 FRICTION_PARAMETER = Parameter(0.5, 0.05, 2.0, "coefficient of friction [-]")
@@ -20,7 +28,7 @@ PATCH_RADIUS = 0.1  # [m] Radius of the contact patch.
 ROLLING_RADIUS = 0.02  # [m] Coefficient of rolling friction, mu_r.
 
 
-def _block_on_slope(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_block_on_slope(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a block on a slope: gravity is inclined and the plane level, so that no engine rounds a rotated plane."""
     angle = math.atan(p["slope"] * p["mu"])
     gravity = (GRAVITY * math.sin(angle), 0.0, -GRAVITY * math.cos(angle))
@@ -32,7 +40,7 @@ def _block_on_slope(p: Values, more: Mapping[str, Any]) -> Scene:
 
 def _measure_creep(p: Values, track: Track) -> dict[str, float]:
     """Measure the speed of creep over the last two seconds."""
-    x, late = track.moved(1), int(np.searchsorted(track.time, track.time[-1] - 2.0 - 1e-9))
+    x, late = track.compute_displacement(1), int(np.searchsorted(track.time, track.time[-1] - 2.0 - 1e-9))
     return {"creep": float(np.linalg.norm(x[-1] - x[late])) / float(track.time[-1] - track.time[late])}
 
 
@@ -47,7 +55,7 @@ def _measure_acceleration(p: Values, track: Track) -> dict[str, float]:
     return {"acceleration": abs(acceleration - truth), "wrong side": float(wrong)}
 
 
-def _sliding_block(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_sliding_block(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a block that slides on a level plane."""
     scene = Scene(**{"friction": p["mu"], **more})
     scene.add_plane()
@@ -55,7 +63,7 @@ def _sliding_block(p: Values, more: Mapping[str, Any]) -> Scene:
     return scene
 
 
-def _stop_time(p: Values) -> float:
+def _compute_stop_time(p: Values) -> float:
     """Return the exact time [s] until the block stops."""
     return p["speed"] / (p["mu"] * GRAVITY)
 
@@ -64,24 +72,24 @@ def _measure_stop(p: Values, track: Track) -> dict[str, float]:
     """Measure the errors of the stopping distance and time, and the speed at rest."""
     truth = p["speed"] ** 2 / (2 * p["mu"] * GRAVITY)
     speed = track.velocities[:, 1, 0]
-    stopped = crossing(track.time, speed, 0.1 * p["speed"]) / 0.9
+    stopped = find_crossing_time(track.time, speed, 0.1 * p["speed"]) / 0.9
     last = track.time >= track.time[-1] - 0.5
-    x = track.moved(1)[:, 0]
+    x = track.compute_displacement(1)[:, 0]
     rest = np.ptp(x[last]) / np.ptp(track.time[last])
     return {
         "distance": abs(x[-1] / truth - 1.0),
-        "time": abs(stopped - _stop_time(p)),
+        "time": abs(stopped - _compute_stop_time(p)),
         "speed at rest": rest,
     }
 
 
 def _measure_lift(p: Values, track: Track) -> dict[str, float]:
     """Measure the largest height of the block above the plane while it slides."""
-    slides = track.time <= 0.9 * _stop_time(p)
-    return {"lift": max(0.0, float(track.moved(1)[slides, 2].max()))}
+    slides = track.time <= 0.9 * _compute_stop_time(p)
+    return {"lift": max(0.0, float(track.compute_displacement(1)[slides, 2].max()))}
 
 
-def _sliding_ball(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_sliding_ball(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a ball that slides on a level plane."""
     scene = Scene(**{"friction": p["mu"], **more})
     scene.add_plane()
@@ -94,14 +102,14 @@ def _measure_roll(p: Values, track: Track) -> dict[str, float]:
     speed, spin = track.velocities[:, 1, 0], track.velocities[:, 1, 4]
     slip = speed - RADIUS * spin
     # The slip speed falls linearly from v to 0.
-    time = crossing(track.time, slip, 0.1 * p["speed"]) / 0.9
+    time = find_crossing_time(track.time, slip, 0.1 * p["speed"]) / 0.9
     return {
         "speed": abs(speed[-1] / (5 / 7 * p["speed"]) - 1.0),
         "time": abs(time - 2 * p["speed"] / (7 * p["mu"] * GRAVITY)),
     }
 
 
-def _rolling_ball(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_rolling_ball(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a ball that rolls on a level plane with rolling friction."""
     scene = Scene(**{"friction": p["mu"], "rolling_radius": p["rolling"], **more})
     scene.add_plane()
@@ -115,7 +123,7 @@ def _rolling_ball(p: Values, more: Mapping[str, Any]) -> Scene:
     return scene
 
 
-def _rolling_time(p: Values) -> float:
+def _compute_rolling_time(p: Values) -> float:
     """Return the exact time [s] until the ball stops: twice the distance over the speed, as it slows uniformly."""
     return 7 * RADIUS * p["speed"] / (5 * p["rolling"] * GRAVITY)
 
@@ -124,12 +132,12 @@ def _measure_roll_to_rest(p: Values, track: Track) -> dict[str, float]:
     """Measure the error of the rolling distance, and the speed that is left."""
     truth = 7 * RADIUS * p["speed"] ** 2 / (10 * p["rolling"] * GRAVITY)
     return {
-        "distance": abs(float(track.moved(1)[-1, 0]) / truth - 1.0),
+        "distance": abs(float(track.compute_displacement(1)[-1, 0]) / truth - 1.0),
         "left": abs(float(track.velocities[-1, 1, 0])),
     }
 
 
-def _spinning_ball(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_spinning_ball(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a ball that spins on a level plane with torsional friction."""
     scene = Scene(**{"friction": p["mu"], "patch_radius": p["patch"], **more})
     scene.add_plane()
@@ -137,14 +145,14 @@ def _spinning_ball(p: Values, more: Mapping[str, Any]) -> Scene:
     return scene
 
 
-def _spin_time(p: Values) -> float:
+def _compute_spin_time(p: Values) -> float:
     """Return the exact time [s] until the spin stops: I = 2/5 m R^2, torque mu r m g."""
     return p["spin"] * 0.4 * RADIUS**2 / (p["mu"] * p["patch"] * GRAVITY)
 
 
 def _measure_spin_down(p: Values, track: Track) -> dict[str, float]:
     """Measure the error of the spin over time, and the spin that is left."""
-    truth = p["spin"] * np.maximum(0.0, 1.0 - track.time / _spin_time(p))
+    truth = p["spin"] * np.maximum(0.0, 1.0 - track.time / _compute_spin_time(p))
     spin = track.velocities[:, 1, 5]
     return {"spin": float(np.abs(spin - truth).max()) / p["spin"], "left": abs(float(spin[-1]))}
 
@@ -159,7 +167,7 @@ FRICTION_PHENOMENA = (
         cases=({"slope": 0.5}, {"slope": 0.9}, {"slope": 0.98}),
         quantities=(Quantity("creep", "m/s", 1e-6, "speed over the last 2 of 4 s; 1e-6 is 9 cm a day"),),
         needs=frozenset({"box"}),
-        build=_block_on_slope,
+        build=_build_block_on_slope,
         seconds=lambda p: 4.0,
         measure=_measure_creep,
     ),
@@ -175,7 +183,7 @@ FRICTION_PHENOMENA = (
             Quantity("wrong side", "", 0.0, "1 if it sticks and should slide, or slides and should stick"),
         ),
         needs=frozenset({"box"}),
-        build=_block_on_slope,
+        build=_build_block_on_slope,
         seconds=lambda p: 1.5,
         measure=_measure_acceleration,
     ),
@@ -192,8 +200,8 @@ FRICTION_PHENOMENA = (
             Quantity("speed at rest", "m/s", 1e-5, "over the last 0.5 s"),
         ),
         needs=frozenset({"box"}),
-        build=_sliding_block,
-        seconds=lambda p: _stop_time(p) + 1.0,
+        build=_build_sliding_block,
+        seconds=lambda p: _compute_stop_time(p) + 1.0,
         measure=_measure_stop,
     ),
     Phenomenon(
@@ -205,8 +213,8 @@ FRICTION_PHENOMENA = (
         cases=({}, {"mu": 1.0, "speed": 5.0}),
         quantities=(Quantity("lift", "m", 1e-4, "largest value while it slides; a tenth of the slop"),),
         needs=frozenset({"box"}),
-        build=_sliding_block,
-        seconds=_stop_time,
+        build=_build_sliding_block,
+        seconds=_compute_stop_time,
         measure=_measure_lift,
     ),
     Phenomenon(
@@ -224,7 +232,7 @@ FRICTION_PHENOMENA = (
             Quantity("time", "s", 1 / 60, "one step"),
         ),
         needs=frozenset({"sphere"}),
-        build=_sliding_ball,
+        build=_build_sliding_ball,
         seconds=lambda p: 2 * p["speed"] / (7 * p["mu"] * GRAVITY) + 1.0,
         measure=_measure_roll,
     ),
@@ -247,8 +255,8 @@ FRICTION_PHENOMENA = (
             Quantity("left", "m/s", 1e-3, "speed half a second after it should have stopped"),
         ),
         needs=frozenset({"sphere", "rolling"}),
-        build=_rolling_ball,
-        seconds=lambda p: _rolling_time(p) + 0.5,
+        build=_build_rolling_ball,
+        seconds=lambda p: _compute_rolling_time(p) + 0.5,
         measure=_measure_roll_to_rest,
     ),
     Phenomenon(
@@ -269,8 +277,8 @@ FRICTION_PHENOMENA = (
             Quantity("left", "rad/s", 1e-3, "half a second after it should have stopped"),
         ),
         needs=frozenset({"sphere", "spin"}),
-        build=_spinning_ball,
-        seconds=lambda p: _spin_time(p) + 0.5,
+        build=_build_spinning_ball,
+        seconds=lambda p: _compute_spin_time(p) + 0.5,
         measure=_measure_spin_down,
     ),
 )

@@ -74,12 +74,12 @@ class Track:
     cpu: float = float("nan")
     setting: str = ""
 
-    def moved(self, body: int) -> FloatArray:
+    def compute_displacement(self, body: int) -> FloatArray:
         """Return the displacement (k, 3) [m] of a body from its initial position."""
         displacement: FloatArray = self.positions[:, body] - self.positions[0, body]
         return displacement
 
-    def axis(self, body: int, axis: int) -> FloatArray:
+    def compute_body_axis(self, body: int, axis: int) -> FloatArray:
         """Return a body's axis (k, 3) in the world frame."""
         from scipy.spatial.transform import Rotation
 
@@ -130,7 +130,7 @@ class Phenomenon:
     measure: Callable[[Values, Track], dict[str, float]]
     interval: float = 1.0 / 60.0
 
-    def values(self, overrides: Mapping[str, Any] | None = None) -> dict[str, float]:
+    def complete_parameters(self, overrides: Mapping[str, Any] | None = None) -> dict[str, float]:
         """Return the values of all parameters: defaults replaced by `overrides`.
 
         Raises
@@ -154,9 +154,9 @@ class Phenomenon:
                 values[name] = check_float(label, x, low=p.low, high=p.high)
         return values
 
-    def scene(self, overrides: Mapping[str, Any] | None = None, **more: Any) -> Scene:
+    def build_scene(self, overrides: Mapping[str, Any] | None = None, **more: Any) -> Scene:
         """Build the scene; `more` holds parameters that all scenes have, such as dt and stepper."""
-        return self.build(self.values(overrides), more)
+        return self.build(self.complete_parameters(overrides), more)
 
 
 @dataclass(frozen=True)
@@ -189,12 +189,12 @@ class Record:
     setting: str = ""
     note: str = ""
 
-    def value(self, name: str) -> float:
+    def get_value(self, name: str) -> float:
         """Return a measured number, nan if there is none."""
         return self.values.get(name, float("nan"))
 
 
-def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
+def find_crossing_time(time: FloatArray, x: FloatArray, level: float) -> float:
     """Compute the time at which x (k,) first falls below `level`, by linear interpolation; inf if it does not."""
     below = np.flatnonzero(x < level)
     if not len(below):

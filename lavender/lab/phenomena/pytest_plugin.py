@@ -90,7 +90,7 @@ class PhenomenonItem(pytest.Item):
     def __init__(self, *, phenomenon: Phenomenon, case: int, adapter: Any, **more: Any) -> None:
         super().__init__(**more)
         self.phenomenon, self.adapter = phenomenon, adapter
-        self.values = phenomenon.values(phenomenon.cases[case])
+        self.values = phenomenon.complete_parameters(phenomenon.cases[case])
         self.add_marker("phenomenon")
 
     def runtest(self) -> None:
@@ -99,7 +99,7 @@ class PhenomenonItem(pytest.Item):
         from lavender.lab.phenomena.engines import record_track
         from lavender.lab.phenomena.parts import measure_track
 
-        scene = self.phenomenon.scene(self.values)
+        scene = self.phenomenon.build_scene(self.values)
         try:
             engine = self.adapter(scene)
         except CapabilityError as error:
@@ -125,7 +125,7 @@ class PhenomenonItem(pytest.Item):
             yield record.note
             return
         for quantity in self.phenomenon.quantities:
-            value = record.value(quantity.name)
+            value = record.get_value(quantity.name)
             if value > quantity.bound:
                 yield (
                     f"{quantity.name} is {value:.3g} {quantity.unit}; at most {quantity.bound:g} {quantity.unit} "

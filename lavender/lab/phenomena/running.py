@@ -29,17 +29,19 @@ class EngineProcess(ProcessBackend):
     """Steps scenes in another process, which is started again if it ended; `limit` [s] is for one track."""
 
     def __init__(self, limit: float = TRACK_TIME_LIMIT) -> None:
-        super().__init__(simulate)
+        super().__init__(record_track_of_engine)
         self.limit = limit
 
-    def track(self, variant: EngineVariant, scene: Scene, seconds: float, interval: float) -> Track | str:
+    def record_track(
+        self, variant: EngineVariant, scene: Scene, seconds: float, interval: float
+    ) -> Track | str:
         """Return the motion that the engine computes, or the reason why there is none."""
         try:
             self.start()
         except ProcessEnded as error:
             return f"its process does not start: {error}"
         try:
-            answer, (time, positions, quaternions, velocities) = self.call(
+            answer, (time, positions, quaternions, velocities) = self.call_function(
                 variant.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
             )
             k, n = len(time), len(scene.bodies)
@@ -64,7 +66,7 @@ class EngineProcess(ProcessBackend):
             return f"its process ended: {error}"
 
 
-def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
+def record_track_of_engine(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
     """Step a scene with the engine of that name, in the process of `EngineProcess`."""
     engine = make_engine(ENGINE_VARIANTS[name], scene)
     try:
@@ -158,7 +160,7 @@ def run(
     plan = [
         (p, case)
         for p in select_phenomena(names)
-        for case in map(p.values, p.cases if parameters is None else (parameters,))
+        for case in map(p.complete_parameters, p.cases if parameters is None else (parameters,))
     ]
     selected = select_variants(steppers, engines)
     if not selected:
@@ -167,7 +169,7 @@ def run(
     process = EngineProcess(limit)
     try:
         for variant in selected:
-            for record in _measure(variant, plan, process, keep):
+            for record in _measure_variant(variant, plan, process, keep):
                 found.append(record)
                 show(record)
     finally:
@@ -175,14 +177,14 @@ def run(
     return found
 
 
-def _measure(
+def _measure_variant(
     variant: EngineVariant,
     plan: list[tuple[Phenomenon, dict[str, float]]],
     process: EngineProcess,
     keep: Callable[[Record, Track], None],
 ) -> Iterator[Record]:
     """Measure all cases of the plan in one engine variant; a case that it cannot run gets a note."""
-    reason = variant.missing()
+    reason = variant.explain_missing()
     for phenomenon, case in plan:
         note = reason or next(
             (variant.cannot[x] for x in sorted(phenomenon.needs) if x in variant.cannot), ""
@@ -203,9 +205,9 @@ def _simulate_case(
     """Simulate one case, third-party engines in the other process; return the reason if that fails."""
     seconds = phenomenon.seconds(case)
     try:
-        scene = phenomenon.scene(case, **variant.scene)
+        scene = phenomenon.build_scene(case, **variant.scene)
         if variant.module != "own":
-            return process.track(variant, scene, seconds, phenomenon.interval)
+            return process.record_track(variant, scene, seconds, phenomenon.interval)
         return record_track(make_engine(variant, scene), seconds, phenomenon.interval)
     except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

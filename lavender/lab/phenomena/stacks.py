@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.lab.phenomena.analytic_solutions import thinnest_arch, tipping_time
+from lavender.lab.phenomena.analytic_solutions import compute_min_arch_thickness, compute_tipping_time
 from lavender.lab.phenomena.parts import (
     GRAVITY,
     Parameter,
@@ -16,13 +16,13 @@ from lavender.lab.phenomena.parts import (
     Quantity,
     Track,
     Values,
-    crossing,
+    find_crossing_time,
     has_fallen,
 )
 from lavender.sim.scene import Scene
-from lavender.sim.scene.parts import quaternion
+from lavender.sim.scene.parts import make_quaternion
 
-TIP_ANGLE = 0.5  # rad, tilt at which a box counts as tipped
+TIP_ANGLE = 0.5  # [rad] Tilt at which a box counts as tipped.
 BRICK_SIZE = (1.0, 0.5, 0.25)  # m
 MAX_STANDING_DROP = 0.1  # [m] A brick or stone that ends lower than this does not stand.
 WRONG_TIPPING = Quantity("wrong side", "", 0.0, "1 if it tips and should stand, or stands and should tip")
@@ -31,7 +31,7 @@ WRONG_DROP = Quantity(
 )
 
 
-def _tall_box(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_tall_box(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a tall box on a slope, as a level plane with inclined gravity."""
     angle = math.atan(p["slope"] * p["width"])
     gravity = (GRAVITY * math.sin(angle), 0.0, -GRAVITY * math.cos(angle))
@@ -43,16 +43,16 @@ def _tall_box(p: Values, more: Mapping[str, Any]) -> Scene:
 
 def _measure_tipping(p: Values, track: Track) -> dict[str, float]:
     """Measure the error of the time to tip, and whether the box wrongly tips or stands."""
-    up = track.axis(1, 2)
+    up = track.compute_body_axis(1, 2)
     tilt = np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2])
-    truth = tipping_time(p["width"], 1.0, p["slope"] * p["width"], TIP_ANGLE)
+    truth = compute_tipping_time(p["width"], 1.0, p["slope"] * p["width"], TIP_ANGLE)
     if p["slope"] < 1.0:
         return {"time": 0.0, "wrong side": float(tilt.max() >= TIP_ANGLE)}
-    time = crossing(track.time, -tilt, -TIP_ANGLE)
+    time = find_crossing_time(track.time, -tilt, -TIP_ANGLE)
     return {"time": abs(time - truth), "wrong side": float(time == math.inf)}
 
 
-def _bricks(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_overhanging_bricks(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build bricks on each other: from the top down, brick k overhangs the next one by 1/(2 k) of its length."""
     scene = Scene(**{"gravity": GRAVITY, "friction": 0.5, **more})
     scene.add_plane()
@@ -66,14 +66,14 @@ def _bricks(p: Values, more: Mapping[str, Any]) -> Scene:
 
 def _measure_overhang(p: Values, track: Track) -> dict[str, float]:
     """Measure the drop of the top brick, and whether it wrongly drops or stands."""
-    drop = max(0.0, -float(track.moved(track.positions.shape[1] - 1)[-1, 2]))
+    drop = max(0.0, -float(track.compute_displacement(track.positions.shape[1] - 1)[-1, 2]))
     return {
         "drop": drop if p["reach"] < 1.0 else 0.0,
         "wrong side": float((drop > MAX_STANDING_DROP) != (p["reach"] > 1.0)),
     }
 
 
-def _heavy_on_light(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_heavy_on_light(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a heavy box on light ones."""
     return Scene(
         "heavy_on_light", n=int(p["boxes"]), ratio=p["ratio"], **{"gravity": GRAVITY, "friction": 0.5, **more}
@@ -86,10 +86,10 @@ def _measure_loaded_stack(p: Values, track: Track) -> dict[str, float]:
     return {"sink": max(0.0, sink), "fell": float(has_fallen(track.positions[0], track.positions[-1]))}
 
 
-def _arch(p: Values, more: Mapping[str, Any]) -> Scene:
+def _build_arch(p: Values, more: Mapping[str, Any]) -> Scene:
     """Build a pointed arch of stones between two inclined planes."""
     lean, half = math.atan(p["lean"]), int(p["stones"]) // 2
-    thick = p["thickness"] * thinnest_arch(half, lean)
+    thick = p["thickness"] * compute_min_arch_thickness(half, lean)
     s, c = math.sin(lean), math.cos(lean)
     scene = Scene(**{"gravity": GRAVITY, "friction": 1.0, **more})
     scene.add_plane((s, 0.0, c))
@@ -97,10 +97,12 @@ def _arch(p: Values, more: Mapping[str, Any]) -> Scene:
     foot = half * s + 0.5 * thick * c  # horizontal distance from the apex to the centre of a foot
     for side in (-1.0, 1.0):
         for i in range(half):
-            # The centre of the foot is on its skewback, whose height is the horizontal distance times tan(lean).
+            # The centre of the foot is on its skewback, at a height of the horizontal distance times tan(lean).
             x, z = side * (foot - (i + 0.5) * s), foot * s / c + (i + 0.5) * c
             scene.add_box(
-                (thick, 1.0, 1.0), position=(x, 0.0, z), quaternion=quaternion((0.0, 1.0, 0.0), -side * lean)
+                (thick, 1.0, 1.0),
+                position=(x, 0.0, z),
+                quaternion=make_quaternion((0.0, 1.0, 0.0), -side * lean),
             )
     return scene
 
@@ -131,8 +133,10 @@ STACK_PHENOMENA = (
             WRONG_TIPPING,
         ),
         needs=frozenset({"box"}),
-        build=_tall_box,
-        seconds=lambda p: min(5.0, 1.0 + tipping_time(p["width"], 1.0, p["slope"] * p["width"], TIP_ANGLE)),
+        build=_build_tall_box,
+        seconds=lambda p: min(
+            5.0, 1.0 + compute_tipping_time(p["width"], 1.0, p["slope"] * p["width"], TIP_ANGLE)
+        ),
         measure=_measure_tipping,
     ),
     Phenomenon(
@@ -152,7 +156,7 @@ STACK_PHENOMENA = (
         ),
         quantities=(Quantity("drop", "m", 0.01, "of the top brick in 10 s, if it should stand"), WRONG_DROP),
         needs=frozenset({"box"}),
-        build=_bricks,
+        build=_build_overhanging_bricks,
         seconds=lambda p: 10.0,
         measure=_measure_overhang,
     ),
@@ -171,7 +175,7 @@ STACK_PHENOMENA = (
             Quantity("fell", "", 0.0, "1 if a box ends half an edge lower than it started"),
         ),
         needs=frozenset({"box"}),
-        build=_heavy_on_light,
+        build=_build_heavy_on_light,
         seconds=lambda p: 60.0,
         measure=_measure_loaded_stack,
         interval=0.1,
@@ -182,7 +186,7 @@ STACK_PHENOMENA = (
         why="it stands by thrust alone: the contacts of a whole structure must be correct at once",
         truth=(
             "limit analysis: it stands if one thrust keeps the resultant inside every joint "
-            "(`analytic_solutions.arch_thrust`); the thinnest such arch is the unit of thickness"
+            "(`analytic_solutions.compute_arch_thrust_bounds`); the thinnest such arch is the unit of thickness"
         ),
         parameters={
             "thickness": Parameter(1.1, 0.5, 2.0, "over the thinnest that stands [-]"),
@@ -195,7 +199,7 @@ STACK_PHENOMENA = (
             WRONG_DROP,
         ),
         needs=frozenset({"box"}),
-        build=_arch,
+        build=_build_arch,
         seconds=lambda p: 10.0,
         measure=_measure_arch,
     ),

@@ -28,9 +28,9 @@ def _group_records(records: Sequence[Record]) -> dict[tuple[str, str], list[Reco
     return lines
 
 
-def _worst_value(group: Sequence[Record], phenomenon: Phenomenon) -> float:
+def _get_worst_value(group: Sequence[Record], phenomenon: Phenomenon) -> float:
     """Return the largest value of the phenomenon's first quantity."""
-    return max(r.value(phenomenon.quantities[0].name) for r in group)
+    return max(r.get_value(phenomenon.quantities[0].name) for r in group)
 
 
 def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
@@ -39,12 +39,12 @@ def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
     if not measured:
         return "–"
     passed = sum(r.passed for r in group)
-    text = _format_number(_worst_value(measured, phenomenon), phenomenon.quantities[0].unit)
+    text = _format_number(_get_worst_value(measured, phenomenon), phenomenon.quantities[0].unit)
     text = f"{text}, {passed}/{len(group)}"
     return text if passed == len(group) else f"**{text}**"
 
 
-def table(records: Sequence[Record]) -> str:
+def format_markdown_table(records: Sequence[Record]) -> str:
     """Build a Markdown table: worst value of the first quantity, cases that passed of those run; bold if one failed."""
     groups = _group_records(records)
     names = [n for n in PHENOMENA if any(key[1] == n for key in groups)]
@@ -59,7 +59,7 @@ def table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
-def notes(records: Sequence[Record]) -> list[str]:
+def list_notes(records: Sequence[Record]) -> list[str]:
     """Return one line per engine variant and reason why cells are empty or cases have no values."""
     lines: dict[tuple[str, str], list[str]] = {}
     for r in records:
@@ -68,7 +68,7 @@ def notes(records: Sequence[Record]) -> list[str]:
     return [f"{engine}: {', '.join(which)}: {note}" for (engine, note), which in lines.items()]
 
 
-def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
+def list_out_of_bound_cases(records: Sequence[Record]) -> list[str]:
     """Return one line per lavender stepper and phenomenon with cases out of bound."""
     lines = []
     for (variant, name), group in _group_records(records).items():
@@ -76,8 +76,8 @@ def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
         if ENGINE_VARIANTS[variant].module != "own" or not bad:
             continue
         phenomenon = PHENOMENA[name]
-        exceeded = [q for q in phenomenon.quantities if any(r.value(q.name) > q.bound for r in bad)]
-        worst = {q.name: max(r.value(q.name) for r in bad) for q in exceeded}
+        exceeded = [q for q in phenomenon.quantities if any(r.get_value(q.name) > q.bound for r in bad)]
+        worst = {q.name: max(r.get_value(q.name) for r in bad) for q in exceeded}
         measurements = ", ".join(
             f"{q.name} {_format_number(worst[q.name], q.unit)} (bound {_format_number(q.bound, q.unit)})"
             for q in exceeded
@@ -99,7 +99,7 @@ def format_record(r: Record) -> str:
     if r.note:
         return f"{head}: {r.note}"
     measurements = ", ".join(
-        f"{q.name} {_format_number(r.value(q.name), q.unit)}" for q in phenomenon.quantities
+        f"{q.name} {_format_number(r.get_value(q.name), q.unit)}" for q in phenomenon.quantities
     )
     return f"{head}: {measurements}{'' if r.passed else ' – out of bound'}"
 

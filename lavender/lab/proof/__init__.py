@@ -36,7 +36,7 @@ from lavender.base.errors import CapabilityError
 from lavender.judge import certificates
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution
-from lavender.lab.motion.reference import PROOF, make_reference, motion_cache, reference
+from lavender.lab.motion.reference import PROOF, get_motion_cache, get_reference, make_reference
 from lavender.lab.proof.numbers import ball_precision
 from lavender.lab.proof.search import Enclosure, Search
 from lavender.problem import Problem, check_problem
@@ -124,7 +124,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
 
 def _check_certificate(problem: Problem, certificate: FloatArray) -> Enclosure:
     """Check a certificate (m,) on the problem's numbers as exact ones."""
-    proof = certificates.prove(problem, certificate)
+    proof = certificates.prove_infeasibility(problem, certificate)
     holds = not proof.reason and proof.impulse_bound == math.inf
     return Enclosure(False, reason=proof.reason or proof.message, infeasible=holds)
 
@@ -134,7 +134,7 @@ def _prove_from(problem: Problem, start: FloatArray, answer: FloatArray) -> Encl
     for bits in BALL_PRECISIONS:
         with ball_precision(bits) as flint:
             search = Search(flint, problem, start, answer)
-            enclosure = search.run()
+            enclosure = search.search_solution()
         if enclosure.proven or search.singular:
             break
     return enclosure
@@ -143,9 +143,9 @@ def _prove_from(problem: Problem, start: FloatArray, answer: FloatArray) -> Encl
 def enclose_reference(problem: Problem) -> Enclosure:
     """Enclose an exact solution near the problem's motion reference and store it as that reference."""
     problem = problem.disk
-    enclosure = prove(problem, reference(problem).impulse)
+    enclosure = prove(problem, get_reference(problem).impulse)
     if enclosure.impulse is not None:
-        motion_cache(problem).reference = make_reference(
+        get_motion_cache(problem).reference = make_reference(
             problem, enclosure.impulse, f"{PROOF}an exact solution within {enclosure.velocity_radius:.1e} m/s"
         )
     return enclosure

@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import lapack
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 
 
 class Tangled(Exception):
@@ -20,7 +20,7 @@ class Tangled(Exception):
 # Above this many rows the factor is sparse; it does not eliminate the row with the largest pivot first.
 MAX_DENSE_GRAM_ROWS = 1000
 
-# A row depends on others to rounding if its squared distance from their span is at most this fraction of its squared
+# A row depends on others to rounding if its squared distance from their span is up to this fraction of its squared
 # length.
 ROUNDING_DEPENDENCE_TOL = 1e-10
 
@@ -38,7 +38,7 @@ def order_by_dependence(j: Any) -> tuple[Any, int]:
         return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
     shifted = gram + SPARSE_GRAM_SHIFT * sp.eye_array(m)
     options = {"SymmetricMode": True}
-    factor = sparse_lu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    factor = factor_sparse_lu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     # Pivots of a Cholesky factor: the squared distances of rows from the span of those before them.
     independent = abs(factor.U.diagonal()[factor.perm_c]) > ROUNDING_DEPENDENCE_TOL
     return np.concatenate([np.flatnonzero(independent), np.flatnonzero(~independent)]), int(
@@ -52,7 +52,7 @@ PRIME = 2**61 - 1
 MAX_INTEGER_RANK = 600
 
 
-def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
+def find_dependent_rows(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
     """Return rows of J that are independent of those before them, and dependent rows with contradicting targets.
 
     Rows that are independent modulo a prime are independent. If they span all columns that they use, the other rows
@@ -89,7 +89,7 @@ def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple
 def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[int]] | None:
     """Return (independent rows, rows that contradict them) of one component of J, or None if its rank is too large."""
     m, n = j.shape
-    integer_rows = _integer_rows(np.column_stack([j.toarray(), target]))
+    integer_rows = _scale_rows_to_integers(np.column_stack([j.toarray(), target]))
     prime = PRIME
     while True:
         reduced, rank = flint.nmod_mat(
@@ -109,7 +109,7 @@ def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int],
         }
         proofs = [
             _residual_rows_depend_on_others(flint, integer_rows, rows, residuals)
-            for rows in _connected_sets(m, [(independent_rows[i], k) for i, k in entries])
+            for rows in _group_connected_rows(m, [(independent_rows[i], k) for i, k in entries])
         ]
         if None in proofs:
             return None
@@ -119,7 +119,7 @@ def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int],
         prime = next(p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime())
 
 
-def _connected_sets(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
+def _group_connected_rows(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
     """Partition `m` rows into sets that pairs connect; a row without a pair is a set of its own."""
     at = tuple(np.array(pairs, np.int64).reshape(-1, 2).T)
     joined = sp.coo_array((np.ones(len(pairs)), at), shape=(m, m))
@@ -137,16 +137,20 @@ def _residual_rows_depend_on_others(
     if len(independent) > MAX_INTEGER_RANK:
         return None
     agree = [integer_rows[k] for k in rows if not residuals.get(k)]
-    return _rank(flint, [integer_rows[k][:-1] for k in rows]) == len(independent) == _rank(flint, agree)
+    return (
+        _compute_rank(flint, [integer_rows[k][:-1] for k in rows])
+        == len(independent)
+        == _compute_rank(flint, agree)
+    )
 
 
-def _rank(flint: Any, rows: list[list[int]]) -> int:
+def _compute_rank(flint: Any, rows: list[list[int]]) -> int:
     """Return the rank of an integer matrix, its zero columns removed."""
     live = [k for k in range(len(rows[0])) if any(row[k] for row in rows)] if rows else []
     return int(flint.fmpz_mat(len(rows), len(live), [row[k] for row in rows for k in live]).rank())
 
 
-def _integer_rows(a: FloatArray) -> list[list[int]]:
+def _scale_rows_to_integers(a: FloatArray) -> list[list[int]]:
     """Multiply each row by a power of two that makes its numbers integers, exactly."""
     mantissa, power = np.frexp(a)
     power = np.where(a != 0.0, power, power.max(axis=1, keepdims=True, initial=0))

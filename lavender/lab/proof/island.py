@@ -19,8 +19,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
-from lavender.lab.proof.numbers import UNIT, max_abs, upper_end
+from lavender.base.lu import factor_sparse_lu
+from lavender.lab.proof.numbers import UNIT, max_abs, round_up_magnitude
 from lavender.lab.proof.operator import MAX_DENSE_FLOAT_ROWS, Part, Rounded, round_up
 
 MAX_BALL_INVERSE_UNKNOWNS = (
@@ -31,7 +31,7 @@ MAX_INVERSE_ENTRIES = (
     4_000_000  # Largest number of entries of the inverse that are in memory at once (32 MB).
 )
 
-# A friction component with a speed of at most this fraction of the largest b may stick in the solution.
+# A friction component with a speed of up to this fraction of the largest b may stick in the solution.
 STICKING_SPEED_FRACTION = 1e-9
 
 MAX_BOX_ENLARGEMENTS = 10  # The box X is enlarged at most this often.
@@ -75,10 +75,10 @@ class Island:
         self.index = {r: k for k, r in enumerate(which)}
         self.base = [base[r] for r in which]
 
-    def value(self, x: list[Any]) -> tuple[list[Any], Any]:
+    def evaluate_equations(self, x: list[Any]) -> tuple[list[Any], Any]:
         """Compute F, and (w, s) of each sliding component."""
         number, index = self.number, self.index
-        w = [p + q for p, q in zip(self.part.times(x), self.base, strict=True)]
+        w = [p + q for p, q in zip(self.part.multiply(x), self.base, strict=True)]
         out, speeds = list(w), []
         for first, part in self.sliding:
             z = [number(c) * w[index[r]] for r, c in zip(part.rows, part.coefficients, strict=True)]
@@ -92,7 +92,7 @@ class Island:
                 out[index[first]] -= s
         return out, speeds
 
-    def slope(self, x: list[Any], speeds: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
+    def compute_slope(self, x: list[Any], speeds: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
         """Return F' = left A + right over a box: entries of `left` that differ from I, nonzero ones of `right`."""
         number, index = self.number, self.index
         left: dict[Any, Any] = {}
@@ -114,26 +114,26 @@ class Island:
                     left[index[first], q] = -ds
         return left, right
 
-    def floats(self, x: list[Any], speeds: Any) -> Rounded:
+    def compute_slope_as_floats(self, x: list[Any], speeds: Any) -> Rounded:
         """Return the slope as float64 numbers with error bounds."""
-        a, n = self.part.bounded, len(x)
+        a, n = self.part.rounded_matrix, len(x)
         if not self.sliding:
             return a
-        left, right = self.slope(x, speeds)
+        left, right = self.compute_slope(x, speeds)
         for k in range(n):
             left.setdefault((k, k), self.number(1.0))
-        (p, dp), (r, dr) = (_bounded(entries, n) for entries in (left, right))
+        (p, dp), (r, dr) = (_split_midpoints_and_bounds(entries, n) for entries in (left, right))
         size = abs(p) @ abs(a.near)
-        rounding = 2.0 * (_max_row_entries(p) + 2) * UNIT  # (3)
+        rounding = 2.0 * (_count_max_row_entries(p) + 2) * UNIT  # (3)
         off = abs(p) @ a.off + dp @ (abs(a.near) + a.off) + dr + rounding * (size + abs(r))
         return Rounded(p @ a.near + r, round_up(off))
 
-    def balls(self, x: list[Any], speeds: Any) -> Any:
+    def compute_slope_as_balls(self, x: list[Any], speeds: Any) -> Any:
         """Return the slope as a matrix of balls."""
-        a, n = self.part.exact, len(x)
+        a, n = self.part.exact_matrix, len(x)
         if not self.sliding:
             return a
-        left, right = self.slope(x, speeds)
+        left, right = self.compute_slope(x, speeds)
         full, added = self.flint.arb_mat(n, n, np.eye(n).ravel().tolist()), self.flint.arb_mat(n, n)
         for (k, q), v in left.items():
             full[k, q] = v
@@ -141,13 +141,13 @@ class Island:
             added[k, q] = v
         return full * a + added
 
-    def enclose(self, answer: list[float], velocity_scale: float) -> list[Any]:
+    def enclose_zero(self, answer: list[float], velocity_scale: float) -> list[Any]:
         """Compute balls that contain exactly one zero of the equations, starting from the impulses `answer` [N s].
 
         Raises
         ------
         Sticks
-            Components have zero speed, or speeds of at most STICKING_SPEED_FRACTION of `velocity_scale` [m/s] at the
+            Components have zero speed, or speeds of up to STICKING_SPEED_FRACTION of `velocity_scale` [m/s] at the
             answer.
         NoZero
             No box proves a zero.
@@ -159,7 +159,7 @@ class Island:
                 with np.errstate(
                     over="ignore", invalid="ignore"
                 ):  # Numbers that are not finite prove nothing.
-                    enclosure = self._krawczyk(*self._newton(start, inverse))
+                    enclosure = self._verify_by_krawczyk(*self._run_newton(start, inverse))
             except ZeroDivisionError:
                 enclosure = None
             if enclosure is not None:
@@ -167,7 +167,7 @@ class Island:
             if len(start) > MAX_BALL_INVERSE_UNKNOWNS:
                 break
         # A component that hardly slides at the answer may stick.
-        _, speeds = self.value(start)
+        _, speeds = self.evaluate_equations(start)
         slow = [
             p
             for (_, p), (_, s) in zip(self.sliding, speeds, strict=True)
@@ -175,14 +175,14 @@ class Island:
         ]
         if slow:
             raise Sticks(slow)
-        raise NoZero(self.floats(start, speeds).near)
+        raise NoZero(self.compute_slope_as_floats(start, speeds).near)
 
-    def _newton(self, x: list[Any], kind: Any) -> tuple[list[Any], Any]:
+    def _run_newton(self, x: list[Any], kind: Any) -> tuple[list[Any], Any]:
         """Run Newton's method; return the midpoints near a zero, and the inverse of the slope there."""
         inverse, moved, last = None, math.inf, math.inf
         small = 2.0 ** (-0.75 * self.flint.ctx.prec)
         for step in range(30):
-            value, speeds = self.value(x)
+            value, speeds = self.evaluate_equations(x)
             if any(not (s > 0) for _, s in speeds):
                 break  # The component's case is wrong, or it is on the boundary of two.
             if (
@@ -191,29 +191,29 @@ class Island:
                 or (self.sliding and step < 3)
             ):
                 inverse = kind(self, x, speeds)
-            move = inverse.times(value)
+            move = inverse.multiply(value)
             x = [(p - q).mid() for p, q in zip(x, move, strict=True)]
             size, last, moved = max_abs(x), moved, max_abs(move)
             if not math.isfinite(moved):
                 raise ZeroDivisionError
             if step > 1 and (moved <= small * size or (step > 9 and moved > 0.1 * last)):
                 break
-        _, speeds = self.value(x)
+        _, speeds = self.evaluate_equations(x)
         sticking = [part for (_, part), (_, s) in zip(self.sliding, speeds, strict=True) if not s > 0]
         if sticking:
             raise Sticks(sticking)
         return x, inverse
 
-    def _krawczyk(self, x: list[Any], inverse: Any) -> list[Any] | None:
+    def _verify_by_krawczyk(self, x: list[Any], inverse: Any) -> list[Any] | None:
         """Return balls around x by (2), or None if no box is found."""
         number = self.number
-        value, speeds = self.value(x)
+        value, speeds = self.evaluate_equations(x)
         half_width = np.full(len(x), 2.0 ** (-0.6 * self.flint.ctx.prec) * max_abs(x) + 2.0**-900)
         for _ in range(MAX_BOX_ENLARGEMENTS):
             box = [p + number(0.0, q) for p, q in zip(x, half_width.tolist(), strict=True)]
-            _, speeds = self.value(box) if self.sliding else (None, [])
+            _, speeds = self.evaluate_equations(box) if self.sliding else (None, [])
             if all(s > 0 for _, s in speeds):
-                box_radius = inverse.radius(box, speeds, value, half_width)
+                box_radius = inverse.bound_radius(box, speeds, value, half_width)
                 if (box_radius < half_width).all():
                     return [p + number(0.0, q) for p, q in zip(x, box_radius.tolist(), strict=True)]
                 half_width = 4.0 * np.maximum(half_width, box_radius)
@@ -230,20 +230,22 @@ class BallInverse:
     def __init__(self, island: Island, x: list[Any], speeds: Any) -> None:
         self.island = island
         self.matrix = island.flint.arb_mat
-        self.inverse = island.balls(x, speeds).mid().inv().mid()
+        self.inverse = island.compute_slope_as_balls(x, speeds).mid().inv().mid()
 
-    def times(self, value: list[Any]) -> list[Any]:
+    def multiply(self, value: list[Any]) -> list[Any]:
         """Compute the midpoints of Y F."""
         return (self.inverse * self.matrix(len(value), 1, value)).mid().entries()
 
-    def radius(self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray) -> FloatArray:
+    def bound_radius(
+        self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray
+    ) -> FloatArray:
         """Compute |Y F| + |I - Y F'(X)| (X - x), rounded up."""
         n = len(box)
         unit = self.matrix(n, n, np.eye(n).ravel().tolist())
         ball = self.matrix(n, 1, [self.island.number(0.0, q) for q in half_width.tolist()])
         newton = self.inverse * self.matrix(n, 1, value)
-        away = (unit - self.inverse * self.island.balls(box, speeds)) * ball - newton
-        return np.array([upper_end(q) for q in away.entries()])
+        away = (unit - self.inverse * self.island.compute_slope_as_balls(box, speeds)) * ball - newton
+        return np.array([round_up_magnitude(q) for q in away.entries()])
 
 
 class FloatInverse:
@@ -251,11 +253,13 @@ class FloatInverse:
 
     def __init__(self, island: Island, x: list[Any], speeds: Any) -> None:
         self.island = island
-        near = island.floats(x, speeds).near
+        near = island.compute_slope_as_floats(x, speeds).near
         with np.errstate(all="ignore"):
-            self.column = _scaling_powers(np.sqrt(_max_abs(near, 0)))
-            self.row = _scaling_powers(_max_abs(_scaled(near, np.ones(len(x)), self.column), 1))
-            near = _scaled(near, self.row, self.column)
+            self.column = _compute_scaling_powers(np.sqrt(_max_abs(near, 0)))
+            self.row = _compute_scaling_powers(
+                _max_abs(_scale_rows_and_columns(near, np.ones(len(x)), self.column), 1)
+            )
+            near = _scale_rows_and_columns(near, self.row, self.column)
             self.dense_inverse: Any = None
             self.factor: Any = None
             try:
@@ -263,7 +267,7 @@ class FloatInverse:
                     self.dense_inverse = np.linalg.inv(near)
                 elif np.isfinite(near.data).all():
                     options = {"SymmetricMode": True}
-                    self.factor = sparse_lu(
+                    self.factor = factor_sparse_lu(
                         near, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options
                     )
                 else:
@@ -271,7 +275,7 @@ class FloatInverse:
             except (np.linalg.LinAlgError, RuntimeError):
                 raise ZeroDivisionError from None
 
-    def times(self, value: list[Any]) -> list[Any]:
+    def multiply(self, value: list[Any]) -> list[Any]:
         """Compute the midpoints of Y F."""
         right = self.row * np.array([float(q) for q in value])
         move = self.column * (
@@ -279,7 +283,7 @@ class FloatInverse:
         )
         return [self.island.number(q) for q in move.tolist()]
 
-    def _rows(self, n: int) -> Iterator[tuple[int, FloatArray]]:
+    def _iterate_rows(self, n: int) -> Iterator[tuple[int, FloatArray]]:
         """Yield rows of Y as columns, in portions that fit MAX_INVERSE_ENTRIES, with the index of the first."""
         if self.dense_inverse is not None:
             yield 0, self.dense_inverse.T
@@ -292,21 +296,23 @@ class FloatInverse:
             yield first, self.factor.solve(unit, trans="T")
 
     @np.errstate(under="ignore")  # UNDERFLOW_BOUND accounts for underflow.
-    def radius(self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray) -> FloatArray:
+    def bound_radius(
+        self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray
+    ) -> FloatArray:
         """Compute |Y F| + |I - Y F'(X)| (X - x), rounded up; inf if float64 cannot represent the numbers."""
-        slope, n = self.island.floats(box, speeds), len(box)
-        near, off = (_scaled(a, self.row, self.column) for a in slope)
+        slope, n = self.island.compute_slope_as_floats(box, speeds), len(box)
+        near, off = (_scale_rows_and_columns(a, self.row, self.column) for a in slope)
         before, after = (a.ravel() if isinstance(a, np.ndarray) else a.data for a in (slope.near, near))
         nonzero = abs(np.concatenate([self.row, self.column, after[before != 0.0]]))
         out = np.full(n, math.inf)
         if not ((nonzero > UNDERFLOW_BOUND) & (nonzero < 1.0 / UNDERFLOW_BOUND)).all():
             return out  # Products of these numbers overflow or underflow.
         transposed = near.T if isinstance(near, np.ndarray) else near.T.tocsr()
-        k = 2.0 * (_max_row_entries(transposed) + 3) * UNIT  # (3)
+        k = 2.0 * (_count_max_row_entries(transposed) + 3) * UNIT  # (3)
         r = round_up(half_width / self.column)
-        f = round_up(self.row * np.array([upper_end(q) for q in value]))
+        f = round_up(self.row * np.array([round_up_magnitude(q) for q in value]))
         t = f + (k * abs(near) + round_up(off)) @ r + UNDERFLOW_BOUND * r.sum()
-        for first, y in self._rows(n):
+        for first, y in self._iterate_rows(n):
             p = transposed @ y
             p[np.arange(first, first + y.shape[1]), np.arange(y.shape[1])] -= 1.0
             out[first : first + y.shape[1]] = abs(p).T @ r + abs(y).T @ t
@@ -314,12 +320,12 @@ class FloatInverse:
         return np.where(np.isfinite(out), out, math.inf)
 
 
-def _scaling_powers(size: FloatArray) -> FloatArray:
+def _compute_scaling_powers(size: FloatArray) -> FloatArray:
     """Return powers of two that scale `size` to about 1."""
     return np.exp2(-np.round(np.log2(np.where(size > 0.0, size, 1.0))))
 
 
-def _scaled(a: Any, row: FloatArray, column: FloatArray) -> Any:
+def _scale_rows_and_columns(a: Any, row: FloatArray, column: FloatArray) -> Any:
     """Multiply the rows and the columns of `a` by factors."""
     if isinstance(a, np.ndarray):
         return row[:, None] * a * column
@@ -333,17 +339,17 @@ def _max_abs(a: Any, axis: int) -> FloatArray:
     return np.asarray(size if isinstance(a, np.ndarray) else size.toarray().ravel())
 
 
-def _max_row_entries(a: Any) -> int:
+def _count_max_row_entries(a: Any) -> int:
     """Return the largest number of non-zero entries in a row."""
     count = np.count_nonzero(a, axis=1) if isinstance(a, np.ndarray) else np.diff(a.indptr)
     return int(count.max())
 
 
-def _bounded(entries: dict[Any, Any], n: int) -> tuple[Any, Any]:
+def _split_midpoints_and_bounds(entries: dict[Any, Any], n: int) -> tuple[Any, Any]:
     """Return the float64 midpoints of balls as an (n, n) matrix, and a matrix of bounds of their errors."""
     at = tuple(np.array(list(entries), np.int64).reshape(-1, 2).T)
     near = [float(v.mid()) for v in entries.values()]
-    off = [upper_end(v - x) for v, x in zip(entries.values(), near, strict=True)]
+    off = [round_up_magnitude(v - x) for v, x in zip(entries.values(), near, strict=True)]
     if n > MAX_DENSE_FLOAT_ROWS:
         return tuple(sp.csr_array((np.array(v), at), shape=(n, n)) for v in (near, off))
     out = np.zeros((2, n, n))

@@ -75,7 +75,7 @@ def to_dense(kind: Any, a: Any) -> Any:
     return kind.matrix(*dense.shape, [kind.number(x) for x in dense.ravel().tolist()])
 
 
-def sparse_times(kind: Any, a: Any, x: list[Any], nonzeros_of_x: Any) -> list[Any]:
+def multiply_sparse_by_vector(kind: Any, a: Any, x: list[Any], nonzeros_of_x: Any) -> list[Any]:
     """Multiply a sparse matrix by a vector; `nonzeros_of_x`: indices of nonzero entries, None means all."""
     out, zero = [], kind.number(0.0)
     used = None if nonzeros_of_x is None else np.isin(a.indices, nonzeros_of_x)
@@ -89,17 +89,17 @@ def sparse_times(kind: Any, a: Any, x: list[Any], nonzeros_of_x: Any) -> list[An
     return out
 
 
-def upper_end(x: Any) -> float:
+def round_up_magnitude(x: Any) -> float:
     """Return a float that is at least |x| for every number of a ball; converting the upper end may round it down."""
     up = abs(x).upper()
     return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
 
 
 def max_abs(x: list[Any]) -> float:
-    """Return the largest magnitude of some numbers, 0 if there are none."""
+    """Return the largest magnitude of some numbers, 0 for an empty sequence."""
     return max((abs(float(q)) for q in x), default=0.0)
 
 
-def sign_of(x: Any) -> int:
+def get_certain_sign(x: Any) -> int:
     """Return +1 if certainly x >= 0, -1 if certainly x < 0, else 0."""
     return 1 if x >= 0 else -1 if x < 0 else 0

@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
-from lavender.lab.proof.numbers import UNIT, Balls, sparse_times, to_dense, upper_end
+from lavender.lab.proof.numbers import UNIT, Balls, multiply_sparse_by_vector, round_up_magnitude, to_dense
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
@@ -32,7 +32,7 @@ class Rounded(NamedTuple):
     off: Any
 
 
-def _in_range(a: Any) -> bool:
+def _is_in_product_range(a: Any) -> bool:
     """Whether all non-zero numbers are in PRODUCT_RANGE."""
     live = abs(a.data[a.data != 0.0])
     return bool(((live > 1.0 / PRODUCT_RANGE) & (live < PRODUCT_RANGE)).all())
@@ -50,20 +50,22 @@ class Part:
         self.which, self._operator, self._kind = which, operator, kind
         self.dense = len(which) <= MAX_DENSE_BALL_ROWS or operator.problem.generalized is not None
         if not self.dense:
-            self._matrices = self._factors()
-            self.dense = not all(map(_in_range, self._matrices)) and operator.transposed is not None
+            self._matrices = self._list_factors()
+            self.dense = (
+                not all(map(_is_in_product_range, self._matrices)) and operator.transposed is not None
+            )
         if self.dense:
             if len(which) > MAX_COUPLED_UNKNOWNS:
                 raise CapabilityError(
                     f"{len(which)} unknowns of J and M are coupled; up to {MAX_COUPLED_UNKNOWNS} are proven"
                 )
             return
-        self._numbers = [_row_entries(kind, f) for f in self._matrices]
+        self._numbers = [_list_row_entries(kind, f) for f in self._matrices]
         theta = operator.problem.compliance
         self._theta = np.zeros(len(which)) if theta is None else theta[which]
         self._soft = [kind.number(t) for t in self._theta.tolist()]
 
-    def _factors(self) -> list[Any]:
+    def _list_factors(self) -> list[Any]:
         """Return the factors of A without compliance, in the order in which they are applied to x."""
         operator = self._operator
         rows = operator.rows[self.which]
@@ -74,46 +76,46 @@ class Part:
         return [j.T.tocsr(), operator.inverse[used][:, used], j]
 
     @cached_property
-    def exact(self) -> Any:
+    def exact_matrix(self) -> Any:
         """Return A as a dense matrix of balls."""
-        return self._operator.block(self._kind, self.which)
+        return self._operator.compute_block(self._kind, self.which)
 
-    def times(self, x: list[Any]) -> list[Any]:
+    def multiply(self, x: list[Any]) -> list[Any]:
         """Compute A x."""
         if self.dense:
-            return list((self.exact * self._kind.matrix(len(x), 1, x)).entries())
+            return list((self.exact_matrix * self._kind.matrix(len(x), 1, x)).entries())
         y = x
         for factor in self._numbers:
             y = [sum((p * y[k] for p, k in row), self._kind.number(0.0)) for row in factor]
         return [p + t * q if t else p for p, t, q in zip(y, self._soft, x, strict=True)]
 
     @cached_property
-    def bounded(self) -> Rounded:
+    def rounded_matrix(self) -> Rounded:
         """Return A as float64 numbers with error bounds."""
         if self._operator.transposed is None:
             a = self._operator.rows[self.which][:, self.which]
-            return self._bounded(a, abs(a) * 0.0)
+            return self._make_rounded(a, abs(a) * 0.0)
         if self.dense:
-            n, entries = len(self.which), self.exact.entries()
+            n, entries = len(self.which), self.exact_matrix.entries()
             near = [float(x.mid()) for x in entries]
-            off = [upper_end(x - y) for x, y in zip(entries, near, strict=True)]
+            off = [round_up_magnitude(x - y) for x, y in zip(entries, near, strict=True)]
             both = (np.array(v).reshape(n, n) for v in (near, off))
             return Rounded(*(v if n <= MAX_DENSE_FLOAT_ROWS else sp.csr_array(v) for v in both))
         _, inner, j = self._matrices
         soft, inner_size, size = sp.diags_array(self._theta), abs(inner), abs(j)
         half, half_size = j @ inner, size @ inner_size
-        # Each entry is a sum of sums of at most k products.
+        # Each entry is a sum of sums of up to k products.
         k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2
         off = 2.0 * k * UNIT * (half_size @ size.T + soft)
-        return self._bounded(half @ j.T + soft, round_up(off))
+        return self._make_rounded(half @ j.T + soft, round_up(off))
 
-    def _bounded(self, near: Any, off: Any) -> Rounded:
+    def _make_rounded(self, near: Any, off: Any) -> Rounded:
         """Build a `Rounded` of dense or sparse matrices, by the number of rows."""
         dense = len(self.which) <= MAX_DENSE_FLOAT_ROWS
         return Rounded(*(a.toarray() if dense else sp.csr_array(a) for a in (near, off)))
 
 
-def _row_entries(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
+def _list_row_entries(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
     """Return (number, column) of the entries of each row of a sparse matrix, as balls or rationals."""
     entries = list(zip([kind.number(x) for x in a.data.tolist()], a.indices.tolist(), strict=True))
     ptr = a.indptr.tolist()
@@ -129,11 +131,11 @@ class Operator:
         if problem.matrix is None and problem.rows is not None:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
         self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
-        self.target, self.v = self._targets()
+        self.target, self.v = self._split_rhs()
         self._mass: dict[Any, Any] = {}  # M^-1 for balls and for rationals
         self._bias: dict[Any, list[Any]] = {}  # b for balls and for rationals
 
-    def _targets(self) -> tuple[FloatArray, FloatArray | None]:
+    def _split_rhs(self) -> tuple[FloatArray, FloatArray | None]:
         """Split b = target - J v*: return (target, v*), rounding noise of a target set to 0; (b, None) for a matrix."""
         problem = self.problem
         if problem.matrix is not None:
@@ -145,17 +147,19 @@ class Operator:
         )
         return np.where(abs(target) <= rounding_bound, 0.0, target), v
 
-    def soft(self, row: int) -> bool:
+    def has_compliance(self, row: int) -> bool:
         """Whether a row has compliance."""
         return self.transposed is not None and bool(self.problem.compliance[row] > 0.0)
 
-    def bias(self, kind: Any) -> list[Any]:
+    def compute_bias(self, kind: Any) -> list[Any]:
         """Compute b from targets and v*, exactly."""
         if type(kind) in self._bias:
             return self._bias[type(kind)]
         out = [kind.number(x) for x in self.target.tolist()]
         if self.v is not None:
-            velocity = sparse_times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
+            velocity = multiply_sparse_by_vector(
+                kind, self.rows, [kind.number(x) for x in self.v.tolist()], None
+            )
             out = [x - y for x, y in zip(out, velocity, strict=True)]
         self._bias[type(kind)] = out
         return out
@@ -169,7 +173,7 @@ class Operator:
             self._mass[type(kind)] = to_dense(kind, generalized.mass).inv()
         return self._mass[type(kind)] * right
 
-    def block(self, kind: Any, which: Any) -> Any:
+    def compute_block(self, kind: Any, which: Any) -> Any:
         """Compute A of the rows and columns `which`, as a dense matrix."""
         if self.transposed is None:
             return to_dense(kind, self.rows[which][:, which])
@@ -186,7 +190,7 @@ class Operator:
             a[k, k] += kind.number(float(self.problem.compliance[i]))
         return a
 
-    def pattern(self, which: Any) -> Any:
+    def compute_sparsity_pattern(self, which: Any) -> Any:
         """Return a sparsity pattern that contains A's: float64 may round a sum of products to 0."""
         if self.transposed is None:
             return (self.rows[which][:, which] != 0).astype(float)
@@ -199,39 +203,41 @@ class Operator:
         j = (self.rows[which] != 0).astype(float)
         return j @ inner.astype(float) @ j.T
 
-    def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
+    def compute_slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
         """Compute w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
         # A ball around 0 may contain other numbers, and `!=` is true only if it is certain: select entries by `not ==`.
         at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
         if self.transposed is None:
-            a = sparse_times(kind, self.rows, impulse, at)
+            a = multiply_sparse_by_vector(kind, self.rows, impulse, at)
         else:
-            generalized_impulse = sparse_times(kind, self.transposed, impulse, at)
+            generalized_impulse = multiply_sparse_by_vector(kind, self.transposed, impulse, at)
             if problem.generalized is None:
-                velocity = sparse_times(kind, self.inverse, generalized_impulse, None)
+                velocity = multiply_sparse_by_vector(kind, self.inverse, generalized_impulse, None)
             else:
                 velocity = self.apply_inverse_mass(
                     kind, kind.matrix(len(generalized_impulse), 1, generalized_impulse)
                 ).entries()
-            a = sparse_times(kind, self.rows, velocity, None)
+            a = multiply_sparse_by_vector(kind, self.rows, velocity, None)
         theta = [0.0] * problem.m if problem.compliance is None else problem.compliance.tolist()
         return [
             x + number(t) * y - b if t else x - b
-            for x, t, y, b in zip(a, theta, impulse, self.bias(kind), strict=True)
+            for x, t, y, b in zip(a, theta, impulse, self.compute_bias(kind), strict=True)
         ]
 
-    def semidefinite(self) -> bool:
+    def prove_semidefinite(self) -> bool:
         """Prove that x.A x >= 0 for every x, with the numbers as exact; False if the proof fails."""
         problem = self.problem
         if problem.matrix is not None:
-            return _semidefinite(problem.dense())
+            return _prove_semidefinite_by_cholesky(problem.dense())
         if problem.generalized is not None:
-            return _semidefinite(problem.generalized.mass.toarray())
-        return bool((problem.rows.inv_mass >= 0.0).all()) and _semidefinite(problem.rows.inv_inertia)
+            return _prove_semidefinite_by_cholesky(problem.generalized.mass.toarray())
+        return bool((problem.rows.inv_mass >= 0.0).all()) and _prove_semidefinite_by_cholesky(
+            problem.rows.inv_inertia
+        )
 
 
-def _semidefinite(a: FloatArray) -> bool:
+def _prove_semidefinite_by_cholesky(a: FloatArray) -> bool:
     """Whether Cholesky factorisation of the symmetric (..., n, n) matrices a - c I succeeds; c bounds its rounding.
 
     S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only
+from lavender.base.arrays import FloatArray, mark_read_only
 from lavender.base.lazy_import import sparse as sp
-from lavender.lab.motion import uniqueness
-from lavender.lab.proof.dependence import Tangled, dependencies, order_by_dependence
+from lavender.lab.motion import prove_uniqueness
+from lavender.lab.proof.dependence import Tangled, find_dependent_rows, order_by_dependence
 from lavender.lab.proof.island import Island, NoZero, Sticks
-from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, upper_end
+from lavender.lab.proof.numbers import UNIT, Balls, Rationals, get_certain_sign, round_up_magnitude
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 
@@ -44,7 +44,8 @@ class Enclosure:
     velocity_radius : float, m/s
         Largest |w_i - w_i*| of a row, rounded up; inf if nothing is proven.
     unique : bool
-        All solutions have the same velocities: proved for convex laws; under Coulomb's law only by `motion.uniqueness`.
+        All solutions have the same velocities: proved for convex laws; under Coulomb's law only by
+        `motion.prove_uniqueness`.
     reason : str
         If nothing is proven: the cause and a remedy. If it is proven: rows with impulses of a family.
     impulse : (m,) N s, or None
@@ -132,7 +133,7 @@ class Search:
         self.flint, self.problem = flint, problem
         self.start, self.answer = start, answer
         self.operator, self.cone = Operator(problem), problem.law == "cone"
-        self.blocks = self._initial_cases()
+        self.blocks = self._choose_initial_cases()
         self.family: Any = np.zeros(0, np.int64)
         self.singular = False  # The equations are singular in float64: a higher precision does not help.
         # Rows of touching blocks that have w = 0 by rows they depend on.
@@ -140,13 +141,13 @@ class Search:
 
     # -- cases ----------------------------------------------------------------------------------
 
-    def _initial_cases(self) -> list[_Block]:
+    def _choose_initial_cases(self) -> list[_Block]:
         """Choose the case of each block by the point that one update would project: inside a bound or beyond it."""
         cones = self.problem.cones
         lam, w, d = self.start, self.problem.slack(self.start), self.problem.d
         components: dict[int, list[_FrictionComponent]] = {}
-        contact, reaches = cones.is_contact, cones.reach
-        for i, rows in cones.parts():
+        contact, reaches = cones.is_contact, cones.friction_coefficient
+        for i, rows in cones.friction_components():
             coefficients = reaches[rows]
             if (coefficients > 0.0).any():
                 positive = rows[coefficients > 0.0]
@@ -177,7 +178,7 @@ class Search:
             out.append(block)
         return out
 
-    def run(self) -> Enclosure:
+    def search_solution(self) -> Enclosure:
         """Change cases until a solution is enclosed; return why none is if the search ends before."""
         try:
             tried: set[tuple[Any, ...]] = set()
@@ -192,22 +193,22 @@ class Search:
                     alternating = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
                     ]
-                    raise self._undecided_error(alternating, "between two cases, which change in turns")
+                    raise self._make_undecided_error(alternating, "between two cases, which change in turns")
                 tried.add(key)
                 before = key
                 try:
-                    lam, w = self.solve()
+                    lam, w = self.solve_equations()
                 except _Recase:
                     continue
                 if not (exactly and self.exact):
                     boundary = self._change_wrong_cases(lam, w)
                     exactly = bool(boundary) and self.exact
                 if exactly:
-                    boundary = self._change_wrong_cases(*self.solve(Rationals(self.flint)))
+                    boundary = self._change_wrong_cases(*self.solve_equations(Rationals(self.flint)))
                 if boundary == []:
                     return self.make_enclosure(lam, w)
                 if boundary:
-                    raise self._undecided_error(
+                    raise self._make_undecided_error(
                         boundary, f"on the boundary of two cases, closer than {self.flint.ctx.prec} bits tell"
                     )
             raise _Undecided(
@@ -216,7 +217,7 @@ class Search:
         except _Undecided as undecided:
             return Enclosure(False, reason=str(undecided), boundary=undecided.boundary)
 
-    def _undecided_error(self, blocks: list[_Block], explanation: str) -> _Undecided:
+    def _make_undecided_error(self, blocks: list[_Block], explanation: str) -> _Undecided:
         """Create the exception that names blocks and says why they are undecided."""
         names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))
         return _Undecided(f"{_join_names(names)}: {explanation}", names)
@@ -237,17 +238,17 @@ class Search:
                 unknown += [block.first, *(r for component in block.components for r in component.rows)]
         return np.array(sorted(unknown), np.int64), fixed
 
-    def solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
+    def solve_equations(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
         """Compute balls that contain a zero of the equations, or the zero in rationals: (lam, w) of all rows."""
         kind = Balls(self.flint) if kind is None else kind
         self.number = kind.number
         unknown, fixed = self._split_unknown_and_fixed()
-        free = self._independent_rows(unknown, fixed)
+        free = self._select_independent_rows(unknown, fixed)
         self.family = np.setdiff1d(unknown, free)
         for r in self.family.tolist():
             fixed[r] = float(self.start[r])
         lam = [kind.number(x) for x in fixed]
-        base = self.operator.slack(kind, lam)
+        base = self.operator.compute_slack(kind, lam)
         islands = self._split_islands(free)
         slides = any(
             component.slides for block in self.blocks if block.loaded for component in block.components or ()
@@ -257,25 +258,27 @@ class Search:
             if isinstance(kind, Rationals):
                 right = kind.matrix(len(which), 1, [-base[r] for r in which.tolist()])
                 for r, x in zip(
-                    which.tolist(), self.operator.block(kind, which).solve(right).entries(), strict=True
+                    which.tolist(),
+                    self.operator.compute_block(kind, which).solve(right).entries(),
+                    strict=True,
                 ):
                     lam[r] = x
             else:
                 self._enclose_island(which, lam, base)
-        return lam, self.operator.slack(kind, lam)
+        return lam, self.operator.compute_slack(kind, lam)
 
     def _split_islands(self, free: Any) -> list[Any]:
         """Split the free rows into sets that A and contacts do not couple."""
         if len(free) <= MAX_SINGLE_ISLAND_UNKNOWNS:
             return [free] if len(free) else []
-        graph = self.operator.pattern(free)
+        graph = self.operator.compute_sparsity_pattern(free)
         block = np.searchsorted(self.problem.cones.ptr, free, side="right")
         same_block = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
         graph = graph + same_block @ same_block.T
         n, label = sp.csgraph.connected_components(graph, directed=False)
         return [free[label == k] for k in range(n)]
 
-    def _independent_rows(self, unknown: Any, fixed: list[float]) -> Any:
+    def _select_independent_rows(self, unknown: Any, fixed: list[float]) -> Any:
         """Return a maximal set of rows with w = 0 and independent J; the others must depend on it exactly, b too."""
         still = set(unknown.tolist())
         for block in self.blocks:
@@ -291,7 +294,7 @@ class Search:
             still &= set(np.flatnonzero(self.problem.compliance == 0.0).tolist())
         touches = (b for b in self.blocks if b.touches and not b.loaded)
         touching = np.array(
-            [b.first for b in touches if not (b.at and self.operator.soft(b.first))], np.int64
+            [b.first for b in touches if not (b.at and self.operator.has_compliance(b.first))], np.int64
         )
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
@@ -303,12 +306,12 @@ class Search:
         while True:  # Rows with load have w = 0; a touching row has it only if it depends on rows with load.
             rows = np.concatenate([own, touching])
             try:
-                split = dependencies(self.flint, j[rows], self.operator.target[rows], numerical)
+                split = find_dependent_rows(self.flint, j[rows], self.operator.target[rows], numerical)
             except Tangled as tangled:
                 if len(touching):
                     touching = touching[:0]
                     continue
-                raise self._dependent_rows_error(
+                raise self._make_dependent_rows_error(
                     rows[tangled.args[0]],
                     "depend on each other to rounding, too many to tell whether exactly",
                 ) from None
@@ -337,11 +340,11 @@ class Search:
                 block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
         if opened:
             raise _Recase
-        raise self._dependent_rows_error(
+        raise self._make_dependent_rows_error(
             rows, "depend on other rows to rounding and contradict them in the last bits"
         )
 
-    def _dependent_rows_error(self, rows: Any, explanation: str) -> _Undecided:
+    def _make_dependent_rows_error(self, rows: Any, explanation: str) -> _Undecided:
         """Create the exception for rows that depend on each other to rounding."""
         names = tuple(self.problem.row_name(int(r)) for r in rows)
         explanation += "; which carry load hangs on these (a compliance on them decides it)"
@@ -362,17 +365,17 @@ class Search:
         part = Part(self.operator, Balls(self.flint), which)
         island = Island(self.flint, part, sliding, self.cone, lam, base)
         try:
-            enclosure = island.enclose(self.start[which].tolist(), float(abs(self.problem.b).max()))
+            enclosure = island.enclose_zero(self.start[which].tolist(), float(abs(self.problem.b).max()))
         except Sticks as slow:
             for one in slow.components:
                 one.slides = False
             raise _Recase from None
         except NoZero as error:
-            raise self._singular_error(which, error.slope) from None
+            raise self._make_singular_error(which, error.slope) from None
         for r, x in zip(which.tolist(), enclosure, strict=True):
             lam[r] = x
 
-    def _singular_error(self, which: Any, slope: Any) -> _Undecided:
+    def _make_singular_error(self, which: Any, slope: Any) -> _Undecided:
         """Create the exception that names the blocks that have impulses not fixed by singular equations."""
         rows = which[:0]
         slope = slope if isinstance(slope, np.ndarray) else slope.toarray()
@@ -405,8 +408,8 @@ class Search:
             if block.components is None:
                 low, high = float(cones.lower[r]), float(cones.upper[r])
                 if block.loaded:
-                    below = sign_of(lam[r] - number(low)) if math.isfinite(low) else 1
-                    above = sign_of(number(high) - lam[r]) if math.isfinite(high) else 1
+                    below = get_certain_sign(lam[r] - number(low)) if math.isfinite(low) else 1
+                    above = get_certain_sign(number(high) - lam[r]) if math.isfinite(high) else 1
                     if below < 0 or above < 0:
                         block.loaded, block.at, changed = False, low if below < 0 else high, True
                     elif not below or not above:
@@ -417,7 +420,7 @@ class Search:
                             True,
                         )
                 elif low < high:
-                    sign = sign_of(w[r]) * (1 if block.at == low else -1)
+                    sign = get_certain_sign(w[r]) * (1 if block.at == low else -1)
                     if sign < 0:
                         block.loaded = changed = True
                     elif not sign and not block.touches:
@@ -430,13 +433,15 @@ class Search:
                 for p in block.components
             ]
             if not block.loaded:
-                sign = sign_of(w[r])
+                sign = get_certain_sign(w[r])
                 # The condition is w_n >= sum s; with a single component, squares are compared and no root is needed.
                 if self.cone and sign > 0:
                     sign = (
-                        sign_of(w[r] * w[r] - speeds[0])
+                        get_certain_sign(w[r] * w[r] - speeds[0])
                         if len(speeds) == 1
-                        else sign_of(w[r] - sum((self._root(s) for s in speeds), self.flint.arb(0)))
+                        else get_certain_sign(
+                            w[r] - sum((self._compute_square_root(s) for s in speeds), self.flint.arb(0))
+                        )
                     )
                 if sign < 0:
                     block.loaded = changed = True
@@ -445,7 +450,7 @@ class Search:
                 elif not sign and ((self.cone and block.components) or r not in self.still):
                     boundary.append(block)
                 continue
-            sign = sign_of(lam[r])
+            sign = get_certain_sign(lam[r])
             if sign <= 0:
                 block.loaded, block.touches, changed = False, not sign, True
                 continue
@@ -459,14 +464,14 @@ class Search:
                     ),
                     0 * lam[r],
                 )
-                sign = sign_of(lam[r] * lam[r] - y)
+                sign = get_certain_sign(lam[r] * lam[r] - y)
                 if sign < 0:
                     component.slides = changed = True
                 elif not sign:
                     boundary.append(block)
         return None if changed else boundary
 
-    def _root(self, square: Any) -> Any:
+    def _compute_square_root(self, square: Any) -> Any:
         """Compute a ball that contains the root; the ball of a square may extend below 0."""
         square = self.flint.arb(square)
         return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
@@ -474,9 +479,11 @@ class Search:
     def make_enclosure(self, lam: list[Any], w: list[Any]) -> Enclosure:
         """Build the `Enclosure` of balls of impulses and slacks."""
         kind = Balls(self.flint)
-        own = self.operator.slack(kind, [kind.number(x) for x in self.answer.tolist()])
-        off = max((upper_end(x - g) for x, g in zip(lam, self.answer.tolist(), strict=True)), default=0.0)
-        speed = max((upper_end(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
+        own = self.operator.compute_slack(kind, [kind.number(x) for x in self.answer.tolist()])
+        off = max(
+            (round_up_magnitude(x - g) for x, g in zip(lam, self.answer.tolist(), strict=True)), default=0.0
+        )
+        speed = max((round_up_magnitude(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
         if not (math.isfinite(off) and math.isfinite(speed)):
             raise _Undecided("no bound of the impulses is finite")
         reason = ""
@@ -484,14 +491,14 @@ class Search:
             names = tuple(self.problem.row_name(int(r)) for r in self.family)
             reason = f"the impulses of {_join_names(names)} are one of a family"
         convex = self.problem.law != "coulomb"
-        unique = self.operator.semidefinite() if convex else uniqueness(self.problem.disk).proved
+        unique = self.operator.prove_semidefinite() if convex else prove_uniqueness(self.problem.disk).proved
         return Enclosure(
             proven=True,
             impulse_radius=off,
             velocity_radius=speed,
             unique=unique,
             reason=reason,
-            impulse=read_only(np.array([float(x.mid()) for x in lam])),
+            impulse=mark_read_only(np.array([float(x.mid()) for x in lam])),
         )
 
 

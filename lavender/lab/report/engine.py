@@ -18,8 +18,8 @@ import numpy as np
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
 from lavender.lab.bench.recommendation import Choice
-from lavender.lab.bench.record import printable
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, geometric_mean, limit_of
+from lavender.lab.bench.record import escape_unprintable
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_time_of_miss
 from lavender.lab.bench.store import Records
 
 _NUMERIC_KEYS = ("rows", "seconds", "relative")
@@ -38,7 +38,7 @@ class EngineAnswers:
     rows : median number of rows
     relative, worst : median and largest relative residual [-]
     above_floor : answers above the round-off floor
-    unconverged : those of them that stopped before convergence or are wrong, by more than the recording's threshold
+    unconverged : answers with an error above the recording's threshold that stopped before convergence or are wrong
     velocity, where : largest velocity error of a row, nan if it was not recorded [m/s]; and that row
     answers : time inside the engine [s] and relative residual by file name
     """
@@ -82,9 +82,9 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
             row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
             verdict = str(entry["verdict"])
             verdict = VERDICTS_OF_OLD.get(verdict, verdict)
-            entries.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
+            entries.append((rows, relative, row, verdict, escape_unprintable(str(entry["solver"]))))
             if math.isfinite(time) and time >= 0.0:
-                answers[printable(str(entry.get("file", "")))] = time, relative
+                answers[escape_unprintable(str(entry.get("file", "")))] = time, relative
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
     if not entries:
@@ -93,7 +93,7 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
     velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
     return EngineAnswers(
         folder=folder.name,
-        source=printable(str(folder)),
+        source=escape_unprintable(str(folder)),
         solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
         steps=len(entries),
         left_out=left_out,
@@ -103,7 +103,7 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
         above_floor=sum(verdict != AT_FLOOR for verdict in verdicts),
         unconverged=sum(verdict in (UNCONVERGED, WRONG) for verdict in verdicts),
         velocity=velocity,
-        where=printable(where),
+        where=escape_unprintable(where),
         answers=answers,
     )
 
@@ -132,10 +132,12 @@ def rank_engine(
     if not cases or len(answers) < len(cases):
         return None
     times = {name: time if relative <= tolerance else math.inf for name, (time, relative) in answers.items()}
-    limit = limit_of(records)
-    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
+    limit = get_time_of_miss(records)
+    score = compute_geometric_mean(
+        [t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT
+    )
     solved = sum(map(math.isfinite, times.values()))
-    return Choice.of(" and ".join(solvers), times, solved, score)
+    return Choice.from_case_values(" and ".join(solvers), times, solved, score)
 
 
 def ranks_before(one: Choice, other: Choice) -> bool:

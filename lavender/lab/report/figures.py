@@ -47,14 +47,16 @@ class Curve:
     high: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any) -> Curve:
+    def from_points(
+        cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any
+    ) -> Curve:
         """Create a line through points. A residual of zero is drawn at `MIN_RESIDUAL`; nan and inf are gaps."""
         x, y = zip(*points, strict=True)
         drawn = tuple(max(v, MIN_RESIDUAL) if math.isfinite(v) else math.nan for v in y)
         return cls(solver, label, tuple(map(float, x)), drawn, **more)
 
     @property
-    def front(self) -> Curve:
+    def lower_front(self) -> Curve:
         """The points in the order of x that are lower than all points before."""
         front: list[tuple[float, float]] = []
         for x, y in sorted(zip(self.x, self.y, strict=True)):
@@ -109,21 +111,25 @@ def _sort_by_work(runs: list[Record]) -> list[Record]:
 def build_work_precision(records: Records, case: str) -> Figure:
     """Plot error against time for every run of a case: a curve for each solver and start, in the order of work."""
     curves = []
-    for (name, solver, start), group in sorted(statistics.pairs(records).items()):
-        runs = _sort_by_work([r for r in group if r.usable]) if name == case else []
+    for (name, solver, start), group in sorted(statistics.group_runs_by_pair(records).items()):
+        runs = _sort_by_work([r for r in group if r.is_usable]) if name == case else []
         if runs:
             points, targets = [(r.time_min, r.relative) for r in runs], tuple(r.target for r in runs)
             curves.append(
-                Curve.of(solver, name_run(solver, start), points, notes=targets, thin=start != "cold")
+                Curve.from_points(
+                    solver, name_run(solver, start), points, notes=targets, thin=start != "cold"
+                )
             )
     return _build_case_figure("work-precision", "time: set-up and solve [s]", records, case, curves)
 
 
 def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
     """Create a figure of a case, with the round-off floor of its best run."""
-    runs = (r for (of, _, _), some in statistics.pairs(records).items() if of == case for r in some)
+    runs = (
+        r for (of, _, _), some in statistics.group_runs_by_pair(records).items() if of == case for r in some
+    )
     best = min(
-        ((r.relative, r.roundoff_floor) for r in runs if r.usable and r.roundoff_floor > 0.0),
+        ((r.relative, r.roundoff_floor) for r in runs if r.is_usable and r.roundoff_floor > 0.0),
         default=(0.0, math.nan),
     )
     return Figure(
@@ -155,7 +161,7 @@ def build_overall_figure(records: Records) -> Figure:
     cases = sorted({r.case for r in runs})
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for r in runs:
-        if r.usable and r.time_min > 0.0:
+        if r.is_usable and r.time_min > 0.0:
             by.setdefault(r.solver, {}).setdefault(r.case, []).append(
                 (r.time_min, max(r.relative, MIN_RESIDUAL))
             )
@@ -187,9 +193,9 @@ def build_overall_figure(records: Records) -> Figure:
 def build_budget_figure(records: Records, case: str) -> Figure:
     """Plot the residual against exact iteration budgets, cold and warm."""
     curves = []
-    for (name, solver, start), points in sorted(statistics.budgets(records).items()):
+    for (name, solver, start), points in sorted(statistics.group_runs_by_budget(records).items()):
         if name == case:
-            curves.append(Curve.of(solver, name_run(solver, start), points, thin=start != "cold"))
+            curves.append(Curve.from_points(solver, name_run(solver, start), points, thin=start != "cold"))
     return _build_case_figure("budget", "iterations (sweeps)", records, case, curves)
 
 
@@ -219,7 +225,11 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
     timed = passes[0].mode == "tol"
 
     def rank(w: statistics.Pass) -> tuple[float, float, str]:
-        return -len(w.times[w.start]), w.time[w.start] if timed else w.middle(w.start), w.solver
+        return (
+            -len(w.times[w.start]),
+            w.total_times[w.start] if timed else w.get_median_residual(w.start),
+            w.solver,
+        )
 
     ranked = [w.solver for w in sorted(passes, key=rank)]
     drawn = set(select_drawn(ranked))
@@ -229,7 +239,7 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
             values = np.cumsum(w.times[start]).tolist() if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
             label = f"{w.solver} (cold)" if cold else w.solver
-            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
+            curves.append(Curve.from_points(w.solver, label, enumerate(values), thin=cold))
     target = passes[0].target
     return Figure(
         f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
@@ -254,7 +264,8 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
     drawn = set(select_drawn([name for name in ranked if standing(name)[0] < 0.0 or is_plug_in(name)]))
     shown = [name for name in ranked if name in drawn]
     curves = [
-        Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
+        Curve.from_points(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True)
+        for name in shown
     ]
     left_out = tuple(sorted(set(profile.curves) - set(shown)))
     by_work = profile.measure == "work"
@@ -291,12 +302,12 @@ class Figures:
     moved: Figures | None = None
 
     @property
-    def places(self) -> dict[str, Group]:
+    def groups_by_name(self) -> dict[str, Group]:
         """The groups by name."""
         return {name: group for name, group in vars(self).items() if name != "moved"}
 
     def __iter__(self) -> Iterator[Figure]:
-        for group in self.places.values():
+        for group in self.groups_by_name.values():
             for some in group.values():
                 yield from some
         yield from self.moved or ()
@@ -327,7 +338,7 @@ def _relabel_for_motion(figures: Figures) -> Figures:
 
     groups: dict[str, Any] = {
         place: {name: tuple(map(relabel, own)) for name, own in group.items()}
-        for place, group in figures.places.items()
+        for place, group in figures.groups_by_name.items()
     }
     return Figures(**groups)
 
@@ -338,25 +349,25 @@ def _build_figures(records: Records) -> Figures:
         if r.step < 0:
             parts.setdefault(r.case, Records(records.runs)).add(r)
     profiles: dict[str, list[Figure]] = {}
-    for profile in (*statistics.profiles(records), *statistics.profiles(records, "work")):
+    for profile in (*statistics.compute_profiles(records), *statistics.compute_profiles(records, "work")):
         if profile.cases > 1 and (profile.measure == "time" or len(profile.curves) > 1):
             profiles.setdefault(profile.law, []).append(build_profile_figure(profile))
-    over = _keep_drawn(build_overall_figure(records))
+    over = _select_drawn_figures(build_overall_figure(records))
     return Figures(
         over={"all": over} if over else {},
-        profiles={law: _keep_drawn(*some) for law, some in profiles.items()},
+        profiles={law: _select_drawn_figures(*some) for law, some in profiles.items()},
         sequences={
             name: _build_pass_figures(name, passes)
             for name, passes in statistics.group_passes(records).items()
         },
         cases={
-            c: _keep_drawn(build_work_precision(part, c), build_budget_figure(part, c))
+            c: _select_drawn_figures(build_work_precision(part, c), build_budget_figure(part, c))
             for c, part in parts.items()
         },
     )
 
 
-def _keep_drawn(*some: Figure) -> tuple[Figure, ...]:
+def _select_drawn_figures(*some: Figure) -> tuple[Figure, ...]:
     return tuple(figure for figure in some if figure.curves)
 
 

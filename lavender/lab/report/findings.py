@@ -26,9 +26,9 @@ class Report:
     earlier : Records, optional
         An earlier run to compare with.
     time_budgets : s, optional
-        Times with a recommended solver; default: those of the plan, or `recommendation.choose_time_budgets`.
+        Times with a recommended solver; default: the times of the plan, or `recommendation.choose_time_budgets`.
     sweep_budgets : int, optional
-        Numbers of sweeps with a recommended solver; default: those of the plan.
+        Numbers of sweeps with a recommended solver; default: the budgets of the plan.
     engines : sequence of EngineAnswers
         Answers of the engines that recorded the steps: `lavender.lab.report.engine.read_engine_answers`.
     """
@@ -40,34 +40,34 @@ class Report:
     engines: Sequence[EngineAnswers] = ()
 
     @cached_property
-    def newest(self) -> Records:
+    def newest_run(self) -> Records:
         """The newest run."""
-        return self.all_records.latest()
+        return self.all_records.select_latest_run()
 
     @cached_property
-    def records(self) -> Records:
+    def ranked_records(self) -> Records:
         """The newest run without cases that the zero impulse solves."""
-        return statistics.drop_idle_cases(self.newest)
+        return statistics.drop_idle_cases(self.newest_run)
 
     @cached_property
     def earlier_run(self) -> Records | None:
         """The newest run of the earlier records."""
-        return None if self.earlier is None else self.earlier.latest()
+        return None if self.earlier is None else self.earlier.select_latest_run()
 
     @cached_property
     def is_campaign(self) -> bool:
         """Whether the runs have no times."""
-        return statistics.is_campaign(self.records)
+        return statistics.is_campaign(self.ranked_records)
 
     @cached_property
-    def stopped(self) -> str:
+    def stopped_warning(self) -> str:
         """A warning if the run ended before everything was measured; else empty."""
-        if all(run.whole for run in self.newest.runs.values()):
+        if all(run.whole for run in self.newest_run.runs.values()):
             return ""
         return "Stopped before the end: the numbers contain only the completed measurements."
 
     @property
-    def busy(self) -> str:
+    def busy_warning(self) -> str:
         """A warning if other processes used the processors while times were taken, with advice; else empty."""
         advice = "The times are invalid; measure again with --no-reuse."
         return f"{self.high_load} {advice}" if self.high_load else ""
@@ -75,38 +75,40 @@ class Report:
     @cached_property
     def high_load(self) -> str:
         """A sentence on the load if other processes used the processors while times were taken; else empty."""
-        if self.is_campaign or not len(self.newest):
+        if self.is_campaign or not len(self.newest_run):
             return ""
-        (run,) = self.newest.runs.values()
-        loads = (run.load if r.load is None else r.load for r in self.newest)
+        (run,) = self.newest_run.runs.values()
+        loads = (run.load if r.load is None else r.load for r in self.newest_run)
         return machine.describe_busy(loads, run.cores)
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:
         """Residual tolerances, largest first."""
-        return statistics.get_tolerances(self.records)
+        return statistics.get_tolerances(self.ranked_records)
 
     @cached_property
-    def speeds(self) -> tuple[float, ...]:
+    def velocity_tolerances(self) -> tuple[float, ...]:
         """Velocity tolerances [m/s]; empty without motion errors."""
-        return get_velocity_tolerances(self.records)
+        return get_velocity_tolerances(self.ranked_records)
 
     @cached_property
-    def by_speed(self) -> Records:
+    def records_by_motion_error(self) -> Records:
         """The records with motion errors in place of residuals; empty without motion errors."""
-        return convert_to_motion_errors(self.records)
+        return convert_to_motion_errors(self.ranked_records)
 
     @cached_property
-    def times(self) -> tuple[float, ...]:
+    def recommendation_times(self) -> tuple[float, ...]:
         """Times [s] with a recommended solver."""
-        return tuple(self.time_budgets) or choose_time_budgets(self.records)
+        return tuple(self.time_budgets) or choose_time_budgets(self.ranked_records)
 
     @cached_property
     def verdict(self) -> Verdict:
         """The sentences of the recommendation."""
-        return build_verdict(self.records, tuple(self.time_budgets), tuple(self.sweep_budgets), self.engines)
+        return build_verdict(
+            self.ranked_records, tuple(self.time_budgets), tuple(self.sweep_budgets), self.engines
+        )
 
     @cached_property
-    def lines(self) -> list[FamilyAdvice]:
+    def rankings(self) -> list[FamilyAdvice]:
         """Rankings by structure and sequence; empty for a campaign."""
-        return [] if self.is_campaign else recommend_solvers(self.records, self.times)
+        return [] if self.is_campaign else recommend_solvers(self.ranked_records, self.recommendation_times)

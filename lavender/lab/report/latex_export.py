@@ -20,11 +20,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
-from lavender.lab.bench.record import file_name, format_tolerance
+from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
@@ -61,10 +61,10 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     InputError
         No runs with times (a campaign), or the folder cannot be written.
     """
-    records = report.records
+    records = report.ranked_records
     if not len(records) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    own = records.having(
+    own = records.with_records(
         r if r.backend_time_min is None else replace(r, time_min=r.backend_time_min) for r in records
     )
     drawn = build_figures(own)
@@ -93,7 +93,7 @@ def _build_folder_figures(records: Records) -> Group:
     groups = {}
     for folder in folders if len(folders) > 1 else ():
         figure = build_overall_figure(
-            records.having(r for r in records if sources.get(r.case, Path()).parent == folder)
+            records.with_records(r for r in records if sources.get(r.case, Path()).parent == folder)
         )
         name = folder.name if sum(f.name == folder.name for f in folders) == 1 else str(folder)
         if figure.curves:
@@ -133,7 +133,7 @@ def escape_tex(text: str) -> str:
 def format_latex(table: Table, caption: str, label: str) -> str:
     """Return a floating table (booktabs)."""
     line = " & ".join
-    body = "".join(f"{line(map(escape_tex, row))} \\\\\n" for row in table.texts)
+    body = "".join(f"{line(map(escape_tex, row))} \\\\\n" for row in table.cell_texts)
     return (
         f"\\begin{{table}}\n\\centering\n\\caption{{{escape_tex(caption)}}}\n\\label{{tab:{label}}}\n"
         f"\\begin{{tabular}}{{l{'r' * (len(table.heads) - 1)}}}\n\\toprule\n{line(map(escape_tex, table.heads))} \\\\\n"
@@ -142,7 +142,7 @@ def format_latex(table: Table, caption: str, label: str) -> str:
 
 
 def _name_file(figure: Figure) -> str:
-    return file_name(figure.name.replace(" ", "-")) + ".pdf"
+    return make_file_name(figure.name.replace(" ", "-")) + ".pdf"
 
 
 def _state_own_times(records: Records, solvers: Iterable[str]) -> str:
@@ -177,7 +177,7 @@ def _include_figure(figure: Figure, records: Records) -> str:
 
 
 def _write_tables(report: Report, own: Records) -> str:
-    records, shift = report.records, seconds(statistics.MEAN_TIME_SHIFT)
+    records, shift = report.ranked_records, format_seconds(statistics.MEAN_TIME_SHIFT)
     caption = (
         "Recommended solver, its mean time (of other packages with conversion), and the cases that it brings to the "
         f"tolerance where that is not all. Within {TIME_NOISE_FACTOR:g} times of each other solvers count as equal."
@@ -187,19 +187,19 @@ def _write_tables(report: Report, own: Records) -> str:
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
-            f"{line.size}{format_left_out(line.left_out)}",
+            f"{line.n_cases}{format_left_out(line.left_out)}",
             *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
         ]
-        for row, line in zip(advice.rows, report.lines, strict=True)
+        for row, line in zip(advice.rows, report.rankings, strict=True)
     ]
     parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
-    for law, by_tolerance in statistics.geometric_means(own).items():
+    for law, by_tolerance in statistics.compute_geometric_means(own).items():
         solvers = set(next(iter(by_tolerance.values())))
         rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - solvers)
         others = f" (not {', '.join(rest)})" if rest else ""
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the tolerance; a miss costs "
-            f"{seconds(statistics.limit_of(records))}. Solvers that take every case{others}."
+            f"{format_seconds(statistics.get_time_of_miss(records))}. Solvers that take every case{others}."
         )
         caption += _state_own_times(own, solvers) + _state_lost_cases(records)
         parts.append(format_latex(table_specs.tabulate_means(by_tolerance), caption, f"means-{law}"))
@@ -211,7 +211,7 @@ def _write_tables(report: Report, own: Records) -> str:
 
 def _describe_method(report: Report) -> str:
     """Return the paragraph on the method; all of its numbers come from the records."""
-    records = report.records
+    records = report.ranked_records
     run = next(reversed(list(records.runs.values())))
     own = [r for r in records if r.run == run.run]
     ran = {r.case for r in own}
@@ -221,17 +221,17 @@ def _describe_method(report: Report) -> str:
         f"{format_count(sum(i.law == law for i in infos), 'problem')} of law {law}"
         for law in sorted({i.law for i in infos})
     ]
-    repeats = sorted({r.repeats for r in own if r.usable})
+    repeats = sorted({r.repeats for r in own if r.is_usable})
     tolerances = ", ".join(map(format_tolerance, statistics.get_tolerances(records)))
     budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
     swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     minimum = f"the minimum of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
-    limit, threads = seconds(statistics.limit_of(records)), format_count(run.threads, "thread")
+    limit, threads = format_seconds(statistics.get_time_of_miss(records)), format_count(run.threads, "thread")
     solvers = format_count(len({r.solver for r in own}), "solver")
     lost = format_left_out(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
-    shift = seconds(statistics.MEAN_TIME_SHIFT)
+    shift = format_seconds(statistics.MEAN_TIME_SHIFT)
     own_times = _state_own_times(records, {r.solver for r in own})
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
@@ -239,7 +239,7 @@ def _describe_method(report: Report) -> str:
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution. Times are those",
         f"of set-up and solve, {minimum}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
-        f"{own_times} {report.stopped} {report.high_load} Means of times are",
+        f"{own_times} {report.stopped_warning} {report.high_load} Means of times are",
         f"geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
         f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",
         f"Python {run.python}, {versions}; run {run.run}, {run.started}.",

@@ -14,7 +14,7 @@ from lavender.lab.report.text import list_left_out
 def format_markdown(table: Table) -> list[str]:
     """Return the lines of a table."""
     lines = ["| " + " | ".join(table.heads) + " |", "|---" * len(table.heads) + "|"]
-    return lines + ["| " + " | ".join(map(escape_markdown, row)) + " |" for row in table.texts]
+    return lines + ["| " + " | ".join(map(escape_markdown, row)) + " |" for row in table.cell_texts]
 
 
 def escape_markdown(text: str) -> str:
@@ -25,12 +25,12 @@ def escape_markdown(text: str) -> str:
 
 def summarise_report(report: Report) -> str:
     """Return recommendations, all tables and the number of failures, to paste into a pull request."""
-    records = report.records
+    records = report.ranked_records
     lines = ["## lavender report", ""]
     for run in records.runs.values():
         machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
         lines += [escape_markdown(f"{machine}; run {run.run}, {run.started}"), ""]
-    for warning in (report.stopped, report.busy):
+    for warning in (report.stopped_warning, report.busy_warning):
         lines += [f"**{escape_markdown(warning)}**", ""] if warning else []
     for statement in report.verdict.statements:
         code = ["```python", *statement.code, "```", ""] if statement.code else []
@@ -40,7 +40,7 @@ def summarise_report(report: Report) -> str:
     for section in list_sections(report):
         lines += [f"**{escape_markdown(section.title)}** ({escape_markdown(section.note)})", ""]
         lines += [*(format_markdown(section.table) if section.table.rows else [section.empty]), ""]
-    failures = statistics.failures(records)
+    failures = statistics.list_failures(records)
     if failures:
         lines += [
             f"{len(failures)} runs missed their target or made a false claim; see the page.",

@@ -49,7 +49,7 @@ def convert_to_motion_errors(records: Records) -> Records:
     tolerances = get_velocity_tolerances(records)
     if not tolerances:
         return Records()
-    converted = records.having(
+    converted = records.with_records(
         replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, roundoff_floor=0.0)
         for r in records
         if not r.interleave_group

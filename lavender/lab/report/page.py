@@ -8,9 +8,9 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.lab.bench import recommendation, statistics
-from lavender.lab.bench.record import file_name, format_tolerance
+from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
@@ -44,10 +44,10 @@ def create_environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        seconds=seconds,
+        seconds=format_seconds,
         residual=format_residual,
         tolerance=format_tolerance,
-        anchor=file_name,
+        anchor=make_file_name,
         numbers=keep_numbers_together,
     )
     environment.globals.update(
@@ -86,11 +86,11 @@ def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
 
     `figures` show the records of the report; `saved`: the folder of the page has them as SVG and PNG, too.
     """
-    records = report.records
+    records = report.ranked_records
     return create_environment().get_template("index.html.j2").render(
         report=report, records=records, verdict=report.verdict, tolerances=report.tolerances, saved=saved,
         tolerance=report.tolerances[len(report.tolerances) // 2],
-        links=_list_links(report.lines), left_out=list_left_out(records),
+        links=_map_rankings_to_anchors(report.rankings), left_out=list_left_out(records),
         diagnostics=list_diagnostics(records), **_render_drawings(records, figures, report.verdict),
         **_describe_cases(report),
     )  # fmt: skip
@@ -106,32 +106,32 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
     titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
         "drawings": {  # their texts are escaped
-            file_name(figure.name): plot_for_page(figure, number, named, titles.get(figure.name))
+            make_file_name(figure.name): plot_for_page(figure, number, named, titles.get(figure.name))
             for figure in figures
         },
         "solvers": names,
         "named": named[:MAX_NAMED],
         "number": number,
         "by_motion": figures.moved is not None,
-        "drawn": _list_keys(figures),
-        "moved_drawn": _list_keys(figures.moved or Figures()),
+        "drawn": _list_drawing_names(figures),
+        "moved_drawn": _list_drawing_names(figures.moved or Figures()),
     }
 
 
-def _list_keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
+def _list_drawing_names(figures: Figures) -> dict[str, dict[str, list[str]]]:
     """Return the names of the drawings by place and subject."""
     return {
-        place: {name: [file_name(figure.name) for figure in some] for name, some in group.items()}
-        for place, group in figures.places.items()
+        place: {name: [make_file_name(figure.name) for figure in some] for name, some in group.items()}
+        for place, group in figures.groups_by_name.items()
     }
 
 
 def _describe_cases(report: Report) -> dict[str, Any]:
     """Return the tables of each case; none for a campaign, which has thousands of cases."""
-    records, tolerances = report.records, report.tolerances
+    records, tolerances = report.ranked_records, report.tolerances
     by_case: dict[str, list[statistics.Reach]] = {}
     if not report.is_campaign:
-        for reach in statistics.reaches(records, tolerances):
+        for reach in statistics.compute_reaches(records, tolerances):
             by_case.setdefault(reach.case, []).append(reach)
     tolerance = tolerances[len(tolerances) // 2]
     fastest = {name: _select_fastest(rows, tolerance) for name, rows in by_case.items()}
@@ -139,21 +139,23 @@ def _describe_cases(report: Report) -> dict[str, Any]:
     cases = [
         {
             "info": records.cases[name],
-            "reaches": table_specs.tabulate_reaches(rows, tolerances).without("case"),
+            "reaches": table_specs.tabulate_reaches(rows, tolerances).without_columns("case"),
         }
         for name, rows in by_case.items()
     ]
     return {
         "cases": cases,
         "case_list": table_specs.tabulate_cases(records, fastest, tolerance, stored),
-        "difficulty": table_specs.tabulate_difficulties(statistics.difficulties(records) if cases else []),
+        "difficulty": table_specs.tabulate_difficulties(
+            statistics.compute_difficulties(records) if cases else []
+        ),
     }
 
 
-def _list_links(lines: Sequence[recommendation.FamilyAdvice]) -> dict[str, str]:
+def _map_rankings_to_anchors(lines: Sequence[recommendation.FamilyAdvice]) -> dict[str, str]:
     """Return for each structure and sequence the part of the page that describes it."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
-    return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}
+    return {name: f"{part}-{make_file_name(name)}" for name, part in parts.items()}
 
 
 def _select_fastest(rows: Sequence[statistics.Reach], tolerance: float) -> statistics.Reach | None:

@@ -23,7 +23,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from lavender.io.stored import make_folder, write_figure
-from lavender.lab.bench.record import file_name, format_tolerance
+from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.text import TIME_UNITS
 
@@ -268,7 +268,7 @@ def save_figures(figures: Iterable[Figure], folder: Path, solvers: Iterable[str]
     styles = assign_styles({*solvers, *(c.solver for figure in figures for c in figure.curves)})
     for figure in figures:
         canvas = plot_figure(figure, styles)
-        path = make_folder(folder) / file_name(figure.name)
+        path = make_folder(folder) / make_file_name(figure.name)
         write_figure(canvas, path.with_name(path.name + ".svg"), metadata={"Date": None})
         write_figure(canvas, path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
 

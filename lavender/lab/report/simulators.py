@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from lavender.lab.bench.simulators import STRICT_RESIDUAL, TARGET_RESIDUAL, Step, WarmStep
-from lavender.lab.bench.statistics import geometric_mean
+from lavender.lab.bench.statistics import compute_geometric_mean
 from lavender.lab.report.markdown import format_markdown
 from lavender.lab.report.table import Table
 
@@ -17,7 +17,7 @@ OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster
 ROW_CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # Ranges of the number of rows.
 
 
-def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
+def _group_by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
     classes = []
     for low, high in ROW_CLASSES:
         name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
@@ -25,23 +25,23 @@ def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
     return [(name, part) for name, part in classes if part]
 
 
-def _sizes(x: Sequence[float]) -> tuple[str, str]:
+def _format_sizes(x: Sequence[float]) -> tuple[str, str]:
     return f"{np.median(x):.1e}", f"{max(x):.1e}"
 
 
-def _row(name: str, part: Sequence[WarmStep]) -> list[str]:
+def _make_row_head(name: str, part: Sequence[WarmStep]) -> list[str]:
     """Return the first cells of a row: models, problems, the engine's time and the ratio of times."""
-    ratio = geometric_mean([s.ours / s.engine for s in part])
-    models, engine = len({s.model for s in part}), geometric_mean([s.engine for s in part])
+    ratio = compute_geometric_mean([s.ours / s.engine for s in part])
+    models, engine = len({s.model for s in part}), compute_geometric_mean([s.engine for s in part])
     return [name, str(models), str(len(part)), f"{1e6 * engine:.1f}", f"{ratio:.2f}"]
 
 
-def table(steps: Sequence[Step]) -> str:
+def format_time_ratio_table(steps: Sequence[Step]) -> str:
     """Return geometric means of time ratios by the number of rows, and how many problems were solved, as Markdown."""
     heads = ["rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`"]
     rows = [
-        [*_row(name, part), f"{geometric_mean([s.many / s.engine for s in part]):.2f}"]
-        for name, part in _by_class(steps)
+        [*_make_row_head(name, part), f"{compute_geometric_mean([s.many / s.engine for s in part]):.2f}"]
+        for name, part in _group_by_class(steps)
     ]
     convex = [s for s in steps if s.strict <= STRICT_RESIDUAL]
     coulomb = [s for s in steps if s.coulomb is not None]
@@ -56,15 +56,15 @@ def table(steps: Sequence[Step]) -> str:
     return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", summary])
 
 
-def warm_table(steps: Sequence[WarmStep]) -> str:
+def format_warm_time_ratio_table(steps: Sequence[WarmStep]) -> str:
     """Return the same over consecutive steps, both solvers started from their last step."""
     rows = [
         [
-            *_row(name, part),
-            *_sizes([s.engine_residual for s in part]),
-            *_sizes([s.residual for s in part]),
+            *_make_row_head(name, part),
+            *_format_sizes([s.engine_residual for s in part]),
+            *_format_sizes([s.residual for s in part]),
         ]
-        for name, part in _by_class(steps)
+        for name, part in _group_by_class(steps)
     ]
     residuals = ["MuJoCo's residual, median", "worst", "ours, median", "worst"]
     start = (

@@ -101,27 +101,27 @@ class Table:
         object.__setattr__(self, "rows", rows)
 
     @classmethod
-    def of(cls, rows: Sequence[Mapping[str, str | Cell]], marks: Sequence[str] = ()) -> Table:
+    def from_rows(cls, rows: Sequence[Mapping[str, str | Cell]], marks: Sequence[str] = ()) -> Table:
         """Create a table from rows that map the same heads to cells."""
         return cls(list(rows[0]) if rows else [], [list(row.values()) for row in rows], marks)
 
-    def without(self, *heads: str) -> Table:
+    def without_columns(self, *heads: str) -> Table:
         """Return the table without some of its columns."""
         columns = [i for i, head in enumerate(self.heads) if head not in heads]
         rows = [[row[i] for i in columns] for row in self.rows]
         return Table([self.heads[i] for i in columns], rows, self.marks, self.folds, self.words)
 
-    def is_number(self, head: str) -> bool:
+    def is_numeric_column(self, head: str) -> bool:
         """Return whether a column has numbers, which are aligned to the right."""
         return not self.folds and head not in self.words
 
     @property
-    def texts(self) -> list[list[str]]:
+    def cell_texts(self) -> list[list[str]]:
         """The text of each cell, as every format shows it."""
         return [[str(cell) for cell in row] for row in self.rows]
 
     @property
-    def lines(self) -> list[tuple[list[Cell], bool]]:
+    def marked_rows(self) -> list[tuple[list[Cell], bool]]:
         """Cells of each row, and whether the row is marked as bad."""
         marks = self.marks or [""] * len(self.rows)
         return [

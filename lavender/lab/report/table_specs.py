@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.judge.residuals import UNCONVERGED
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
 from lavender.lab.bench import recommendation, resampling, statistics
 from lavender.lab.bench.recommendation import Advice, Choice, FamilyAdvice
-from lavender.lab.bench.record import Record, Skip, file_name, format_tolerance, printable
+from lavender.lab.bench.record import Record, Skip, escape_unprintable, format_tolerance, make_file_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, list_cases_of, rank_engine, ranks_before
 from lavender.lab.report.findings import Report
@@ -70,11 +70,13 @@ class Section:
 
 def list_sections(report: Report) -> list[Section]:
     """List the tables of a report with their headings, from the recommendations to changes since an earlier report."""
-    records, tolerances = report.records, report.tolerances
+    records, tolerances = report.ranked_records, report.tolerances
     moved = "largest velocity error of a body"
     if report.is_campaign:
-        shares = tabulate_robustness(statistics.robustness(records), tolerances)
-        by_speed = tabulate_robustness(statistics.robustness(report.by_speed), report.speeds, " m/s")
+        shares = tabulate_robustness(statistics.compute_robustness(records), tolerances)
+        by_speed = tabulate_robustness(
+            statistics.compute_robustness(report.records_by_motion_error), report.velocity_tolerances, " m/s"
+        )
         note = "no times; share of cases brought to a tolerance, residual at each budget"
         sections = [
             Section("Campaign", note, shares, grouped=True),
@@ -101,24 +103,30 @@ def list_sections(report: Report) -> list[Section]:
             "time of all steps, of a part if a limit ended the run; median residual by budget; carried from step to "
             "step, or cold if the solver takes no start"
         )
-        cases = tabulate_reaches(statistics.reaches(records, tolerances), tolerances).without("form")
+        cases = tabulate_reaches(statistics.compute_reaches(records, tolerances), tolerances).without_columns(
+            "form"
+        )
         sections = [
             Section("By structure", by_structure, tabulate_advice(report)),
-            Section("By sweeps", by_sweeps, tabulate_sweeps(report.lines)),
+            Section("By sweeps", by_sweeps, tabulate_sweeps(report.rankings)),
             Section("Inside the engine", inside, tabulate_engines(report)),
             Section("By motion error", moved, tabulate_speeds(report)),
             Section("Motion error of each case", moved, tabulate_motion_errors(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
-            Section("Difficulty", DIFFICULTY, tabulate_difficulties(statistics.difficulties(records))),
+            Section(
+                "Difficulty", DIFFICULTY, tabulate_difficulties(statistics.compute_difficulties(records))
+            ),
             *(
-                Section(f"Sequence {printable(name)}", carried, tabulate_sequence(passes))
+                Section(f"Sequence {escape_unprintable(name)}", carried, tabulate_sequence(passes))
                 for name, passes in statistics.group_passes(records).items()
             ),
         ]
     if report.earlier_run is not None:
         changed = tabulate_changes(report.earlier_run, records)
-        title = f"Against {printable(report.earlier_run.source)}"
-        empty = "nothing beyond noise" if statistics.changes(report.earlier_run, records) else NOT_COMPARED
+        title = f"Against {escape_unprintable(report.earlier_run.source)}"
+        empty = (
+            "nothing beyond noise" if statistics.compare_times(report.earlier_run, records) else NOT_COMPARED
+        )
         sections.append(Section(title, "times to a tolerance", changed, empty=empty))
     return [s for s in sections if s.table.rows or s.empty]
 
@@ -132,14 +140,14 @@ def build_short_table(report: Report) -> Table:
     middle = len(report.tolerances) // 2
     if report.is_campaign:
         table = tabulate_robustness(
-            statistics.robustness(report.records), report.tolerances[middle : middle + 1]
+            statistics.compute_robustness(report.ranked_records), report.tolerances[middle : middle + 1]
         )
-        return table.without(*(head for head in table.heads if "iterations" in head), "hardest")
-    by_motion = any(run.plan.get("velocity_tolerances") for run in report.newest.runs.values())
-    if len(report.lines) == 1 and not by_motion:
+        return table.without_columns(*(head for head in table.heads if "iterations" in head), "hardest")
+    by_motion = any(run.plan.get("velocity_tolerances") for run in report.newest_run.runs.values())
+    if len(report.rankings) == 1 and not by_motion:
         return _tabulate_solvers(report, report.tolerances[middle])
     table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
-    column = 1 + (len(report.speeds) // 2 if by_motion else middle)
+    column = 1 + (len(report.velocity_tolerances) // 2 if by_motion else middle)
     rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
     head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) and not by_motion else ALONE}"
     heads = ["structure", head]
@@ -151,13 +159,17 @@ def build_short_table(report: Report) -> Table:
 
 def has_interleaved_calls(report: Report) -> bool:
     """Return whether calls of the recommendation were timed alternately."""
-    return any(r.interleave_group for r in report.records)
+    return any(r.interleave_group for r in report.ranked_records)
 
 
 def _tabulate_solvers(report: Report, tolerance: float) -> Table:
     """Tabulate the solvers of the only structure to a tolerance; the solvers of the first sentence come first."""
-    raced = {choice.solver: (final.line, choice) for final, choice in report.verdict.ranking if choice.solved}
-    alone = [c for c in report.lines[0].by_tolerance[tolerance].ranking if c.solved and c.solver not in raced]
+    raced = {
+        choice.solver: (final.as_record, choice) for final, choice in report.verdict.ranking if choice.solved
+    }
+    alone = [
+        c for c in report.rankings[0].by_tolerance[tolerance].ranking if c.solved and c.solver not in raced
+    ]
     rows: Rows = [
         [
             c.solver,
@@ -170,7 +182,7 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
     rows += [
         [c.solver, Cell.time(c.score, after=format_share(c.solved, c.cases)), c.how, ALONE] for c in alone
     ]
-    engine = rank_engine(report.engines, report.records, report.lines[0].cases, tolerance)
+    engine = rank_engine(report.engines, report.ranked_records, report.rankings[0].cases, tolerance)
     if engine is not None and engine.solved:
         ranked = [*(choice for _, choice in raced.values()), *alone]
         before = sum(not ranks_before(engine, choice) for choice in ranked)
@@ -184,11 +196,11 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
 
 def format_advice(advice: Advice, in_time: bool) -> Cell:
     """Return the first solver with its time or residual, the number of cases that it solves, and its budget."""
-    best, ties = advice.best, advice.ties
+    best, ties = advice.best, advice.tied_solvers
     if best is None:
         most = advice.ranking[0] if advice.ranking else None
         return Cell("none", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
-    write = format_residual if in_time else seconds
+    write = format_residual if in_time else format_seconds
     after = f", {best.how}" if best.how else ""
     if ties:
         others = f" and {len(ties) - SHOWN_TIES} more" if len(ties) > SHOWN_TIES else ""
@@ -212,33 +224,35 @@ def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> T
     """
     heads = [
         *(f"to {format_tolerance(x)}" for x in report.tolerances),
-        *(f"in {seconds(t)}" for t in report.times),
+        *(f"in {format_seconds(t)}" for t in report.recommendation_times),
     ]
     tolerance = report.tolerances[len(report.tolerances) // 2]
-    engines = [rank_engine(report.engines, report.records, line.cases, tolerance) for line in report.lines]
+    engines = [
+        rank_engine(report.engines, report.ranked_records, line.cases, tolerance) for line in report.rankings
+    ]
     rows: Rows = [
         [
             Cell(
                 line.name,
                 after=format_left_out(line.left_out),
-                more=format_count(line.size, "step" if line.sequence else "case"),
+                more=format_count(line.n_cases, "step" if line.sequence else "case"),
                 link=(links or {}).get(line.name, ""),
             ),
             *(format_advice(a, False) for a in line.by_tolerance.values()),
             *(format_advice(a, True) for a in line.by_time.values()),
             _format_engine(engine, tolerance),
         ]
-        for line, engine in zip(report.lines, engines, strict=True)
+        for line, engine in zip(report.rankings, engines, strict=True)
     ]
     table = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
-    return table if any(engines) else table.without(ENGINES_OWN)
+    return table if any(engines) else table.without_columns(ENGINES_OWN)
 
 
 def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
     """Return the engine's own solver to the tolerance of the first sentence."""
     if engine is None or not engine.solved:
         return Cell(NONE if engine is None else f"nothing to {format_tolerance(tolerance)}")
-    text = seconds(engine.score) + format_share(engine.solved, engine.cases)
+    text = format_seconds(engine.score) + format_share(engine.solved, engine.cases)
     return Cell(text, engine.solver, f", to {format_tolerance(tolerance)}", title=INSIDE)
 
 
@@ -259,10 +273,10 @@ def tabulate_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
 
 def tabulate_speeds(report: Report) -> Table:
     """Tabulate the first solver to each motion error [m/s], for each structure."""
-    heads = [f"to {format_speed(x)}" for x in report.speeds]
+    heads = [f"to {format_speed(x)}" for x in report.velocity_tolerances]
     rows: Rows = [
         [line.name, *(format_advice(a, False) for a in line.by_tolerance.values())]
-        for line in recommendation.recommend_from_single_runs(report.by_speed)
+        for line in recommendation.recommend_from_single_runs(report.records_by_motion_error)
         if not line.sequence
     ]
     return Table(["structure", *heads], rows, folds=True)
@@ -282,7 +296,7 @@ def tabulate_cases(
         answer = format_residual(info.stored) if math.isfinite(info.stored) else NONE
         rows.append(
             [
-                Cell(name, link=f"case-{file_name(name)}"), info.law, str(info.rows), str(info.contacts),
+                Cell(name, link=f"case-{make_file_name(name)}"), info.law, str(info.rows), str(info.contacts),
                 ", ".join(info.structure), "none" if best is None else best.solver, Cell.time(time),
                 Cell(answer, value=info.stored),
             ]
@@ -290,7 +304,7 @@ def tabulate_cases(
     head = f"fastest to {format_tolerance(tolerance)}"
     heads = ["case", "law", "rows", "contacts", "structure", head, "time", "stored answer"]
     table = Table(heads, rows, words=WORDS | {head})
-    return table if stored else table.without("stored answer")
+    return table if stored else table.without_columns("stored answer")
 
 
 def tabulate_reaches(reaches: Sequence[statistics.Reach], tolerances: Sequence[float]) -> Table:
@@ -335,14 +349,14 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
         for d in difficulties
     ]
     heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer", "exact solution"]
-    return Table(heads, rows).without(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
+    return Table(heads, rows).without_columns(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
 
 
 def tabulate_motion_errors(report: Report) -> Table:
     """Tabulate time to each motion error, the smallest, relative, and its bound, of each case and solver."""
-    tolerances = report.speeds
+    tolerances = report.velocity_tolerances
     rows: Rows = []
-    for m in statistics.reaches(report.by_speed, tolerances):
+    for m in statistics.compute_reaches(report.records_by_motion_error, tolerances):
         known = [
             f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
             for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
@@ -373,7 +387,8 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     """Tabulate runs that missed their tolerance or made a false claim. Cases of a campaign are not linked."""
     rows: Rows = [
         [
-            Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.target,
+            Cell(f.case, link="" if campaign else f"case-{make_file_name(f.case)}"),
+            name_run(f.solver, f.start), f.target,
             f.status, format_residual(f.relative), format_residual(f.roundoff_floor), f.worst_name,
             (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
         ]
@@ -394,7 +409,7 @@ def tabulate_skips(skips: Sequence[Skip]) -> Table:
 
 def tabulate_changes(old: Records, new: Records) -> Table:
     """Tabulate times to a tolerance that differ from an earlier run beyond noise."""
-    changes = [c for c in statistics.changes(old, new) if c.kind != "same"]
+    changes = [c for c in statistics.compare_times(old, new) if c.kind != "same"]
     rows: Rows = []
     for c in changes:
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
@@ -433,12 +448,12 @@ def tabulate_robustness(
         }
         for r in rows
     ]
-    return Table.of(cells, ["bad" if r.wrong or r.died else "" for r in rows])
+    return Table.from_rows(cells, ["bad" if r.wrong or r.died else "" for r in rows])
 
 
 def tabulate_claims(records: Records) -> Table:
     """Tabulate how many claims of each solver are correct."""
-    claims = statistics.claims(records)
+    claims = statistics.count_claims(records)
     rows: Rows = [
         [
             c.solver, str(c.runs), format_percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
@@ -453,7 +468,7 @@ def tabulate_claims(records: Records) -> Table:
 
 
 def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
-    """Tabulate `statistics.geometric_means` of one law: mean time to each tolerance, and cases that reach it."""
+    """Tabulate the geometric mean time to each tolerance for one law, and the number of cases that reach it."""
     tolerances = list(by_tolerance)
     rows: Rows = [
         [
@@ -474,7 +489,7 @@ def tabulate_backends(records: Records) -> Table:
             *map(Cell.time, (b.total_time, b.total_time - b.backend_time, b.backend_time)),
             str(b.wins),
         ]
-        for b in statistics.backends(records)
+        for b in statistics.compare_backend_times(records)
     ]
     return Table(["solver", "cases", "total", "conversion", "own interface", "faster than lavender"], rows)
 
@@ -483,7 +498,7 @@ def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:
     """Tabulate residuals after one budget in several orders of the blocks."""
     rows: Rows = [
         [
-            s.case, s.solver, str(s.budget), format_ratio(s.factor),
+            s.case, s.solver, str(s.budget), format_ratio(s.worst_to_best_ratio),
             ", ".join(f"{order} {format_residual(x)}" for order, x in s.by_order.items()),
         ]
         for s in spreads
@@ -499,10 +514,12 @@ def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
         rows.append(
             [
                 Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.target, str(w.steps),
-                f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
-                *(format_residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
+                f"{w.carried_gain:.3g}" if math.isfinite(w.carried_gain) and w.mode == "budget" else NONE,
+                *(format_residual(w.get_median_residual(s)) if s in w.residuals else NONE for s in starts),
                 *(
-                    Cell.time(w.time[s], after=format_share(len(w.times[s]), w.steps)) if s in w.time else NONE
+                    Cell.time(w.total_times[s], after=format_share(len(w.times[s]), w.steps))
+                    if s in w.total_times
+                    else NONE
                     for s in starts
                 ),
                 *(str(w.iterations.get(s, NONE)) for s in starts),
@@ -525,7 +542,9 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
 
     def rank(solver: str) -> tuple[float, float, str]:
         w = by_target.get((solver, "tol", middle))
-        return (0, math.inf, solver) if w is None else (-len(w.times[w.start]), w.time[w.start], solver)
+        return (
+            (0, math.inf, solver) if w is None else (-len(w.times[w.start]), w.total_times[w.start], solver)
+        )
 
     rows: Rows = []
     for solver in sorted({w.solver for w in passes}, key=rank):
@@ -537,10 +556,10 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
                 *(
                     NONE
                     if w is None
-                    else Cell.time(w.time[w.start], after=format_share(len(w.times[w.start]), w.steps))
+                    else Cell.time(w.total_times[w.start], after=format_share(len(w.times[w.start]), w.steps))
                     for w in timed
                 ),
-                *(NONE if w is None else format_residual(w.middle(w.start)) for w in limited),
+                *(NONE if w is None else format_residual(w.get_median_residual(w.start)) for w in limited),
             ]
         )
     heads = [f"to {format_tolerance(x)}" for x in tolerances]
@@ -549,7 +568,7 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
 
 def tabulate_engines(report: Report) -> Table:
     """Tabulate engines' own answers, and the first solver here on the same cases, to the middle tolerance."""
-    records, tolerance = report.records, report.tolerances[len(report.tolerances) // 2]
+    records, tolerance = report.ranked_records, report.tolerances[len(report.tolerances) // 2]
     rows = []
     for c in report.engines:
         cases = list_cases_of(c, records)
@@ -572,7 +591,7 @@ def tabulate_engines(report: Report) -> Table:
                 f"to {format_tolerance(tolerance)}, here": _format_time(first),
             }
         )
-    return Table.of(rows)
+    return Table.from_rows(rows)
 
 
 def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) -> Choice | None:
@@ -590,4 +609,4 @@ def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) ->
 def _format_time(choice: Choice | None) -> str:
     if choice is None or not choice.solved:
         return NONE
-    return seconds(choice.score) + format_share(choice.solved, choice.cases)
+    return format_seconds(choice.score) + format_share(choice.solved, choice.cases)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from lavender.lab.bench import statistics
-from lavender.lab.bench.record import printable
+from lavender.lab.bench.record import escape_unprintable
 from lavender.lab.report.findings import Report
 from lavender.lab.report.motion_tables import list_idle_cases
 from lavender.lab.report.table import COLOURS, Cell, Table
@@ -41,13 +41,15 @@ def print_table(console: Console, table: Table, grouped: bool = False, cut: bool
     from rich.text import Text
 
     empty = [
-        head for i, head in enumerate(table.heads) if table.rows and not any(row[i] for row in table.texts)
+        head
+        for i, head in enumerate(table.heads)
+        if table.rows and not any(row[i] for row in table.cell_texts)
     ]
-    table = table.without(*empty)
+    table = table.without_columns(*empty)
     grid = RichTable(box=None, pad_edge=False, header_style="bold")
     for head in table.heads:
         grid.add_column(
-            Text(head), justify="right" if table.is_number(head) else "left", no_wrap=not table.folds
+            Text(head), justify="right" if table.is_numeric_column(head) else "left", no_wrap=not table.folds
         )
     grid.columns[0].no_wrap = not (table.folds or cut)
     above = ""
@@ -75,8 +77,8 @@ def _fold_words(grid: RichTable, table: Table) -> int:
 
     width = 2 * (len(table.heads) - 1)
     for i, (column, head) in enumerate(zip(grid.columns, table.heads, strict=True)):
-        texts = [row[i] for row in table.texts]
-        if table.is_number(head):
+        texts = [row[i] for row in table.cell_texts]
+        if table.is_numeric_column(head):
             lines = textwrap.wrap(head, max(map(len, ["x" * MIN_HEAD_WIDTH, *texts, *head.split()])))
             smallest = max(map(len, [*texts, *lines]))
             column.header = Text("\n".join(lines))
@@ -90,7 +92,7 @@ def _fold_words(grid: RichTable, table: Table) -> int:
 def _print_lines(console: Console, table: Table) -> None:
     """Print each row as the line of its first cell, and a line for each other cell."""
     width = max(map(len, table.heads[1:]))
-    for name, *texts in table.texts:
+    for name, *texts in table.cell_texts:
         console.print(name, highlight=False, markup=False)
         for head, text in zip(table.heads[1:], texts, strict=True):
             console.print(f"  {head:<{width}}  {text}", highlight=False, markup=False)
@@ -99,7 +101,7 @@ def _print_lines(console: Console, table: Table) -> None:
 def print_report(report: Report, console: Console, complete: bool = False) -> None:
     """Print the recommendation, a table to the middle tolerance, and notes.
 
-    A short report has at most `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
+    A short report has up to `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
     and warning.
     """
     from rich.text import Text
@@ -110,9 +112,15 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
             lines.append(Text(statement.text, style="" if i else "bold"))
             hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
             in_c = (f"# in C: {statement.in_c}",) * bool(statement.in_c)
-            code = (*statement.code, *in_c) if complete else (statement.line + hint,) * bool(statement.line)
+            code = (
+                (*statement.code, *in_c)
+                if complete
+                else (statement.call_line + hint,) * bool(statement.call_line)
+            )
             lines += [Text(f"    {line}") for line in code]
-    lines += [Text(warning, style="yellow") for warning in (report.stopped, report.busy) if warning]
+    lines += [
+        Text(warning, style="yellow") for warning in (report.stopped_warning, report.busy_warning) if warning
+    ]
     notes = [
         Text.assemble((text, style)) for text, style in _list_notes(report, MAX_NOTES if complete else 1)
     ]
@@ -146,10 +154,10 @@ def print_first_rows(console: Console, table: Table, height: int) -> None:
 
 def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     """Yield notes, each with a style: at most `most` of each kind, with the number of all of them."""
-    records = report.records
+    records = report.ranked_records
     false_claims = [
         f"{r.case}, {r.solver}: {r.status_conflict}"
-        for r in statistics.failures(records)
+        for r in statistics.list_failures(records)
         if r.status_conflict
     ]
     kinds = {
@@ -157,7 +165,7 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
         "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
         "same answer without an iteration": (
             "yellow",
-            [f"{d.case}: {', '.join(d.same)}" for d in statistics.difficulties(records) if d.same],
+            [f"{d.case}: {', '.join(d.same)}" for d in statistics.compute_difficulties(records) if d.same],
         ),
         "left out": ("yellow", [f"{what}: {reason}" for what, reason in list_left_out(records)]),
     }
@@ -175,12 +183,12 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
         pairs = format_count(refused, "pair")
         yield f"{pairs} of case and solver not run, or not to the end: the page says why", "dim"
     if report.earlier_run is not None:
-        changes = statistics.changes(report.earlier_run, records)
+        changes = statistics.compare_times(report.earlier_run, records)
         by_kind = Counter(c.kind for c in changes if c.kind != "same")
         text = ", ".join(f"{n} {kind}" for kind, n in sorted(by_kind.items()))
         text = text or ("nothing beyond noise" if changes else NOT_COMPARED)
-        yield f"Against {printable(report.earlier_run.source)}: {text}", ""
-    idle = list_idle_cases(report.newest)
+        yield f"Against {escape_unprintable(report.earlier_run.source)}: {text}", ""
+    idle = list_idle_cases(report.newest_run)
     if idle:
         worst = max(idle, key=lambda case: case.velocity)
         cases, speed = format_count(len(idle), "case"), format_residual(worst.velocity)

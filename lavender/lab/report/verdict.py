@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.io.stored import SUFFIXES
 from lavender.lab.bench import statistics
 from lavender.lab.bench.recommendation import (
@@ -54,7 +54,7 @@ class Statement:
     requested: bool = False
 
     @property
-    def line(self) -> str:
+    def call_line(self) -> str:
         """The call without the loop around it; empty without code."""
         return next((line.strip() for line in self.code if "lv.solve" in line), "")
 
@@ -75,7 +75,7 @@ class Verdict:
     ranking: tuple[tuple[TimedCall, Choice], ...] = ()
 
     @property
-    def text(self) -> str:
+    def joined_text(self) -> str:
         """All sentences in one line."""
         return " ".join(statement.text for statement in self.statements)
 
@@ -108,7 +108,9 @@ def build_verdict(
         best = list_subjects(convert_to_motion_errors(records))[0].best.best
         if best is not None:
             reached = _describe_speed(speeds[len(speeds) // 2])
-            statements.append(Statement(f"By motion error {best.solver}: {seconds(best.score)} {reached}."))
+            statements.append(
+                Statement(f"By motion error {best.solver}: {format_seconds(best.score)} {reached}.")
+            )
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
     return Verdict(tuple(statements), tuple(leaders)[:3], parts[0].ranking if len(parts) == 1 else ())
 
@@ -136,7 +138,7 @@ def _recommend(
         return Verdict((Statement(_add_engine(records, text, None, engine, cases)),), near)
     call, first = resampled.ranking[0]
     named_cases = "them" if engine is not None and ranks_before(engine, first) else cases
-    head = _state_choice(records, first, f"{STARTS[call.line.start]}, {reached}", named_cases)
+    head = _state_choice(records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases)
     statements = [
         _add_code(records, call, _add_engine(records, head, first, engine, cases)),
         *_state_certainty(resampled),
@@ -145,32 +147,40 @@ def _recommend(
     batches = [
         f
         for f in select_calls(records, "batch")
-        if f.line.solver == first.solver and set(f.runs) <= set(call.runs)
+        if f.as_record.solver == first.solver and set(f.runs) <= set(call.runs)
     ]
     for batch in batches[:1] if len(call.runs) > 1 else ():
-        statements.append(_add_code(records, batch, f"As a batch: {seconds(batch.time)} for each problem."))
+        statements.append(
+            _add_code(records, batch, f"As a batch: {format_seconds(batch.mean_time)} for each problem.")
+        )
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
             continue  # The recommended call ends within this time.
         rankings = (rank_calls_in_time(records, calls, t, n) for calls in (interleaved, single))
-        quick = next((r for r in rankings if r is not None and r.ranking[0][1].is_for(SERVED_QUANTILE)), None)
+        quick = next(
+            (r for r in rankings if r is not None and r.ranking[0][1].solves_share(SERVED_QUANTILE)), None
+        )
         if quick is None:
             statements.append(Statement(_state_serving_time(single, t), requested=bool(times)))
             continue
         best, choice = quick.ranking[0]
-        text = _state_service(f"If you have only {seconds(t)}", choice, t)
+        text = _state_service(f"If you have only {format_seconds(t)}", choice, t)
         statements.append(_add_code(records, best, text, bool(times)))
         leaders.insert(1, choice.solver)
     for budget in sweeps:
-        calls = [f for f in single if f.line.mode == "budget" and f.line.max_iter == budget]
+        calls = [f for f in single if f.as_record.mode == "budget" and f.as_record.max_iter == budget]
         swept = rank_calls_in_time(records, calls, math.inf, n)
         budget_text = f"With {format_count(budget, 'sweep')}"
-        if swept is not None and swept.ranking[0][1].is_for(SERVED_QUANTILE):
+        if swept is not None and swept.ranking[0][1].solves_share(SERVED_QUANTILE):
             best, choice = swept.ranking[0]
             statements.append(_add_code(records, best, _state_service(budget_text, choice, math.inf), True))
         elif swept is not None:
             statements.append(Statement(f"{budget_text} no solver serves nine cases of ten.", requested=True))
-    faster = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in statistics.backends(records) if b.wins]
+    faster = [
+        f"{b.solver} on {b.wins} of {b.solved} cases"
+        for b in statistics.compare_backend_times(records)
+        if b.wins
+    ]
     if faster and subject.timing_mode == "call":
         head = (
             "In their own interface, without conversion, some other solvers are faster than all of lavender's"
@@ -188,7 +198,7 @@ def _recommend_by_speed(records: Records) -> Verdict:
     first = best.best
     if first is None:
         return Verdict((Statement(f"No solver brings {cases} so far {reached}."),), leaders)
-    ties = (Statement(f"As good within noise: {', '.join(best.ties)}."),) if best.ties else ()
+    ties = (Statement(f"As good within noise: {', '.join(best.tied_solvers)}."),) if best.tied_solvers else ()
     tol = _find_tolerance(records, first.solver, best.target)
     arguments = (
         f"tol={format_tolerance(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
@@ -251,14 +261,14 @@ def _state_choice(records: Records, first: Choice, reached: str, cases: str) -> 
         {r.case for r in records if r.solver == first.solver}
     )  # Records of several runs may lack some.
     solved = f"{first.solved} of " if has_misses else ""
-    text = f"Use {first.solver}: it solves {solved}{cases} in {seconds(first.score)}"
+    text = f"Use {first.solver}: it solves {solved}{cases} in {format_seconds(first.score)}"
     if first.cases > 1:
         text += " on average"
     if has_misses:
         no_run = f"; on {idle} it has no run" if idle > 0 else ""
-        text += f" (a miss counted as {seconds(statistics.limit_of(records))}{no_run})"
+        text += f" (a miss counted as {format_seconds(statistics.get_time_of_miss(records))}{no_run})"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
-        text += f" ({seconds(first.worst)} at worst, {first.hardest})"
+        text += f" ({format_seconds(first.worst)} at worst, {first.hardest})"
     return f"{text}, {reached}."
 
 
@@ -267,9 +277,9 @@ def _add_engine(records: Records, head: str, first: Choice | None, engine: Choic
     if engine is None:
         return head
     has_misses = engine.solved < engine.cases
-    time = seconds(engine.score) + (" on average" if engine.cases > 1 else "")
+    time = format_seconds(engine.score) + (" on average" if engine.cases > 1 else "")
     if has_misses:
-        time += f" (a miss counted as {seconds(statistics.limit_of(records))})"
+        time += f" (a miss counted as {format_seconds(statistics.get_time_of_miss(records))})"
     if engine.solved and (first is None or ranks_before(engine, first)):
         of = f"{engine.solved} of " if has_misses else ""
         here = head if first is None else f"Of the solvers here, u{head[1:]}"
@@ -285,23 +295,23 @@ def _state_certainty(resampled: ResampledRanking) -> list[Statement]:
     if len(resampled.ranking) < 2:
         return []
     shares = [
-        f"{c.solver} ({seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # Rounded down: 100 % means all.
+        f"{c.solver} ({format_seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # Rounded down: 100 % means all.
         for (_, c), share in zip(resampled.ranking, resampled.shares, strict=True)
-        if c.solver in resampled.named
+        if c.solver in resampled.named_calls
     ]
     text = f"Among the fastest, within noise, in resamplings of cases and repetitions: {', '.join(shares)}."
     if resampled.loss > 1.0:
         loss = format_ratio(resampled.loss)
-        text += f" In the others, {resampled.named[0]} takes {loss} the time of the fastest."
+        text += f" In the others, {resampled.named_calls[0]} takes {loss} the time of the fastest."
     return [Statement(text)]
 
 
 def _state_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
     """State that no call serves enough cases in a time, and the shortest time in which one does."""
     shortest = min(map(compute_serving_time, calls), default=math.inf)
-    text = f"No solver leaves at most half of the start's residual on nine cases of ten in {seconds(limit)}"
+    text = f"No solver leaves at most half of the start's residual on nine cases of ten in {format_seconds(limit)}"
     if math.isfinite(shortest):
-        text += f"; the shortest time for that is {seconds(shortest)}"
+        text += f"; the shortest time for that is {format_seconds(shortest)}"
     return f"{text}."
 
 
@@ -335,9 +345,9 @@ def _explain_missing_c(records: Records, call: TimedCall) -> str:
 
 def _add_code(records: Records, call: TimedCall, text: str, requested: bool = False) -> Statement:
     """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
-    if not call.line.times:
+    if not call.as_record.times:
         text += " Records of an earlier version: the call itself was not timed."
-    line, reason, in_c = call.line, _explain_missing_c(records, call), ""
+    line, reason, in_c = call.as_record, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
     if (
         spec is not None
@@ -349,4 +359,4 @@ def _add_code(records: Records, call: TimedCall, text: str, requested: bool = Fa
         source = quote(records.source or "records.jsonl")
         command = f"lavender export c liblavender --solver {line.solver} --records {source}"
         in_c = f"not in C: {reason}" if reason else command
-    return Statement(text, call.code, in_c, requested)
+    return Statement(text, call.code_lines, in_c, requested)

@@ -41,7 +41,7 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
         raise InputError(
             f"source is a {type(source).__name__}; Records, as lavender.lab.bench.run returns them, or a Report"
         )
-    drawn = build_figures(report.records)
+    drawn = build_figures(report.ranked_records)
     folder = make_folder(folder)
     write_csv(report.all_records, folder / "records.csv")
     write_json(report.all_records, folder / "records.json")
@@ -50,5 +50,5 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     write_text(index, render_page(report, drawn, saved=figures))
     write_text(folder / "summary.md", summarise_report(report))
     if figures:
-        save_figures(drawn, folder / "figures", {r.solver for r in report.newest})
+        save_figures(drawn, folder / "figures", {r.solver for r in report.newest_run})
     return index

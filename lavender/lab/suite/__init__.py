@@ -17,7 +17,14 @@ from collections.abc import Iterator
 
 from lavender.base.errors import UnknownName
 from lavender.lab.suite import friction, hard
-from lavender.lab.suite.case import FAMILIES, MAX_SIZE, Case, Reference, parse, spell
+from lavender.lab.suite.case import (
+    FAMILIES,
+    MAX_SIZE,
+    Case,
+    Reference,
+    format_parameter_value,
+    parse_case_name,
+)
 from lavender.lab.suite.families import (
     box_stack,
     boxed_friction,
@@ -30,7 +37,15 @@ from lavender.lab.suite.families import (
     toy_stack,
     two_particles,
 )
-from lavender.lab.suite.steps import LICENCES, engine_step, missing, package_of, robot, versions, walking
+from lavender.lab.suite.steps import (
+    LICENCES,
+    engine_step,
+    explain_missing_packages,
+    get_model_package,
+    get_package_versions,
+    robot,
+    walking,
+)
 
 __all__ = [
     "FAMILIES",
@@ -46,22 +61,22 @@ __all__ = [
     "chain",
     "default",
     "engine_step",
+    "explain_missing_packages",
     "families",
     "friction",
+    "get_model_package",
+    "get_package_versions",
     "granular",
     "hang",
     "hard",
-    "missing",
     "names",
-    "package_of",
-    "parse",
+    "parse_case_name",
     "pyramid",
     "random_spd",
     "robot",
     "stack",
     "toy_stack",
     "two_particles",
-    "versions",
     "walking",
 ]
 
@@ -129,7 +144,11 @@ def families() -> dict[str, str]:
     """Return {"name(parameter=default, ...)": one-line summary} of every family."""
     out = {}
     for f in FAMILIES.values():
-        shown = [f"{n}={spell(p.default)}" for n, p in f.signature.parameters.items() if n not in f.preset]
+        shown = [
+            f"{n}={format_parameter_value(p.default)}"
+            for n, p in f.signature.parameters.items()
+            if n not in f.preset
+        ]
         out[f"{f.name}({', '.join(shown)})"] = f.summary
     return out
 
@@ -144,10 +163,10 @@ def case(text: str) -> Case:
     InputError
         The text is not a name with parameters, or a value is out of range.
     """
-    name, values = parse(text)
+    name, values = parse_case_name(text)
     if name not in FAMILIES:
         raise UnknownName("case", name, [*FAMILIES, *SETS])
-    return FAMILIES[name].case(**values)
+    return FAMILIES[name].build_case(**values)
 
 
 def cases(text: str) -> Iterator[Case]:

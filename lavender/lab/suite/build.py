@@ -15,7 +15,7 @@ from lavender.problem.rows import Rows
 
 GRAVITY = 9.81  # m/s^2, along -z
 STEP_SIZE = 0.01  # s
-FALL_SPEED = GRAVITY * STEP_SIZE  # m/s, speed that gravity adds in one step
+FALL_SPEED = GRAVITY * STEP_SIZE  # [m/s] Speed that gravity adds in one step.
 
 CONTACT_FRICTION_LAWS = ("none", "coulomb", "cone")
 
@@ -35,11 +35,15 @@ class Bodies:
         self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
         self.v_free[:, 2] = -FALL_SPEED
 
-    def rows(self, contacts: Contacts | None = None, **more: Any) -> Rows:
+    def make_rows(self, contacts: Contacts | None = None, **more: Any) -> Rows:
         """Build the rows of these bodies with joints or contacts; point masses (no inertia) do not rotate."""
         if contacts is not None:
-            more |= dict(zip(("arm_a", "arm_b"), contacts.arms(self.position), strict=True))
-            more |= {"normal": contacts.normal, "tangent": contacts.tangent(), "contact_body": contacts.body}
+            more |= dict(zip(("arm_a", "arm_b"), contacts.compute_arms(self.position), strict=True))
+            more |= {
+                "normal": contacts.normal,
+                "tangent": contacts.compute_tangents(),
+                "contact_body": contacts.body,
+            }
         inv_inertia = np.zeros((len(self.mass), 3, 3))
         inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (
             (1.0 / self.inertia)[:, None] if np.all(self.inertia > 0.0) else 0.0
@@ -55,7 +59,7 @@ class Contacts:
         self.point: FloatArray = np.asarray(point, float).reshape(-1, 3)
         self.normal: FloatArray = np.broadcast_to(np.asarray(normal, float), self.point.shape).copy()
 
-    def arms(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compute_arms(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Compute the arms from the centres of a and b to the points, (c, 3) each [m]; zero for the ground."""
         a, b = (
             np.where(side[:, None] >= 0, self.point - position[np.maximum(side, 0)], 0.0)
@@ -63,14 +67,14 @@ class Contacts:
         )
         return a, b
 
-    def tangent(self) -> FloatArray:
+    def compute_tangents(self) -> FloatArray:
         """Compute unit tangents (c, 3): n x e_x, or n x e_y if n is close to e_x."""
         other = np.where(np.abs(self.normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
         t = np.cross(self.normal, other)
         return t / np.linalg.norm(t, axis=1, keepdims=True)
 
 
-def contact_problem(
+def build_contact_problem(
     bodies: Bodies, contacts: Contacts, friction: str = "none", mu: Any = 0.5, target: Any = 0.0, **more: Any
 ) -> Problem:
     """Build a problem of contacts without friction, or with two tangents and the law "coulomb" or "cone".
@@ -78,24 +82,26 @@ def contact_problem(
     Raises
     ------
     InputError
-        `friction` is none of these.
+        `friction` has another value.
     """
     if friction not in CONTACT_FRICTION_LAWS:
         raise InputError(f"friction is {friction!r}; {', '.join(CONTACT_FRICTION_LAWS)} are known")
-    rows = bodies.rows(contacts)
+    rows = bodies.make_rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)
     return Problem.from_rows(rows, target, mu=mu, tangents=2, friction=friction, **more)
 
 
-def joint_problem(bodies: Bodies, body: Any, jac: Any, size: int, target: Any = 0.0, **more: Any) -> Problem:
+def build_joint_problem(
+    bodies: Bodies, body: Any, jac: Any, size: int, target: Any = 0.0, **more: Any
+) -> Problem:
     """Build a problem of joints of `size` rows each: jac (k size, 12), body (k, 2)."""
     ptr = np.arange(0, len(jac) + 1, size, dtype=np.int32)
-    rows = bodies.rows(jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32))
+    rows = bodies.make_rows(jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32))
     return Problem.from_rows(rows, target, **more)
 
 
-def manifold(body: Any, centre: Any, half_x: Any) -> Contacts:
+def place_four_corners(body: Any, centre: Any, half_x: Any) -> Contacts:
     """Place four corner points on horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3) [m]; normals up."""
     sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
     half = np.broadcast_to(np.asarray(half_x, float), (len(body),))
@@ -105,7 +111,7 @@ def manifold(body: Any, centre: Any, half_x: Any) -> Contacts:
     return Contacts(np.repeat(np.asarray(body), 4, axis=0), point, [0.0, 0.0, 1.0])
 
 
-def tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
+def place_tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
     """Place unit bodies on each other: positions (n, 3), body pairs (n, 2) from the ground up, contacts (n, 3) [m]."""
     k = np.arange(n)
     contact_point = np.stack([0.0 * k, 0.0 * k, k], 1)
@@ -119,7 +125,7 @@ def add_horizontal_velocity(bodies: Bodies, speed: float, seed: int = 5) -> None
     bodies.v_free[:, 1] += speed * map_scalar(math.sin, angle)
 
 
-def static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:
+def guess_static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:
     """Guess the normal impulses (c,) [N s]: the contacts below a body carry equal parts of its load."""
     z = np.append(bodies.position[:, 2], -np.inf)  # the ground is index -1
     a, b = contacts.body.T

@@ -88,7 +88,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Return value of a family function; the decorator `family` adds name and parameters."""
+    """Return value of a family function; the decorator `register_family` adds name and parameters."""
 
     problem: Problem
     reason: str
@@ -119,7 +119,7 @@ class Family:
     preset: Mapping[str, Any]
     summary: str
 
-    def case(self, **parameters: Any) -> Case:
+    def build_case(self, **parameters: Any) -> Case:
         """Build the case of these parameters; the others have their defaults."""
         known = [name for name in self.signature.parameters if name not in self.preset]
         for name in parameters:
@@ -131,7 +131,7 @@ class Family:
 FAMILIES: dict[str, Family] = {}
 
 
-def family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
+def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
     """Register a function under its name, and under aliases with some parameters fixed."""
 
     def decorate(function: Callable[P, Draft]) -> Callable[P, Case]:
@@ -198,14 +198,14 @@ def _spell_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) 
             best, preset = alias.name, fixed
     parameters = FAMILIES[name].signature.parameters
     shown = [
-        f"{n}={spell(v)}"
+        f"{n}={format_parameter_value(v)}"
         for n, v in values.items()
         if n not in preset and (n in explicit or v != parameters[n].default)
     ]
     return f"{best}({', '.join(shown)})" if shown else best
 
 
-def spell(value: Any) -> str:
+def format_parameter_value(value: Any) -> str:
     """Return the shortest text of a value in a case name that gives the same number."""
     if not isinstance(value, float):
         return str(value)
@@ -217,7 +217,7 @@ def spell(value: Any) -> str:
     return min((s for s in spellings if float(s) == value), key=len)
 
 
-def parse(text: str) -> tuple[str, dict[str, Any]]:
+def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
     """Split "pyramid(k=10, mass_ratio=1e6)" into name and parameters; strings need no quotes.
 
     Raises

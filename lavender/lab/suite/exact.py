@@ -18,7 +18,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
 from lavender_ext.core.checks import MIN_MAGNITUDE
 
@@ -31,24 +31,24 @@ FREE_ROW_MARGIN = 1e-6
 Pair = tuple[FloatArray, FloatArray]
 
 
-def _split(x: FloatArray) -> Pair:
+def _split_bits(x: FloatArray) -> Pair:
     """Split 53 bits into 26 + 26 (Veltkamp); |x| must be below 2^996."""
     t = VELTKAMP_FACTOR * x
     high = t - (t - x)
     return high, x - high
 
 
-def _product(x: FloatArray, y: FloatArray) -> Pair:
+def _multiply_exactly(x: FloatArray, y: FloatArray) -> Pair:
     """Compute x y = p + e exactly, unless it underflows."""
     p = x * y
-    (xh, xl), (yh, yl) = _split(x), _split(y)
+    (xh, xl), (yh, yl) = _split_bits(x), _split_bits(y)
     return p, ((xh * yh - p) + xh * yl + xl * yh) + xl * yl
 
 
-def _matvec(a: sp.csr_array, x: Pair, *added: FloatArray) -> Pair:
+def _multiply_in_extended_precision(a: sp.csr_array, x: Pair, *added: FloatArray) -> Pair:
     """Compute A x plus vectors as hi + lo, each row summed without rounding."""
     hi, lo = (part[a.indices] for part in x)
-    p, e = _product(a.data, hi)
+    p, e = _multiply_exactly(a.data, hi)
     terms = np.stack([p, e, a.data * lo], axis=1).ravel().tolist()
     summands = np.stack(added, axis=1).tolist() if added else [[] for _ in range(a.shape[0])]
     ends = (3 * a.indptr).tolist()
@@ -74,16 +74,18 @@ class ExtendedOperator:
             assert problem.compliance is not None
             self.compliance = problem.compliance
 
-    def slack(self, hi: FloatArray, lo: FloatArray | None = None) -> FloatArray:
+    def compute_slack(self, hi: FloatArray, lo: FloatArray | None = None) -> FloatArray:
         """Compute w (m,) [m/s] of the impulse hi + lo."""
         lam = (hi, np.zeros_like(hi) if lo is None else lo)
         y = lam
         for factor in self.factors[:-1]:
-            y = _matvec(factor, y)
-        compliant_velocity = _product(self.compliance, lam[0])
-        return _matvec(self.factors[-1], y, -self.b, *compliant_velocity, self.compliance * lam[1])[0]
+            y = _multiply_in_extended_precision(factor, y)
+        compliant_velocity = _multiply_exactly(self.compliance, lam[0])
+        return _multiply_in_extended_precision(
+            self.factors[-1], y, -self.b, *compliant_velocity, self.compliance * lam[1]
+        )[0]
 
-    def size(self, impulse: FloatArray) -> FloatArray:
+    def sum_term_magnitudes(self, impulse: FloatArray) -> FloatArray:
         """Sum the absolute values of the terms of each row of w (m,) [m/s]: rounding is relative to this."""
         y = x = np.abs(impulse)
         for factor in self.factors:
@@ -101,7 +103,7 @@ def solve_linear(problem: Problem) -> FloatArray:
     """
     operator = ExtendedOperator(problem)
     hi, lo = _solve_rows(problem, operator, np.ones(problem.m, bool), np.zeros(problem.m))
-    if np.any(np.abs(operator.slack(hi, lo)) > 2.0**-49 * operator.size(hi)):
+    if np.any(np.abs(operator.compute_slack(hi, lo)) > 2.0**-49 * operator.sum_term_magnitudes(hi)):
         raise InputError("no solution: A is singular and b is outside its range")
     return hi
 
@@ -123,13 +125,13 @@ def solve_boxed(problem: Problem, candidate: FloatArray) -> FloatArray:
     inside = (lam - c.lower > FREE_ROW_MARGIN * size) & (c.upper - lam > FREE_ROW_MARGIN * size)
     nearest = np.where(lam - c.lower <= c.upper - lam, c.lower, c.upper)
     hi, lo = _solve_rows(problem, operator, inside, np.where(inside, lam, nearest))
-    w = operator.slack(hi, lo)
+    w = operator.compute_slack(hi, lo)
     violation = np.where(
         hi <= c.lower, np.maximum(-w, 0.0), np.where(hi >= c.upper, np.maximum(w, 0.0), np.abs(w))
     )
     excess = np.maximum(np.maximum(c.lower - hi, hi - c.upper), 0.0).max(initial=0.0)
     # Rows that are zero in exact arithmetic are accurate to some units of 2^-53 of the rounded data.
-    rounding_scale = operator.size(hi)
+    rounding_scale = operator.sum_term_magnitudes(hi)
     if (
         np.any(violation > 2.0**-49 * rounding_scale + 2.0**-90 * rounding_scale.max(initial=0.0))
         or excess > 2.0**-49 * size
@@ -165,7 +167,9 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
             continue
         inside = np.repeat(candidate[normal] > 1e-12 * np.abs(candidate).max(), np.diff(c.ptr))
         hi, lo = _solve_rows(problem, operator, inside, np.where(inside, candidate, 0.0))
-        if np.all(np.abs(operator.slack(hi, lo)) <= 2.0**-49 * operator.size(hi)) and _in_cones(problem, hi):
+        if np.all(
+            np.abs(operator.compute_slack(hi, lo)) <= 2.0**-49 * operator.sum_term_magnitudes(hi)
+        ) and _is_in_cones(problem, hi):
             return hi
     raise InputError("no impulses with room for rounding hold the bodies at rest")
 
@@ -181,12 +185,12 @@ def _propose_rest_impulse(problem: Problem, momentum: FloatArray, scale: FloatAr
     one = np.ones(k)
     columns_of_margin = np.stack([normal, np.full(k, m)], 1).ravel()
     facets = [
-        sp.csr_array((np.tile([-1.0, 1.0], k), columns_of_margin, _row_pointers(k, 2)), shape=(k, m + 1))
+        sp.csr_array((np.tile([-1.0, 1.0], k), columns_of_margin, _make_row_pointers(k, 2)), shape=(k, m + 1))
     ]
     for x, y in [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)] if c.n_tangents.any() else []:
         values = np.stack([-c.mu, x * one, y * one, one], 1).ravel()
         columns = np.stack([normal, normal + 1, normal + 2, np.full(k, m)], 1).ravel()
-        facets.append(sp.csr_array((values, columns, _row_pointers(k, 4)), shape=(k, m + 1)))
+        facets.append(sp.csr_array((values, columns, _make_row_pointers(k, 4)), shape=(k, m + 1)))
     result = linprog(
         np.append(np.zeros(m), -1.0),
         A_ub=sp.vstack(facets),
@@ -199,12 +203,12 @@ def _propose_rest_impulse(problem: Problem, momentum: FloatArray, scale: FloatAr
     return scale.max() * result.x[:m] if result.status == 0 else None
 
 
-def _row_pointers(n_rows: int, entries_per_row: int) -> IntArray:
+def _make_row_pointers(n_rows: int, entries_per_row: int) -> IntArray:
     """Return the row pointers of a CSR matrix with equally many entries in all rows."""
     return np.arange(0, entries_per_row * n_rows + 1, entries_per_row, dtype=np.int32)
 
 
-def _in_cones(problem: Problem, impulse: FloatArray) -> bool:
+def _is_in_cones(problem: Problem, impulse: FloatArray) -> bool:
     """Whether the impulses of all contacts satisfy their friction bounds."""
     c = problem.cones
     normal = impulse[c.ptr[:-1]]
@@ -219,7 +223,7 @@ def _solve_rows(problem: Problem, operator: ExtendedOperator, rows: np.ndarray, 
     index = np.flatnonzero(rows)
     if len(index) == 0:
         return start.copy(), np.zeros_like(start)
-    for solve in _solvers(sp.csc_matrix(problem.csr[index][:, index])):
+    for solve in _iterate_solvers(sp.csc_matrix(problem.csr[index][:, index])):
         result = _refine(operator, index, start, solve)
         if result is not None:
             return result
@@ -236,7 +240,7 @@ def _refine(
     hi, lo = start.copy(), np.zeros_like(start)
     last = np.inf
     for _ in range(MAX_REFINEMENT_STEPS):
-        step = solve(-operator.slack(hi, lo)[index])
+        step = solve(-operator.compute_slack(hi, lo)[index])
         change = float(np.abs(step).max())
         if not np.isfinite(change):
             return None
@@ -254,7 +258,7 @@ def _refine(
     return None
 
 
-def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
+def _iterate_solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
     """Yield solvers: a factorisation, or inverses on ever smaller ranges of A, for dependent rows."""
     if a.shape[0] <= MAX_SVD_ROWS:
         dense = a.toarray()
@@ -266,6 +270,6 @@ def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
             yield lambda r, inverse=inverse: d * (inverse @ (d * r))  # type: ignore[misc]
         return
     try:
-        yield sparse_lu(a).solve
+        yield factor_sparse_lu(a).solve
     except RuntimeError as error:
         raise InputError(f"the rows cannot be factorised ({error})") from None

@@ -19,14 +19,14 @@ from lavender.lab.suite.build import (
     Bodies,
     Contacts,
     add_horizontal_velocity,
-    contact_problem,
-    joint_problem,
-    manifold,
+    build_contact_problem,
+    build_joint_problem,
+    guess_static_loads,
     map_scalar,
-    static_loads,
-    tower,
+    place_four_corners,
+    place_tower,
 )
-from lavender.lab.suite.case import Draft, Reference, family
+from lavender.lab.suite.case import Draft, Reference, register_family
 from lavender.lab.suite.exact import solve_boxed, solve_linear, solve_rest_impulse
 from lavender.problem import Problem
 from lavender.solving.solve import solve
@@ -37,7 +37,7 @@ FRICTION_COEFFICIENT = 0.5
 SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1
 
 
-def check_minimum(minimum: int, **sizes: int) -> None:
+def check_min_sizes(minimum: int, **sizes: int) -> None:
     """Raise InputError if a size is below `minimum`."""
     for name, value in sizes.items():
         if value < minimum:
@@ -51,14 +51,14 @@ def check_positive(**values: float) -> None:
             raise InputError(f"{name} is {value}; a number above 0 is needed")
 
 
-def rest_reference(problem: Problem) -> Callable[[], Reference]:
+def make_rest_reference(problem: Problem) -> Callable[[], Reference]:
     """Return the function that computes the reference of bodies that stay at rest: w = 0."""
     return lambda: Reference(
         solve_rest_impulse(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
     )
 
 
-def boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Reference]:
+def make_boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Reference]:
     """Return the function that computes a boxed LCP's reference: sweeps propose the active set, which is proved."""
 
     def solve_reference() -> Reference:
@@ -72,22 +72,22 @@ def boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Re
 # -- stacks ---------------------------------------------------------------------------------------
 
 
-@family(stackF=WITH_FRICTION)
+@register_family(stackF=WITH_FRICTION)
 def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
     """n spheres in a column, one contact between neighbours; the top one weighs `mass_ratio` times the others.
 
     A is tridiagonal with condition number near n^2 (times a factor of mass_ratio). Without friction and after one step
     of gravity, contact i carries the bodies above it: lambda_i = g h sum of masses above.
     """
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     check_positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    position, pairs, contact_point = tower(n)
+    position, pairs, contact_point = place_tower(n)
     bodies = Bodies(position, mass, SPHERE)
     add_horizontal_velocity(bodies, sliding)
     contacts = Contacts(pairs, contact_point, [0.0, 0.0, 1.0])
-    problem = contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
+    problem = build_contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
     reason = "information must travel from the ground to the top: sweeps grow as n^2, a tridiagonal factorisation as n"
     if friction != "none" and sliding != 0.0:
         return Draft(problem, reason)
@@ -101,15 +101,15 @@ def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding:
     return Draft(problem, reason, closed_form)
 
 
-@family(box_stackF=WITH_FRICTION)
+@register_family(box_stackF=WITH_FRICTION)
 def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
     """n unit cubes on four points each; the top one weighs `mass_ratio` times the others.
 
     Four normals of one face have rank 3 (twelve rows with friction have rank 6): impulses are not unique,
     velocities are. With friction every body also gets a small random velocity, so that contacts slide and lift.
     """
-    bodies, contacts = _cube_column(n, mass_ratio)
-    problem = _box_problem(bodies, contacts, friction, sliding)
+    bodies, contacts = _build_cube_column(n, mass_ratio)
+    problem = _build_box_problem(bodies, contacts, friction, sliding)
     reason = (
         "redundant: four points where three would do, so A is singular; heavy on light makes sweeps stall"
     )
@@ -125,17 +125,17 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
     return Draft(problem, reason, closed_form)
 
 
-def _cube_column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
+def _build_cube_column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
     """Build the bodies and contacts of a column of unit cubes."""
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     check_positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    position, pairs, contact_point = tower(n)
-    return Bodies(position, mass, BOX), manifold(pairs, contact_point, 0.5)
+    position, pairs, contact_point = place_tower(n)
+    return Bodies(position, mass, BOX), place_four_corners(pairs, contact_point, 0.5)
 
 
-@family(pyramidF=WITH_FRICTION)
+@register_family(pyramidF=WITH_FRICTION)
 def pyramid(
     k: int = 10,
     mass_ratio: float = 1.0,
@@ -147,15 +147,15 @@ def pyramid(
 
     4 k^2 contacts on 3 k (k + 1) degrees of freedom: redundant. `bottom_ratio` makes the lowest row heavy.
     """
-    bodies, contacts = _cube_pyramid(k, mass_ratio, bottom_ratio)
-    problem = _box_problem(bodies, contacts, friction, sliding)
+    bodies, contacts = _build_cube_pyramid(k, mass_ratio, bottom_ratio)
+    problem = _build_box_problem(bodies, contacts, friction, sliding)
     reason = "more contacts than degrees of freedom, loads that spread sideways, heavy on light"
-    return Draft(problem, reason, rest_reference(problem) if friction == "none" else None)
+    return Draft(problem, reason, make_rest_reference(problem) if friction == "none" else None)
 
 
-def _cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
+def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
     """Build the bodies and contacts of a pyramid of unit cubes."""
-    check_minimum(1, k=k)
+    check_min_sizes(1, k=k)
     check_positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
     row = np.repeat(np.arange(k), k - np.arange(k))
     first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # first box of each row
@@ -176,15 +176,15 @@ def _cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple
     low = np.where(a < 0, x[b], np.maximum(x[np.maximum(a, 0)], x[b])) - 0.5
     high = np.where(a < 0, x[b], np.minimum(x[np.maximum(a, 0)], x[b])) + 0.5
     centre = np.stack([0.5 * (low + high), 0.0 * low, row[b].astype(float)], 1)
-    return bodies, manifold(pairs, centre, 0.5 * (high - low))
+    return bodies, place_four_corners(pairs, centre, 0.5 * (high - low))
 
 
-def _box_problem(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
+def _build_box_problem(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
     """Build a problem of boxes; with friction, some contacts slide and some lift."""
     if friction != "none":
         _add_random_velocity(bodies)
     add_horizontal_velocity(bodies, sliding)
-    return contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
+    return build_contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
 
 
 def _add_random_velocity(bodies: Bodies) -> None:
@@ -195,22 +195,22 @@ def _add_random_velocity(bodies: Bodies) -> None:
 # -- piles ----------------------------------------------------------------------------------------
 
 
-@family(granularF=WITH_FRICTION)
+@register_family(granularF=WITH_FRICTION)
 def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int = 7) -> Draft:
     """n^3 pebbles on a jittered lattice in a box, contacts with neighbours, floor and four walls.
 
     n = 4, 9, 18 give 299, 3,402 and 27,570 contacts (seed 7). Well conditioned and three-dimensional: sparse
     factorisations fill in, sweeps converge fast.
     """
-    check_minimum(1, n=n)
-    bodies, contacts = _pile(n, seed)
+    check_min_sizes(1, n=n)
+    bodies, contacts = _build_pile(n, seed)
     add_horizontal_velocity(bodies, sliding)
-    problem = contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
+    problem = build_contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
     reason = "a large well-conditioned pile: sweeps converge fast, factorisations fill in"
-    return Draft(problem, reason, boxed_reference(problem) if friction == "none" else None)
+    return Draft(problem, reason, make_boxed_reference(problem) if friction == "none" else None)
 
 
-def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
+def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     """Build a pile site by site (x slowest): face neighbours, 30 % of the edge neighbours, walls; compute last."""
     rng = np.random.default_rng(seed)
     count = n**3
@@ -280,45 +280,45 @@ def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
 # -- joints ---------------------------------------------------------------------------------------
 
 
-@family()
+@register_family()
 def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     """n rods in a slack zig-zag arm from a fixed point, ball joints of 3 rows, the last rod weighs `tip_mass`.
 
     Half-bandwidth 5. The tension is small: the easy chain.
     """
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     check_positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack(
         [0.8 + 0.0 * k, 0.3 * map_scalar(math.cos, k), -0.5 + 0.3 * map_scalar(math.sin, 1.7 * k)], 1
     )
-    problem = _chain(link, tip_mass, 0.02)
+    problem = _build_chain(link, tip_mass, 0.02)
     return Draft(
         problem,
         "bilateral and banded with little tension: easy for every solver that uses the band",
-        _linear_reference(problem),
+        _make_linear_reference(problem),
     )
 
 
-@family()
+@register_family()
 def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
-    """n rods hanging almost straight down under their weight and that of the last, `tip_mass`.
+    """n rods hanging almost straight down under their weight; the last one weighs `tip_mass`.
 
     Half-bandwidth 5; the condition number grows as n^2 and with tip_mass: the hard chain.
     """
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     check_positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack([1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
-    problem = _chain(link, tip_mass, 1e-4)
+    problem = _build_chain(link, tip_mass, 1e-4)
     return Draft(
         problem,
         "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
-        _linear_reference(problem),
+        _make_linear_reference(problem),
     )
 
 
-def _chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
+def _build_chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
     """Build a chain of rods along `link` (n, 3) with ball joints."""
     n = len(link)
     link = link / np.linalg.norm(link, axis=1, keepdims=True)
@@ -329,10 +329,12 @@ def _chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
     bodies.v_free = jitter * np.random.default_rng(11).standard_normal(6 * n).reshape(-1, 6)
     bodies.v_free[:, 2] -= FALL_SPEED
     body = np.stack([np.arange(n) - 1, np.arange(n)], 1)
-    return joint_problem(bodies, body, ball_joints(bodies.position, body, anchor[:-1]), 3)
+    return build_joint_problem(
+        bodies, body, compute_ball_joint_jacobian(bodies.position, body, anchor[:-1]), 3
+    )
 
 
-def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> FloatArray:
+def compute_ball_joint_jacobian(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> FloatArray:
     """Compute the Jacobian (3 k, 12) of ball joints: the anchors on bodies a and b have the same velocity."""
     k = len(body)
     jac = np.zeros((k, 3, 12))
@@ -347,17 +349,17 @@ def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> F
     return jac.reshape(-1, 12)
 
 
-def ordered_matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+def multiply_in_index_order(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute a @ b, summed in the order of the index: unlike BLAS, it has the same bits on every processor."""
     return np.asarray(sum(np.multiply.outer(column, row) for column, row in zip(a.T, b, strict=True)))
 
 
-def _linear_reference(problem: Problem) -> Callable[[], Reference]:
+def _make_linear_reference(problem: Problem) -> Callable[[], Reference]:
     """Return the function that computes the reference of a linear problem."""
     return lambda: Reference(solve_linear(problem), "factorised in float64, refined in 100 bits")
 
 
-@family()
+@register_family()
 def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draft:
     """Two particles joined by one distance row: the smallest problem, A derived here.
 
@@ -376,7 +378,7 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
     bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL_SPEED], [0.0, 0.1, -FALL_SPEED]
     n = x[1] - x[0]  # its length is 1: 0.36 + 0.64
     jac = np.concatenate([-n, np.zeros(3), n, np.zeros(3)])[None]
-    problem = joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
+    problem = build_joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
     closing = -drift / 0.01 - n @ (bodies.v_free[1, :3] - bodies.v_free[0, :3])
 
     def closed_form() -> Reference:
@@ -388,7 +390,7 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
 # -- small problems -------------------------------------------------------------------------------
 
 
-@family()
+@register_family()
 def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
     """Eight unit spheres in a column, eight contacts; the fifth is kicked upwards by `kick` [m/s].
 
@@ -401,26 +403,26 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
         raise InputError(f"kick is {kick}; upwards (0 or more) is needed")
     if friction not in ("none", "box"):
         raise InputError(f"friction is {friction!r}; none, box are known")
-    position, pairs, contact_point = tower(n)
+    position, pairs, contact_point = place_tower(n)
     bodies = Bodies(position, 1.0, SPHERE)
     bodies.v_free[4, 2] += kick
     contacts = Contacts(pairs, contact_point, [0.0, 0.0, 1.0])
     reason = "eight contacts that fit on a page, one of which must open"
     if friction == "none":
-        problem = contact_problem(bodies, contacts)
-        return Draft(problem, reason, boxed_reference(problem, "impulse"))
+        problem = build_contact_problem(bodies, contacts)
+        return Draft(problem, reason, make_boxed_reference(problem, "impulse"))
     bodies.v_free[:, 0] = 0.05 * np.arange(1, n + 1)
-    problem = _boxed_friction_problem(bodies, contacts)
-    return Draft(problem, reason + ", with friction bounded by fixed loads", boxed_reference(problem))
+    problem = _build_boxed_friction_problem(bodies, contacts)
+    return Draft(problem, reason + ", with friction bounded by fixed loads", make_boxed_reference(problem))
 
 
-@family()
+@register_family()
 def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
     """A dense symmetric positive definite linear system: eigenvalues from 1/condition to 1, evenly in the logarithm.
 
     b = A x with x of standard normal entries, so that every eigenvector matters.
     """
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     if not condition >= 1.0:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
@@ -435,15 +437,15 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
         for view in (a, a.T):
             view[i], view[j] = c * view[i] - s * view[j], s * view[i] + c * view[j]
     a = 0.5 * (a + a.T)
-    problem = Problem.linear(a, ordered_matmul(a, rng.standard_normal(n)))
+    problem = Problem.linear(a, multiply_in_index_order(a, rng.standard_normal(n)))
     return Draft(
         problem,
         "no structure, only a condition number, which separates direct from iterative solvers",
-        _linear_reference(problem),
+        _make_linear_reference(problem),
     )
 
 
-@family()
+@register_family()
 def boxed_friction(
     n: int = 4, scene: str = "box_stack", mass_ratio: float = 1.0, sliding: float = 0.5
 ) -> Draft:
@@ -453,39 +455,39 @@ def boxed_friction(
     size n.
     """
     if scene == "box_stack":
-        bodies, contacts = _cube_column(n, mass_ratio)
+        bodies, contacts = _build_cube_column(n, mass_ratio)
         _add_random_velocity(bodies)
     elif scene == "pyramid":
-        bodies, contacts = _cube_pyramid(n, mass_ratio)
+        bodies, contacts = _build_cube_pyramid(n, mass_ratio)
         _add_random_velocity(bodies)
     elif scene == "granular":
-        check_minimum(1, n=n)
-        bodies, contacts = _pile(n, 7)
+        check_min_sizes(1, n=n)
+        bodies, contacts = _build_pile(n, 7)
     else:
         raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
     add_horizontal_velocity(bodies, sliding)
-    problem = _boxed_friction_problem(bodies, contacts)
+    problem = _build_boxed_friction_problem(bodies, contacts)
     return Draft(
         problem,
         "friction that every QP solver accepts: a boxed LCP with finite bounds",
-        boxed_reference(problem),
+        make_boxed_reference(problem),
     )
 
 
-def _boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:
+def _build_boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:
     """Build rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
-    arm_a, arm_b = contacts.arms(bodies.position)
-    n, t = contacts.normal, contacts.tangent()
+    arm_a, arm_b = contacts.compute_arms(bodies.position)
+    n, t = contacts.normal, contacts.compute_tangents()
     axes = np.stack([n, t, np.cross(n, t)], 1)  # (c, 3, 3)
     moving = (contacts.body >= 0).astype(float)[:, :, None, None]
     jac = np.concatenate([
         -axes * moving[:, 0], -np.cross(arm_a[:, None], axes) * moving[:, 0],
         axes * moving[:, 1], np.cross(arm_b[:, None], axes) * moving[:, 1],
     ], axis=2)  # fmt: skip
-    bound = FRICTION_COEFFICIENT * static_loads(bodies, contacts)
+    bound = FRICTION_COEFFICIENT * guess_static_loads(bodies, contacts)
     high = np.stack([np.full(len(n), np.inf), bound, bound], 1)
     low = np.stack([np.zeros(len(n)), -bound, -bound], 1)
     names = [f"contact {i}" for i in range(len(n))]
-    return joint_problem(
+    return build_joint_problem(
         bodies, contacts.body, jac.reshape(-1, 12), 3, lower=low.ravel(), upper=high.ravel(), names=names
     )

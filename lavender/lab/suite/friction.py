@@ -8,14 +8,21 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.lab.suite.build import FALL_SPEED, Bodies, Contacts, contact_problem, manifold, map_scalar
-from lavender.lab.suite.case import Draft, Reference, family
-from lavender.lab.suite.families import BOX, check_minimum, check_positive, rest_reference
+from lavender.lab.suite.build import (
+    FALL_SPEED,
+    Bodies,
+    Contacts,
+    build_contact_problem,
+    map_scalar,
+    place_four_corners,
+)
+from lavender.lab.suite.case import Draft, Reference, register_family
+from lavender.lab.suite.families import BOX, check_min_sizes, check_positive, make_rest_reference
 from lavender.lab.suite.hard import EXPECT_EXACT
 from lavender.problem import Problem
 
 
-@family()
+@register_family()
 def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb") -> Draft:
     """A point mass sliding across the slope of a ramp of `angle` [degrees]: one contact, solved by hand.
 
@@ -28,7 +35,7 @@ def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: s
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     bodies.v_free[0, :3] = [speed, -FALL_SPEED * math.sin(a), -FALL_SPEED * math.cos(a)]
     contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
-    problem = contact_problem(bodies, contacts, friction, mu)
+    problem = build_contact_problem(bodies, contacts, friction, mu)
 
     def closed_form() -> Reference:
         b = problem.b
@@ -45,13 +52,15 @@ def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: s
     return Draft(problem, "friction coefficients from 0 to 10: sticking and sliding", closed_form)
 
 
-@family()
+@register_family()
 def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
     """A cube on four points of a ramp of `angle` [degrees]; with mu = 0.5 it slides above arctan 0.5 = 26.6 degrees."""
     a = np.deg2rad(angle)
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, BOX)
     bodies.v_free[0, :3] = [FALL_SPEED * math.sin(a), 0.0, -FALL_SPEED * math.cos(a)]
-    problem = contact_problem(bodies, manifold([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu)
+    problem = build_contact_problem(
+        bodies, place_four_corners([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu
+    )
 
     def closed_form() -> Reference:
         n, t = FALL_SPEED * math.cos(a), min(FALL_SPEED * math.sin(a), mu * FALL_SPEED * math.cos(a))
@@ -74,14 +83,14 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
     )
 
 
-@family()
+@register_family()
 def threshold(above: float = 0.0) -> Draft:
     """A point mass pushed with (1 + above) times the friction limit: between sticking and sliding."""
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     push_speed = (1.0 + above) * 0.5 * FALL_SPEED
     bodies.v_free[0, :2] = [0.6 * push_speed, 0.8 * push_speed]
     contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
-    problem = contact_problem(bodies, contacts, "coulomb", 0.5)
+    problem = build_contact_problem(bodies, contacts, "coulomb", 0.5)
 
     def closed_form() -> Reference:
         b = problem.b
@@ -96,7 +105,7 @@ def threshold(above: float = 0.0) -> Draft:
     )
 
 
-@family()
+@register_family()
 def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
     """One contact with A = diag(1, 1, ratio), mu = 0.5, pushed along (1, 1) with `speed`: sticks at 0.1, slides at 3.
 
@@ -129,7 +138,7 @@ def _solve_secular_equation(b: FloatArray, ratio: float) -> FloatArray:
     return np.append(b[0], b[1:] / (mass + s))
 
 
-@family()
+@register_family()
 def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
     """A rod sliding on its tip, mu = 2: A_nn - mu A_nt < 0, so that sliding presses the rod into the ground.
 
@@ -148,10 +157,10 @@ def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
     )
 
 
-@family()
+@register_family()
 def arch(n: int = 9, mu: float = 0.6) -> Draft:
     """n voussoirs of a half circle (radius 5 m, 1 m thick), four points between neighbours."""
-    check_minimum(3, n=n)
+    check_min_sizes(3, n=n)
     angle = np.pi * np.arange(n + 1) / n
     middle = 0.5 * (angle[1:] + angle[:-1])
     position = np.stack(
@@ -167,22 +176,24 @@ def arch(n: int = 9, mu: float = 0.6) -> Draft:
         (-along[:, None] * radius).ravel(), np.tile(side, n + 1), (up[:, None] * radius).ravel()
     ], 1)  # fmt: skip
     normal = np.repeat(np.stack([up, 0.0 * angle, along], 1), 4, axis=0)
-    problem = contact_problem(bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu)
+    problem = build_contact_problem(
+        bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu
+    )
     return Draft(
         problem,
         "held by friction and thrust alone: errors appear as a sag",
-        rest_reference(problem),
+        make_rest_reference(problem),
         EXPECT_EXACT,
     )
 
 
-@family()
+@register_family()
 def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     """A house of cards: leaning pairs, cards across their tops, the next level on those; two points per edge."""
-    check_minimum(1, levels=levels)
+    check_min_sizes(1, levels=levels)
     lean = np.deg2rad(20.0)
     d, h = math.sin(lean), math.cos(lean)
-    half = 0.02  # m, half the distance between the edges at a top
+    half = 0.02  # [m] Half the distance between the edges at a top.
     position: list[list[float]] = []
     contacts: list[tuple[int, int, list[float], list[float]]] = []
 
@@ -217,5 +228,7 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
             cards_below[j] = across
     bodies = Bodies(position, 1.0, 0.1)
     a, b, point, normal = zip(*contacts, strict=True)
-    problem = contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
-    return Draft(problem, "held by friction only, over several levels", rest_reference(problem), EXPECT_EXACT)
+    problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
+    return Draft(
+        problem, "held by friction only, over several levels", make_rest_reference(problem), EXPECT_EXACT
+    )

@@ -17,23 +17,23 @@ from lavender.lab.suite.build import (
     Bodies,
     Contacts,
     add_horizontal_velocity,
-    contact_problem,
-    joint_problem,
-    manifold,
+    build_contact_problem,
+    build_joint_problem,
     map_scalar,
-    tower,
+    place_four_corners,
+    place_tower,
 )
-from lavender.lab.suite.case import Draft, Reference, family
+from lavender.lab.suite.case import Draft, Reference, register_family
 from lavender.lab.suite.exact import solve_linear
 from lavender.lab.suite.families import (
     BOX,
     FRICTION_COEFFICIENT,
     SPHERE,
-    ball_joints,
-    check_minimum,
+    check_min_sizes,
     check_positive,
-    ordered_matmul,
-    rest_reference,
+    compute_ball_joint_jacobian,
+    make_rest_reference,
+    multiply_in_index_order,
 )
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
@@ -82,7 +82,7 @@ SET = (
 # -- mass ratios and redundancy -------------------------------------------------------------------
 
 
-@family(big_boxF={"friction": "coulomb"})
+@register_family(big_boxF={"friction": "coulomb"})
 def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 0.0) -> Draft:
     """A 20 m box on two 1 m boxes, four points each: heavy on light with long levers.
 
@@ -94,21 +94,23 @@ def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 
     add_horizontal_velocity(bodies, sliding)
     pairs = [[-1, 0], [-1, 1], [0, 2], [1, 2]]
     centre = [[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-5.0, 0.0, 1.0], [5.0, 0.0, 1.0]]
-    problem = contact_problem(bodies, manifold(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT)
-    rest = rest_reference(problem) if friction == "none" or sliding == 0.0 else None
+    problem = build_contact_problem(
+        bodies, place_four_corners(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT
+    )
+    rest = make_rest_reference(problem) if friction == "none" or sliding == 0.0 else None
     return Draft(problem, "heavy on light with levers of ten metres", rest, EXPECT_SWEEPS_STALL)
 
 
-@family()
+@register_family()
 def duplicated(k: int = 8) -> Draft:
     """One sphere on the ground with its contact repeated k times: rank 1.
 
     Undamped Jacobi has the factor k - 1: it cycles for k = 2 and diverges for k of 3 and more.
     """
-    check_minimum(1, k=k)
+    check_min_sizes(1, k=k)
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, SPHERE)
     contacts = Contacts(np.tile([-1, 0], (k, 1)), np.zeros((k, 3)), [0.0, 0.0, 1.0])
-    problem = contact_problem(bodies, contacts)
+    problem = build_contact_problem(bodies, contacts)
 
     def closed_form() -> Reference:
         return Reference(np.full(k, FALL_SPEED / k), "closed form: the weight, shared", "slack")
@@ -116,22 +118,22 @@ def duplicated(k: int = 8) -> Draft:
     return Draft(problem, "the same row many times: Jacobi diverges unless damped, A has rank 1", closed_form)
 
 
-@family(slabF={"friction": "coulomb"})
+@register_family(slabF={"friction": "coulomb"})
 def slab(n: int = 5, friction: str = "none", sliding: float = 0.0) -> Draft:
     """A slab of 10 kg on n x n points: rank 3 (6 with friction), however many points."""
-    check_minimum(2, n=n)
+    check_min_sizes(2, n=n)
     x = np.linspace(-1.0, 1.0, n)
     point = np.stack([*(g.ravel() for g in np.meshgrid(x, x)), np.zeros(n * n)], 1)
     bodies = Bodies([[0.1, 0.05, 0.2]], 10.0, 0.35)
     add_horizontal_velocity(bodies, sliding)
-    problem = contact_problem(
+    problem = build_contact_problem(
         bodies, Contacts(np.tile([-1, 0], (n * n, 1)), point, [0.0, 0.0, 1.0]), friction, FRICTION_COEFFICIENT
     )
-    rest = rest_reference(problem) if friction == "none" or sliding == 0.0 else None
+    rest = make_rest_reference(problem) if friction == "none" or sliding == 0.0 else None
     return Draft(problem, "a body on many points: only three of them are needed", rest)
 
 
-@family()
+@register_family()
 def four_bar(tilt: float = 0.3) -> Draft:
     """A closed loop: three bars and the ground, four parallel hinges of five rows, in a tilted plane.
 
@@ -140,10 +142,10 @@ def four_bar(tilt: float = 0.3) -> Draft:
     anchor = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 1.0], [1.4, 0.0, 1.3], [1.5, 0.0, 0.0]])
     c, s = math.cos(tilt), math.sin(tilt)
     rotation = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])  # about z, then about x
-    anchor = ordered_matmul(anchor, rotation.T)
+    anchor = multiply_in_index_order(anchor, rotation.T)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), [1.0, 2.0, 1.0], 0.1)
     body = np.array([[-1, 0], [0, 1], [1, 2], [2, -1]])
-    ball = ball_joints(bodies.position, body, anchor).reshape(4, 3, 12)
+    ball = compute_ball_joint_jacobian(bodies.position, body, anchor).reshape(4, 3, 12)
     # Perpendicular to the hinge axis y: omega_b - omega_a is zero along these.
     hinge_normals = rotation.T[[0, 2]]
     hinge_rows = np.zeros((4, 2, 12))
@@ -154,7 +156,7 @@ def four_bar(tilt: float = 0.3) -> Draft:
             if b >= 0:
                 hinge_rows[joint, row, 9:12] = hinge_normals[row]
     jac = np.concatenate([ball, hinge_rows], axis=1).reshape(-1, 12)
-    problem = joint_problem(bodies, body, jac, 5, names=[f"hinge {i}" for i in range(4)])
+    problem = build_joint_problem(bodies, body, jac, 5, names=[f"hinge {i}" for i in range(4)])
     return Draft(
         problem,
         "a closed loop off the axes: consistent but singular, so a plain factorisation meets a zero pivot",
@@ -163,10 +165,10 @@ def four_bar(tilt: float = 0.3) -> Draft:
     )
 
 
-@family()
+@register_family()
 def ring(n: int = 8) -> Draft:
     """A closed ring of n rods in a tilted circle, ball joints, hung at one point: a cycle of 3 n + 3 rows."""
-    check_minimum(3, n=n)
+    check_min_sizes(3, n=n)
     angle = 2.0 * np.pi * np.arange(n + 1) / n
     along = map_scalar(math.cos, angle)
     anchor = np.stack([map_scalar(math.sin, angle), 0.2 * along, -1.0 + along], 1)
@@ -175,7 +177,7 @@ def ring(n: int = 8) -> Draft:
     body[0, 0] = n - 1
     body = np.concatenate([body, [[-1, 0]]])
     at = np.concatenate([anchor[:-1], [anchor[0]]])
-    problem = joint_problem(bodies, body, ball_joints(bodies.position, body, at), 3)
+    problem = build_joint_problem(bodies, body, compute_ball_joint_jacobian(bodies.position, body, at), 3)
     return Draft(
         problem,
         "a loop of joints: the band of the chain closes on itself",
@@ -186,11 +188,11 @@ def ring(n: int = 8) -> Draft:
 # -- geometry -------------------------------------------------------------------------------------
 
 
-@family()
+@register_family()
 def near_parallel(angle: float = 1e-4) -> Draft:
     """A point mass on two planes, normals 2 x `angle` [rad] apart: A = [[1, c], [c, 1]], c = cos 2 angle."""
     check_positive(angle=angle)
-    problem = _on_two_planes(math.sin(angle), math.cos(angle))
+    problem = _build_mass_on_two_planes(math.sin(angle), math.cos(angle))
     # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals.
     unique = "impulse" if angle > 1e-3 else "slack"
 
@@ -202,11 +204,11 @@ def near_parallel(angle: float = 1e-4) -> Draft:
     )
 
 
-@family()
+@register_family()
 def wedge(angle: float = 1e-4) -> Draft:
     """A point mass falls into a slot with two walls at `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
     check_positive(angle=angle)
-    problem = _on_two_planes(math.cos(angle), math.sin(angle))
+    problem = _build_mass_on_two_planes(math.cos(angle), math.sin(angle))
 
     def closed_form() -> Reference:
         impulse = 0.5 * FALL_SPEED / problem.rows.normal[:, 2]  # type: ignore[union-attr]
@@ -217,23 +219,23 @@ def wedge(angle: float = 1e-4) -> Draft:
     )
 
 
-def _on_two_planes(x: float, z: float) -> Problem:
+def _build_mass_on_two_planes(x: float, z: float) -> Problem:
     """Build a point mass on two planes with normals (x, 0, z) and (-x, 0, z)."""
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     contacts = Contacts([[-1, 0], [-1, 0]], np.zeros((2, 3)), [[x, 0.0, z], [-x, 0.0, z]])
-    return contact_problem(bodies, contacts)
+    return build_contact_problem(bodies, contacts)
 
 
 # -- numbers --------------------------------------------------------------------------------------
 
 
-@family()
+@register_family()
 def diagonal(kind: str = "zero", n: int = 12) -> Draft:
     """An LCP with zero, negative or negligible diagonal entries, built from its solution in small integers.
 
     Sweeps divide by the largest entry of the row instead and need not converge; pivoting is not affected.
     """
-    check_minimum(2, n=n)
+    check_min_sizes(2, n=n)
     value = {"zero": 0.0, "negative": -1.0, "negligible": 2.0**-60}.get(kind)
     if value is None:
         raise InputError(f"kind is {kind!r}; zero, negative, negligible are known")
@@ -257,21 +259,21 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
     )
 
 
-@family()
+@register_family()
 def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft:
     """The box stack in other units, masses times kg, lengths times m, times times s: relative errors stay."""
     check_positive(kg=kg, m=m, s=s)
-    check_minimum(1, n=n)
-    position, pairs, contact_point = tower(n)
-    bodies, contacts = Bodies(position, 1.0, BOX), manifold(pairs, contact_point, 0.5)
-    arm_a, arm_b = contacts.arms(bodies.position)
+    check_min_sizes(1, n=n)
+    position, pairs, contact_point = place_tower(n)
+    bodies, contacts = Bodies(position, 1.0, BOX), place_four_corners(pairs, contact_point, 0.5)
+    arm_a, arm_b = contacts.compute_arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(
         1.0 / (bodies.mass * kg),
         np.eye(3) / (BOX * kg * m * m) * np.ones((n, 1, 1)),
         bodies.v_free * speed,
         normal=contacts.normal,
-        tangent=contacts.tangent(),
+        tangent=contacts.compute_tangents(),
         arm_a=arm_a * m,
         arm_b=arm_b * m,
         contact_body=contacts.body,
@@ -285,10 +287,10 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     return Draft(problem, "reveals tolerances with a hidden unit", closed_form)
 
 
-@family()
+@register_family()
 def least_speeds(n: int = 8) -> Draft:
     """A stack with the smallest speeds that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     a[0, 0] = 1.0
     b = np.zeros(n)
@@ -301,10 +303,10 @@ def least_speeds(n: int = 8) -> Draft:
     )
 
 
-@family()
+@register_family()
 def degenerate_lcp(n: int = 40, seed: int = 0, asymmetric: int = 0) -> Draft:
     """A random P-matrix LCP in small integers, hence exact; a third of its rows have lambda = w = 0."""
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     rng = np.random.default_rng(seed)
     g = rng.integers(-2, 3, (n, n + 2)).astype(float)
     a = g @ g.T + np.eye(n)
@@ -322,7 +324,7 @@ def degenerate_lcp(n: int = 40, seed: int = 0, asymmetric: int = 0) -> Draft:
     )
 
 
-@family()
+@register_family()
 def infeasible(kind: str = "squeeze") -> Draft:
     """No solution: "squeeze" moves floor and ceiling through a body; "joints" prescribes two speeds for one row.
 
@@ -331,12 +333,12 @@ def infeasible(kind: str = "squeeze") -> Draft:
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     if kind == "squeeze":
         contacts = Contacts([[-1, 0], [-1, 0]], np.zeros((2, 3)), [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-        problem = contact_problem(bodies, contacts, target=0.1)
+        problem = build_contact_problem(bodies, contacts, target=0.1)
         proof = np.array([1.0, 1.0])
     elif kind == "joints":
         jac = np.zeros((2, 12))
         jac[:, 8] = 1.0
-        problem = joint_problem(
+        problem = build_joint_problem(
             bodies, [[-1, 0], [-1, 0]], jac, 1, target=[0.2, -0.2], names=["lift", "lower"]
         )
         proof = np.array([1.0, -1.0])

@@ -13,8 +13,8 @@ import numpy as np
 
 from lavender.base.errors import SolverUnavailable, UnknownName, check_name
 from lavender.lab.suite.build import GRAVITY
-from lavender.lab.suite.case import Draft, family, parse
-from lavender.lab.suite.families import check_minimum, check_positive, ordered_matmul
+from lavender.lab.suite.case import Draft, parse_case_name, register_family
+from lavender.lab.suite.families import check_min_sizes, check_positive, multiply_in_index_order
 from lavender.problem import Problem
 
 #: Licence of each package's models.
@@ -23,7 +23,7 @@ MODEL_FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}
 MUJOCO_CONES = {"pyramidal": 0, "elliptic": 1}
 
 
-@family()
+@register_family()
 def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
     """The problem of a scene's substep after `at` steps of LavenderSim with default options, without its warm start."""
     from lavender.sim.engine import Simulation
@@ -40,14 +40,14 @@ def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
     )
 
 
-@family()
+@register_family()
 def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1, seed: int = 0) -> Draft:
     """Predictive control of a walk: n jerks of the centre of mass that keep the centre of pressure inside the feet.
 
     min 1/2 |z - z_ref|^2 + 1/2 1e-4 |u|^2 over jerks u [m/s^3], z = c - (height/g) c'' the centre of pressure [m], in
     the foot of each instant: 2 n bounded rows over n variables (P.-B. Wieber 2006, Humanoids, 137-142, eqs. 7-10).
     """
-    check_minimum(1, n=n)
+    check_min_sizes(1, n=n)
     check_positive(dt=dt, height=height, foot=foot)
     rng = np.random.default_rng([seed, 0x77616C6B])
     transition = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
@@ -56,13 +56,19 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
     free, by_jerk = np.empty(n), np.zeros((n, n))
     by_each_jerk = np.zeros((3, n))  # effect of each jerk on the state
     for k in range(n):
-        state, by_each_jerk = ordered_matmul(transition, state), ordered_matmul(transition, by_each_jerk)
+        state, by_each_jerk = (
+            multiply_in_index_order(transition, state),
+            multiply_in_index_order(transition, by_each_jerk),
+        )
         by_each_jerk[:, k] = jerk_effect
-        free[k], by_jerk[k] = ordered_matmul(pressure, state), ordered_matmul(pressure, by_each_jerk)
+        free[k], by_jerk[k] = (
+            multiply_in_index_order(pressure, state),
+            multiply_in_index_order(pressure, by_each_jerk),
+        )
     foot_centre = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
     problem = Problem.from_qp(
-        ordered_matmul(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),
-        ordered_matmul(by_jerk.T, free - foot_centre),
+        multiply_in_index_order(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),
+        multiply_in_index_order(by_jerk.T, free - foot_centre),
         G=np.vstack([by_jerk, -by_jerk]),
         h=np.concatenate([foot_centre + 0.5 * foot - free, free - foot_centre + 0.5 * foot]),
     )
@@ -72,11 +78,11 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
 # -- robots -----------------------------------------------------------------------------------------------
 
 
-@family()
+@register_family()
 def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal", at: int = 200) -> Draft:
     """A MuJoCo model of gymnasium or dm_control after `at` steps under controls drawn by seed 0.
 
-    The numbers depend on the versions of MuJoCo and of the package (`versions`).
+    The numbers depend on the versions of MuJoCo and of the package (`get_package_versions`).
     """
     path, known = _find_model_file(package, model), tuple(MUJOCO_CONES)
     check_name("cone", cone, known)
@@ -95,14 +101,14 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
     return Draft(problem, f"{model} of {package} under random controls: few rows that share many velocities")
 
 
-def package_of(name: str) -> str:
+def get_model_package(name: str) -> str:
     """Return the package of models that a case's name needs; empty if it needs none."""
     if name.partition("(")[0] != "robot":
         return ""
-    return str(parse(name)[1].get("package", "gymnasium"))
+    return str(parse_case_name(name)[1].get("package", "gymnasium"))
 
 
-def missing(package: str) -> str:
+def explain_missing_packages(package: str) -> str:
     """Return a message about packages that must be installed for the models of `package`; empty if none is missing."""
     absent = [name for name in ("mujoco", package) if package and find_spec(name) is None]
     return (
@@ -112,7 +118,7 @@ def missing(package: str) -> str:
     )
 
 
-def versions(package: str) -> str:
+def get_package_versions(package: str) -> str:
     """Return the versions of MuJoCo and of a package of models; empty for no package."""
     from importlib.metadata import version
 
@@ -122,7 +128,7 @@ def versions(package: str) -> str:
 def _find_model_file(package: str, model: str) -> Path:
     """Return the path of a model file, or raise SolverUnavailable or UnknownName."""
     check_name("package of models", package, MODEL_FOLDERS)
-    spec, message = find_spec(package), missing(package)
+    spec, message = find_spec(package), explain_missing_packages(package)
     if message or spec is None or not spec.submodule_search_locations:
         raise SolverUnavailable(message)
     folder = Path(spec.submodule_search_locations[0]) / MODEL_FOLDERS[package]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.problem.cones import kinds_of
+from lavender.problem.cones import get_kinds
 from lavender.sim.engine.layout import HEAD, SETTING, SIZE
 from lavender.sim.engine.state import KEPT, State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
@@ -33,7 +33,7 @@ QUATERNION_TOLERANCE = 1e-9
 
 
 def check_sizes(own: State, size: np.ndarray) -> None:
-    """Raise InputError if sizes other than the capacities differ from those of the simulation."""
+    """Raise InputError if sizes other than the capacities differ from the simulation's."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
@@ -41,7 +41,7 @@ def check_sizes(own: State, size: np.ndarray) -> None:
 
 
 def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
-    """Raise InputError if `new`, whose sizes passed `check_sizes`, is not a state of the scene of `own`.
+    """Raise InputError if `new` is not a state of the scene of `own`; call `check_sizes` first.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _check_contacts(new: State) -> None:
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])
-    if c and (b["kind"][: kj + c] != kinds_of(contact, box=is_box, spin=size == 4, rolling=size > 4)).any():
+    if c and (b["kind"][: kj + c] != get_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)).any():
         raise _damaged("kind does not match the rows of a block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):

@@ -19,7 +19,7 @@ from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.errors import InputError
 from lavender.io.stored import as_path, write_atomically, write_figure
 from lavender.sim.engine.film import Film
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
 PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
@@ -38,7 +38,7 @@ LIGHT = np.array([-0.45, -0.62, 0.64])
 COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a7fb0")
 
 
-def picture_suffix(path: str | PathLike[str]) -> str:
+def get_picture_suffix(path: str | PathLike[str]) -> str:
     """Return the suffix of a picture file in lower case; raise InputError if the format cannot be written."""
     suffix = as_path(path).suffix
     if suffix.lower() not in PICTURES:
@@ -84,7 +84,7 @@ def save_picture(
     InputError
         The film has no frames, a value is out of range, or the file cannot be written.
     """
-    path, suffix = as_path(path), picture_suffix(path)
+    path, suffix = as_path(path), get_picture_suffix(path)
     films = film if isinstance(film, Mapping) else {"": film}
     if not films or not all(len(one) for one in films.values()):
         raise InputError("the film has no frames; step first")
@@ -96,9 +96,9 @@ def save_picture(
     for view in views:  # All films have the same scale.
         view.bounds = tuple(np.where([1, 0, 1, 0], bounds.min(axis=0), bounds.max(axis=0)))
     if suffix in (".gif", ".mp4"):
-        _animate(views, path, size, rate)
+        _write_animation(views, path, size, rate)
     else:
-        _strip(views, path, frames, size)
+        _write_strip(views, path, frames, size)
     return path
 
 
@@ -149,7 +149,7 @@ class FilmView:
             x, q, size = self.x[frame, i], self.q[frame, i], np.array(body["shape"][:3])
             color = np.array(to_rgb(COLORS[i % len(COLORS)]))
             if body["kind"] == BOX:
-                r = rotation(q)
+                r = convert_to_rotation_matrix(q)
                 corners = x + (CORNERS * size) @ r.T
                 for f, face in enumerate(FACES):
                     normal = (1.0 if f & 1 else -1.0) * r[:, f >> 1]
@@ -167,11 +167,11 @@ class FilmView:
         for depth, (_, shape) in enumerate(sorted(items, key=lambda item: -item[0])):
             shape.set_zorder(2 + depth / (len(items) + 1))
             axes.add_patch(shape)
-        self._ground(axes)
-        self._joints(axes, frame)
+        self._draw_ground(axes)
+        self._draw_joints(axes, frame)
         axes.set_title(f"{self.name}  {self.time[frame]:.2f} s".strip(), fontsize=8)
 
-    def _ground(self, axes: Any) -> None:
+    def _draw_ground(self, axes: Any) -> None:
         """Draw the ground as a line if the scene has a horizontal plane."""
         if any(body["kind"] == PLANE and body["shape"][2] > 0.99 for body in self.bodies):
             left, right, *_ = self.bounds
@@ -179,16 +179,18 @@ class FilmView:
             level = float(np.array([0.0, 0.0, offset]) @ self.top)
             axes.plot([left, right], [level, level], color="0.6", lw=0.8, zorder=1)
 
-    def _joints(self, axes: Any, frame: int) -> None:
+    def _draw_joints(self, axes: Any, frame: int) -> None:
         """Draw a line from the body to the anchor of each joint."""
         for joint in self.film.header["joints"]:
             i = joint["body"]
-            anchor = self.x[frame, i] + rotation(self.q[frame, i]) @ np.array(joint["anchor"])
+            anchor = self.x[frame, i] + convert_to_rotation_matrix(self.q[frame, i]) @ np.array(
+                joint["anchor"]
+            )
             axes.plot(*self.project(np.stack([self.x[frame, i], anchor])).T, color="k", lw=0.6, zorder=4)
             axes.plot(*self.project(anchor), "k.", markersize=3, zorder=4)
 
 
-def _strip(views: list[FilmView], path: Path, count: int, size: float) -> None:
+def _write_strip(views: list[FilmView], path: Path, count: int, size: float) -> None:
     """Write a strip of `count` frames per film."""
     from matplotlib.figure import Figure
 
@@ -203,7 +205,7 @@ def _strip(views: list[FilmView], path: Path, count: int, size: float) -> None:
     write_figure(canvas, path, dpi=150)
 
 
-def _animate(views: list[FilmView], path: Path, size: float, rate: float) -> None:
+def _write_animation(views: list[FilmView], path: Path, size: float, rate: float) -> None:
     """Write an animation with `rate` [1/s] frames per second of simulated time."""
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure

@@ -15,7 +15,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.rows import Rows
 from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.state import State
-from lavender.sim.scene.arithmetic import norm
+from lavender.sim.scene.arithmetic import compute_norm
 
 motion = lazy_module("lavender.lab.motion")
 
@@ -41,7 +41,7 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
     tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
     # Contacts without friction have no tangent; `Rows` needs a unit vector orthogonal to the normal.
     frictionless = np.flatnonzero(a["mu"][kj:k] == 0.0)
-    tangent[frictionless] = _any_tangent(normal[frictionless])
+    tangent[frictionless] = _choose_tangents(normal[frictionless])
     rows = Rows(
         inv_mass=a["inv_mass"].copy(),
         inv_inertia=a["inv_inertia"].copy(),
@@ -67,9 +67,10 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
         patch_radius=a["patch_radius"][:k].copy(),
         rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
     )
-    # Keys of joints are above those of contacts: body numbers have 24 bits, and the pair (2^24 - 1, ...) is unused.
+    # Keys of joints are larger than keys of contacts: body numbers have 24 bits, and the pair (2^24 - 1, ...) is
+    # unused.
     joint_keys = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
-    pairs = zip(a["contact_pair"][:c].tolist(), _point_numbers(a["key"][:c]), strict=True)
+    pairs = zip(a["contact_pair"][:c].tolist(), _number_contact_points(a["key"][:c]), strict=True)
     guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
     return Problem(
         a["b"][:m].copy(),
@@ -84,7 +85,7 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
     )
 
 
-def _point_numbers(key: np.ndarray) -> list[int]:
+def _number_contact_points(key: np.ndarray) -> list[int]:
     """Return the numbers of the contacts of each pair of bodies, from 1 on, in the order of their keys."""
     order = np.argsort(key)
     pair = key[order] >> np.uint64(16)
@@ -95,18 +96,18 @@ def _point_numbers(key: np.ndarray) -> list[int]:
     return list(number.tolist())
 
 
-def _any_tangent(normal: FloatArray) -> FloatArray:
+def _choose_tangents(normal: FloatArray) -> FloatArray:
     """Return a unit vector orthogonal to each normal (c, 3)."""
     out = np.zeros_like(normal)
     for i, n in enumerate(normal):
         t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-        size = norm(t)
+        size = compute_norm(t)
         if size > 0.0:  # A zero normal (a body is too far away for a direction) is an error of Rows.
             out[i] = t / size
     return out
 
 
-def residual_summary(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
+def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
     """Return the values of `Simulation.residual` for impulses (m,) [N s]."""
     result = residual(problem, impulse)
     return {
@@ -115,22 +116,22 @@ def residual_summary(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
         "velocity": result.velocity,
         "floor": result.roundoff_floor,
         "worst": result.worst_name,
-        "share": _energy_fractions(problem, result),
+        "share": _compute_energy_fractions(problem, result),
     }
 
 
-def motion_summary(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
+def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
     """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies.
 
     With Coulomb friction, the smaller of two distances is returned: to the solution of `auto`, and to the solution that
     continues from the impulses.
     """
-    error, distance = motion.measure(problem, impulse, motion.reference(problem)), 0.0
+    error, distance = motion.measure_distance(problem, impulse, motion.get_reference(problem)), 0.0
     if problem.law == "coulomb":
-        branch_solution = motion.branch(problem, impulse)
-        branch_error = motion.measure(problem, impulse, branch_solution)
-        if branch_solution.accepted and error.reference.accepted:
-            distance = motion.measure(problem, branch_solution.impulse, error.reference).speed or 0.0
+        branch_solution = motion.follow_to_solution(problem, impulse)
+        branch_error = motion.measure_distance(problem, impulse, branch_solution)
+        if branch_solution.is_accepted and error.reference.is_accepted:
+            distance = motion.measure_distance(problem, branch_solution.impulse, error.reference).speed or 0.0
         if branch_error.kinetic is not None and (
             error.kinetic is None or branch_error.kinetic < error.kinetic
         ):
@@ -140,7 +141,7 @@ def motion_summary(problem: Problem, impulse: FloatArray, moving_bodies: Sequenc
     return {**{name: getattr(error, name) for name in names}, "body": body, "open": distance}
 
 
-def _energy_fractions(problem: Problem, result: Residual) -> dict[str, float]:
+def _compute_energy_fractions(problem: Problem, result: Residual) -> dict[str, float]:
     """Return the fraction of the squared energy error [-] on joints, normals, friction, torsion and rolling."""
     c = problem.cones
     part = np.zeros(problem.m, np.int32)

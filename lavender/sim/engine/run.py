@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
-from lavender.io.stored import folder_for_steps, write_figure, write_text
+from lavender.io.stored import open_step_folder, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
-from lavender.sim.engine.stepping import sweep_order
+from lavender.sim.engine.stepping import get_sweep_order
 from lavender.sim.engine.values import SOLVER_FIELDS
 from lavender.solvers.registry import get
 
@@ -35,7 +35,7 @@ class Trace:
     cost : (steps,) s
         Wall time of the step.
     lost_body : str
-        Name of the body whose state is not finite, which ended the run, or empty.
+        Name of the body with the non-finite state that ended the run, or empty.
     recorded : int
         Number of problems written.
     title : str
@@ -128,7 +128,7 @@ def run(
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done, stopped = "", 0, False
-    with nullcontext() if record is None else folder_for_steps(record, replace) as folder:
+    with nullcontext() if record is None else open_step_folder(record, replace) as folder:
         try:
             while done < steps and not lost:
                 if folder is not None:
@@ -149,7 +149,7 @@ def run(
             stopped = True
     scene = simulation.scene
     spec = get(scene.parameters.solver)
-    order = sweep_order(scene.parameters) or scene.parameters.order
+    order = get_sweep_order(scene.parameters) or scene.parameters.order
     method_parts = [] if spec.name == "sequential_impulses" else [spec.name]
     method = ", ".join([*method_parts, f"order {order}"] if spec.order else method_parts)
     return Trace(

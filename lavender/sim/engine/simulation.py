@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from lavender import io
-from lavender.base.arrays import check_int, read_only
+from lavender.base.arrays import check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.base.lazy_import import lazy_module
-from lavender.io.stored import folder_for_steps
+from lavender.io.stored import open_step_folder
 from lavender.problem import Problem
 from lavender.sim.engine.check import check_fields, check_sizes, check_state
-from lavender.sim.engine.film import Film, header_of
+from lavender.sim.engine.film import Film, make_header
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
@@ -83,7 +83,7 @@ class Simulation(Stepping):
             invalidate_pairs(state)
         while state.kernel.prepare() == NEED_CAPACITY:
             state = state.with_larger_buffers()
-        return self._problem(state)
+        return self._build_problem(state)
 
     def sweep_seed(self) -> int:
         """Return the `seed` with which `lavender.solve(..., order="random")` uses the order of the next substep."""
@@ -156,7 +156,7 @@ class Simulation(Stepping):
         steps = check_int("steps", steps, 1)
         folder = Path(folder)
         digits, written = len(str(self._steps + steps)), []
-        with folder_for_steps(folder, continued=folder.resolve() == self._recorded):
+        with open_step_folder(folder, continued=folder.resolve() == self._recorded):
             self._recorded = folder.resolve()
             for _ in range(steps):
                 written.append(self.write_problem(folder, digits, form))
@@ -206,8 +206,8 @@ class Simulation(Stepping):
     @exclusive
     def start_film(self) -> Film:
         """Return a new film with the present poses; every step adds a frame until `end_film`."""
-        film = Film(header_of(self.scene, self.state))
-        film.add(self.time, self._observe())
+        film = Film(make_header(self.scene, self.state))
+        film.add(self.time, self._make_observation())
         self.films.append(film)
         return film
 
@@ -333,11 +333,11 @@ class Simulation(Stepping):
             fingerprint=self._fingerprint,
             steps=self._steps,
             failed=self._failed,
-            lost=self._lost_body(),
-            size=read_only(s.size.copy()),
-            real=read_only(s.real.copy()),
-            index=read_only(s.index.copy()),
-            keys=read_only(s.keys.copy()),
+            lost=self._find_lost_body(),
+            size=mark_read_only(s.size.copy()),
+            real=mark_read_only(s.real.copy()),
+            index=mark_read_only(s.index.copy()),
+            keys=mark_read_only(s.keys.copy()),
         )
 
     @exclusive
@@ -374,7 +374,7 @@ class Simulation(Stepping):
         self.state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
         self._last, self._end_reason = None, ""
-        self._lost_body()
+        self._find_lost_body()
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a snapshot to a file; see `Snapshot.save`."""

@@ -40,7 +40,7 @@ class Snapshot:
     failed : int
         Number of failed solves.
     lost : str
-        Name of the body whose state is not finite, or empty.
+        Name of the body with a non-finite state, or empty.
     size : int32 array
     real : float64 array
     index : int32 array

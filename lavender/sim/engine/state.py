@@ -93,11 +93,11 @@ class State:
         self._views: tuple[int, int, ObservationViews] | None = None
 
     @cached_property
-    def warm(self) -> Substep:
+    def warm_start_phase(self) -> Substep:
         """The first phase of `newton` on these buffers."""
         return Substep(self.size, self.real, self.index, self.keys, False)
 
-    def observation_views(self, contacts: int, rows: int) -> ObservationViews:
+    def get_observation_views(self, contacts: int, rows: int) -> ObservationViews:
         """Return the copy functions of an observation; they are cached while the numbers do not change."""
         if self._views is None or self._views[:2] != (contacts, rows):
             a, first = self.a, int(self.size[SIZE["joint_rows"]])
@@ -158,7 +158,7 @@ class State:
         return other
 
     @classmethod
-    def of_scene(cls, scene: Scene) -> State:
+    def from_scene(cls, scene: Scene) -> State:
         """Build the initial state of a scene.
 
         Raises
@@ -200,7 +200,7 @@ class State:
         size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
         size[CAP_CONTACT] = 4 * n_shapes if n_shapes > 1 else 0
         state = cls(size)
-        get_stepper(p.stepper).check(spin, bool((restitution > 0.0).any()), rolling)
+        get_stepper(p.stepper).check_scene_properties(spin, bool((restitution > 0.0).any()), rolling)
         _put_parameters(state, p)
         a: dict[str, Any] = state.a
         _put_bodies(a, bodies, uneven)
@@ -243,14 +243,14 @@ def _put_parameters(state: State, p: Parameters) -> None:
 
 
 def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool]) -> None:
-    """Write poses, velocities, masses and shapes; `uneven` marks bodies whose inertia changes under rotation."""
+    """Write poses, velocities, masses and shapes; `uneven` marks bodies with an inertia that changes under rotation."""
     dynamic = 0
     for i, b in enumerate(bodies):
         a["x"][i], a["q"][i] = b.position, b.quaternion
         a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
         a["dyn"][i] = -1
         if not b.is_static:
-            inverse = arithmetic.inverse(b.inertia)
+            inverse = arithmetic.invert_definite_matrix(b.inertia)
             a["dyn"][i] = dynamic
             a["body_of"][dynamic] = i
             a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
@@ -258,7 +258,7 @@ def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool
             a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
             a["uneven"][i] = uneven[i]
             dynamic += 1
-        a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
+        a["kind_of_shape"][i], a["shape"][i] = _encode_shape(b.shape)
 
 
 def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
@@ -274,7 +274,7 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         ):
             values[JOINT[name] : JOINT[name] + 3] = x
         side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
-        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.norm(side)
+        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.compute_norm(side)
         values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
             j.length,
             j.hertz,
@@ -288,7 +288,7 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         a["ptr"][i + 1] = row
 
 
-def _shape(shape: Any) -> tuple[int, list[float]]:
+def _encode_shape(shape: Any) -> tuple[int, list[float]]:
     """Return the kind of a shape and its four numbers in the engine's arrays."""
     if isinstance(shape, Plane):
         return PLANE, [*shape.normal, shape.offset]

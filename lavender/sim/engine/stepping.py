@@ -16,11 +16,11 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.arrays import check_bool as check_flag
 from lavender.base.errors import InputError, LavenderError, SolveFailed, UnknownName
-from lavender.judge.solution import Solution, order_name, uninterrupted
+from lavender.judge.solution import Solution, get_order_name, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.sim.engine.film import Film
 from lavender.sim.engine.layout import HEAD, SIZE
-from lavender.sim.engine.problem import build_problem, motion_summary, residual_summary
+from lavender.sim.engine.problem import build_problem, summarise_motion, summarise_residual
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import Parameters
@@ -109,7 +109,7 @@ class Stepping:
         p = self._parameters = scene.parameters
         self._names = tuple(b.name for b in scene.bodies)
         self._joint_names = tuple(j.name for j in scene.joints)
-        self.state = State.of_scene(scene)
+        self.state = State.from_scene(scene)
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
         self._sweeps = get_stepper(p.stepper).sweeps if self._own_sweeps else (1, 2**31 - 1)
@@ -118,7 +118,7 @@ class Stepping:
         self._warm_tol = 0.0
         if p.solver == "newton" and set(p.solver_options) <= {"tol"} and isinstance(tol, (int, float)):
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
-        self._order = sweep_order(p)
+        self._order = get_sweep_order(p)
         self._steps = 0
         self._failed = 0
         self._end_reason = ""  # Reason why no step can follow, or empty.
@@ -204,7 +204,7 @@ class Stepping:
             The simulation has terminated: reset it or restore a snapshot.
         """
         self._check_can_step()
-        i = self._body_number(body)
+        i = self._find_body_number(body)
         name = self._names[i]
         if self.state.a["dyn"][i] < 0:
             raise InputError(f"{name} is static; it has no velocity")
@@ -217,7 +217,7 @@ class Stepping:
         for first, x in values:
             self.state.a["v"][i, first : first + 3] = x
 
-    def _body_number(self, body: int | str) -> int:
+    def _find_body_number(self, body: int | str) -> int:
         """Return the number of a body given by number or unique name."""
         if not isinstance(body, str):
             return check_int("body", body, 0, len(self._names) - 1)
@@ -244,7 +244,7 @@ class Stepping:
         self._load(self.scene)
         self.state.head[HEAD["iterations"]] = sweeps
         self.state.head[HEAD["warm_start"]] = warm
-        return self._observe(), self._info()
+        return self._make_observation(), self._make_info()
 
     def step(self, action: None = None) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by dt.
@@ -291,12 +291,12 @@ class Stepping:
             self._refusal = INSIDE_STEP
             try:
                 self._advance()
-                lost = self._lost_body()
-                observation = self._observe()
+                lost = self._find_lost_body()
+                observation = self._make_observation()
                 if self.films:
                     for film in self.films:
                         film.add(self.time, observation)
-                return observation, 0.0, bool(lost), False, self._info(lost)
+                return observation, 0.0, bool(lost), False, self._make_info(lost)
             finally:
                 self._refusal = ""
 
@@ -327,7 +327,7 @@ class Stepping:
                 self._solve_substeps()
         except BaseException as error:
             done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
-            if done == substeps or self._lost_body():
+            if done == substeps or self._find_lost_body():
                 self._steps += 1  # The step was complete.
                 raise
             if done and self._state_before_step is not None and needs_copy:
@@ -342,8 +342,8 @@ class Stepping:
             raise
         self._steps += 1
 
-    def _lost_body(self) -> str:
-        """Return the name of the body whose state is not finite, or an empty text; no step can follow it."""
+    def _find_lost_body(self) -> str:
+        """Return the name of the body with a non-finite state, after which no step is possible, or an empty text."""
         lost = self.state.head.item(HEAD["lost"])
         if lost < 0:
             return ""
@@ -376,7 +376,7 @@ class Stepping:
             kernel.solve(False)
             if not (warm and self._solve_in_place()):
                 try:
-                    problem = self._problem(self.state)
+                    problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
                     self._mark_lost()
                     return
@@ -396,17 +396,17 @@ class Stepping:
     def _solve_in_place(self) -> bool:
         """Run the first phase of `newton` on the engine's arrays; return whether it solved the problem.
 
-        The impulses are bit for bit those of lavender.solve(problem, "newton"), without building the problem.
+        The impulses are bit for bit the result of lavender.solve(problem, "newton"), without building the problem.
         """
         start = perf_counter()
-        status_code, sweeps, factorisations, _ = self.state.warm.solve(self._warm_tol)
+        status_code, sweeps, factorisations, _ = self.state.warm_start_phase.solve(self._warm_tol)
         if status_code:
             self._last = _PendingClaim(status_code, sweeps, factorisations, perf_counter() - start)
         return bool(status_code)
 
     def _build_solution(self, pending: _PendingClaim) -> Solution:
-        """Build the solution of the last substep, whose arrays do not change until the next one."""
-        problem = self._problem(self.state, steps=self._steps)
+        """Build the solution of the last substep. Its arrays do not change until the next substep."""
+        problem = self._build_problem(self.state, steps=self._steps)
         claim = make_warm_start_claim(pending.status_code, pending.sweeps, pending.factorisations)
         assert claim is not None
         impulse = self.state.a["impulse"][: problem.m].copy()
@@ -424,7 +424,7 @@ class Stepping:
             problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options
         )
         if "callback" not in p.solver_options:
-            uninterrupted(solution)  # An interrupted solve must not be used for a step.
+            raise_if_interrupted(solution)  # An interrupted solve must not be used for a step.
         self._last = solution
         if solution.success or solution.residual.at_floor:
             return solution.impulse
@@ -435,20 +435,22 @@ class Stepping:
             return guess
         return 0.5 * (guess + solution.impulse) if p.on_failure == "damp" else solution.impulse
 
-    def _observe(self) -> dict[str, Any]:
+    def _make_observation(self) -> dict[str, Any]:
         """Return the observation of the present state, in new arrays."""
         s = self.state
         c = s.head.item(HEAD["contacts"])
-        views = s.observation_views(c, s.head.item(HEAD["contact_rows"]))
+        views = s.get_observation_views(c, s.head.item(HEAD["contact_rows"]))
         observation: dict[str, Any] = {name: copy_array() for name, copy_array in views.arrays.items()}
         contacts = {name: copy_array() for name, copy_array in views.contacts.items()}
         contacts["depth"] = 0.0 - views.gap
-        impulses = views.impulses() if views.impulses is not None else self._contact_impulses(c, views.per)
+        impulses = (
+            views.impulses() if views.impulses is not None else self._collect_contact_impulses(c, views.per)
+        )
         contacts["impulses"] = impulses
         observation["contacts"] = contacts
         return observation
 
-    def _contact_impulses(self, c: int, per: int) -> FloatArray:
+    def _collect_contact_impulses(self, c: int, per: int) -> FloatArray:
         """Return the impulses (c, per) of contacts with different numbers of rows; missing rows are zero."""
         a, kj = self.state.a, int(self.state.size[SIZE["joints"]])
         out = np.zeros((c, per))
@@ -463,7 +465,7 @@ class Stepping:
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
         return out
 
-    def _info(self, lost: str = "") -> dict[str, Any]:
+    def _make_info(self, lost: str = "") -> dict[str, Any]:
         """Return the `info` of a step."""
         info: dict[str, Any] = {
             "time": self.time,
@@ -482,7 +484,7 @@ class Stepping:
 
     # -- the problem of the last substep ----------------------------------------------------------
 
-    def _problem(self, state: State, steps: int | None = None) -> Problem:
+    def _build_problem(self, state: State, steps: int | None = None) -> Problem:
         """Return the problem of a prepared substep of `state`."""
         step = self._steps + 1 if steps is None else steps
         return build_problem(
@@ -490,28 +492,28 @@ class Stepping:
         )
 
     def _residual_summary(self) -> dict[str, Any]:
-        return residual_summary(*self._last_problem())
+        return summarise_residual(*self._rebuild_last_problem())
 
     def _motion_summary(self) -> dict[str, Any]:
-        problem, impulse = self._last_problem()
-        return motion_summary(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
+        problem, impulse = self._rebuild_last_problem()
+        return summarise_motion(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
 
-    def _last_problem(self) -> tuple[Problem, FloatArray]:
+    def _rebuild_last_problem(self) -> tuple[Problem, FloatArray]:
         """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""
         if not self.state.head[HEAD["solved"]]:
             raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
-        problem = self._problem(self.state)
+        problem = self._build_problem(self.state)
         return problem, self.state.a["impulse"][: problem.m].copy()
 
     def __repr__(self) -> str:
         return f"<Simulation of {self.scene!r}, step {self._steps}>"
 
 
-def sweep_order(p: Parameters) -> str | None:
+def get_sweep_order(p: Parameters) -> str | None:
     """Return the name of the order in which the scene's solver visits the blocks; None if it has no order."""
     if not get(p.solver).order:
         return None
-    return order_name(p.solver_options.get("order", p.order))
+    return get_order_name(p.solver_options.get("order", p.order))
 
 
 def invalidate_pairs(state: State) -> None:

@@ -21,7 +21,7 @@ SOLVER_UNITS = ("", "", "", "", "N s", "N s", "m/s", "m/s")
 
 
 class SolverValues(np.ndarray):
-    """Array whose text is one line per value with name and unit, if it holds eight float64 numbers."""
+    """Array that is printed as one line per value with name and unit, if it holds eight float64 numbers."""
 
     def __str__(self) -> str:
         if self.shape != (len(SOLVER_FIELDS),) or self.dtype != np.float64:

@@ -14,7 +14,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 
-#: `sine_cosine` computes in integer multiples of 2^-FIXED_POINT_BITS.
+#: `compute_sine_and_cosine` computes in integer multiples of 2^-FIXED_POINT_BITS.
 FIXED_POINT_BITS = 256
 #: Largest accepted angle [rad]: the reduction to one quarter turn uses 64 of the bits of PI for it.
 MAX_ANGLE = 2.0**64
@@ -23,7 +23,7 @@ MAX_ANGLE = 2.0**64
 PI = 0x3243F6A8885A308D313198A2E03707344A4093822299F31D0082EFA98EC4E6C89
 
 
-def sine_cosine(angle: float) -> tuple[float, float]:
+def compute_sine_and_cosine(angle: float) -> tuple[float, float]:
     """Return sine and cosine of an angle [rad], each rounded once: Taylor series in integer multiples of 2^-256.
 
     Raises
@@ -51,7 +51,7 @@ def sine_cosine(angle: float) -> tuple[float, float]:
     return sine / one, cosine / one  # A quotient of integers is rounded to nearest.
 
 
-def norm(x: FloatArray) -> float:
+def compute_norm(x: FloatArray) -> float:
     """Return the Euclidean norm of a short vector (n,); squares are added in order."""
     total = 0.0
     for value in x.tolist():
@@ -59,18 +59,18 @@ def norm(x: FloatArray) -> float:
     return sqrt(total)
 
 
-def rotate(r: FloatArray, x: FloatArray) -> FloatArray:
+def rotate_vector(r: FloatArray, x: FloatArray) -> FloatArray:
     """Return R x for a matrix (3, 3) and a vector (3,)."""
     a, b, c = x[0] * r[:, 0], x[1] * r[:, 1], x[2] * r[:, 2]
     return (a + b) + c
 
 
-def rotate_back(r: FloatArray, x: FloatArray) -> FloatArray:
+def rotate_vector_back(r: FloatArray, x: FloatArray) -> FloatArray:
     """Return R^T x for a matrix (3, 3) and a vector (3,)."""
-    return rotate(r.T, x)
+    return rotate_vector(r.T, x)
 
 
-def inverse(x: FloatArray) -> FloatArray | None:
+def invert_definite_matrix(x: FloatArray) -> FloatArray | None:
     """Return the inverse (3, 3) of a symmetric positive definite X = L D L^T, or None if a pivot is not positive."""
     (a, _, _), (b, d, _), (c, e, f) = x.tolist()
     if not a > 0.0:
@@ -94,7 +94,7 @@ def inverse(x: FloatArray) -> FloatArray | None:
     return np.array([[i00, i10, i20], [i10, i11, i21], [i20, i21, i22]]) + 0.0
 
 
-def frame_quaternion(r: FloatArray) -> FloatArray:
+def convert_frame_to_quaternion(r: FloatArray) -> FloatArray:
     """Return the unit quaternion (4,) w x y z with w >= 0 of a rotation matrix (3, 3).
 
     It is the row of 4 q q^T with the largest diagonal entry, which loses no digits (Shepperd 1978).
@@ -108,5 +108,5 @@ def frame_quaternion(r: FloatArray) -> FloatArray:
     )
     best = max(range(4), key=lambda k: rows[k][k])
     q = np.array(rows[best])
-    q = q / norm(q)
+    q = q / compute_norm(q)
     return q if q[0] >= 0.0 else -q

@@ -13,8 +13,13 @@ import numpy as np
 
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import check_name
-from lavender.sim.scene.arithmetic import frame_quaternion, norm, rotate, sine_cosine
-from lavender.sim.scene.parts import quaternion, rotation
+from lavender.sim.scene.arithmetic import (
+    compute_norm,
+    compute_sine_and_cosine,
+    convert_frame_to_quaternion,
+    rotate_vector,
+)
+from lavender.sim.scene.parts import convert_to_rotation_matrix, make_quaternion
 from lavender.sim.scene.scene import SCENES, Scene, named_scene
 
 __all__ = ["SCENES"]
@@ -58,7 +63,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
     check_int("levels", levels, 1)
     lean = check_float("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
-    s, c = sine_cosine(lean)
+    s, c = compute_sine_and_cosine(lean)
     half_width = tall * s + thick * c  # Half the width of the base of a pair.
     pitch = 2.0 * half_width + thick
     height = tall * c + thick * s
@@ -73,7 +78,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
                     (thick, width, tall),
                     mass,
                     position=(x - side * 0.5 * half_width, 0.0, z + 0.5 * height),
-                    quaternion=quaternion((0.0, 1.0, 0.0), side * lean),
+                    quaternion=make_quaternion((0.0, 1.0, 0.0), side * lean),
                 )
         for left, right in pairwise(apex):
             scene.add_box(
@@ -122,9 +127,9 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
     """
     check_int("n", n, 1)
     length = check_float("length", length, above=0.0)
-    s, c = sine_cosine(angle)
+    s, c = compute_sine_and_cosine(angle)
     down = np.array([s, 0.0, -c])
-    turn = quaternion((0.0, 1.0, 0.0), np.pi - angle)
+    turn = make_quaternion((0.0, 1.0, 0.0), np.pi - angle)
     before = -1
     for i in range(n):
         thick = 0.2 * length if i < n - 1 else 0.4 * length
@@ -196,8 +201,8 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
     2 bodies, 4 contacts.
     """
     angle, size = check_float("angle", angle, low=-1.5, high=1.5), check_float("size", size, above=0.0)
-    turn = quaternion((0.0, 1.0, 0.0), angle)
-    normal = rotation(turn)[:, 2]
+    turn = make_quaternion((0.0, 1.0, 0.0), angle)
+    normal = convert_to_rotation_matrix(turn)[:, 2]
     scene.add_plane(normal, 0.0)
     scene.add_box((size, size, size), position=0.5 * size * normal, quaternion=turn)
 
@@ -226,7 +231,7 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
     drop = np.sqrt(string * string - half_spread * half_spread)
     for i in range(n):
         pivot = np.array([(i - 0.5 * (n - 1)) * (2.0 * radius + gap), 0.0, 3.0])
-        s, c = sine_cosine(-angle if i < lifted else 0.0)
+        s, c = compute_sine_and_cosine(-angle if i < lifted else 0.0)
         ball = scene.add_sphere(radius, position=pivot + drop * np.array([s, 0.0, -c]), name=f"ball {i}")
         for side in (-1.0, 1.0):
             scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * half_spread, 0.0]))
@@ -239,16 +244,16 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
     3 bodies, 20 rows (21 with a motor) on 18 degrees of freedom, of which one remains. `motor` is the speed of the
     crank [rad/s], `torque` the largest torque of the motor [N m].
     """
-    r = rotation(quaternion((0.3, 0.2, 1.0), tilt))
+    r = convert_to_rotation_matrix(make_quaternion((0.3, 0.2, 1.0), tilt))
     flat = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8], [2.4, 0.0, 1.6], [2.2, 0.0, 0.0]])
-    corner = [rotate(r, p) for p in flat]
+    corner = [rotate_vector(r, p) for p in flat]
     axis = r[:, 1].copy()
     bars = []
     for i in range(3):
         d = corner[i + 1] - corner[i]
-        long = norm(d)
+        long = compute_norm(d)
         x = d / long
-        q = frame_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))
+        q = convert_frame_to_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))
         # The bars are offset along the axis, so that they do not overlap.
         position = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         bars.append(

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_float, shape_of
+from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
 from lavender.base.errors import InputError
-from lavender.sim.scene.arithmetic import norm, rotate_back, sine_cosine
+from lavender.sim.scene.arithmetic import compute_norm, compute_sine_and_cosine, rotate_vector_back
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 # Relative excess of the largest moment over the sum of the others that is accepted as rounding, as for a flat plate.
@@ -32,7 +32,7 @@ class Plane:
     offset: float
 
     def __post_init__(self) -> None:
-        _put(self, "normal", tuple(unit("normal of a plane", self.normal).tolist()))
+        _put(self, "normal", tuple(check_unit_vector("normal of a plane", self.normal).tolist()))
         _put(self, "offset", check_float("offset of a plane [m]", self.offset))
 
 
@@ -50,7 +50,7 @@ class Sphere:
     def __post_init__(self) -> None:
         _put(self, "radius", check_float("radius of a sphere [m]", self.radius, above=0.0))
 
-    def inertia(self, mass: float) -> FloatArray:
+    def compute_inertia(self, mass: float) -> FloatArray:
         """Return the inertia (3, 3) [kg m^2] of a solid ball of `mass` [kg]."""
         return np.diag(np.full(3, 0.4 * mass * (self.radius * self.radius)))
 
@@ -68,12 +68,12 @@ class Box:
     size: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        edges = numbers("size of a box [m]", self.size, 3)
+        edges = check_numbers("size of a box [m]", self.size, 3)
         if not (edges > 0.0).all():
             raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
         _put(self, "size", tuple(edges.tolist()))
 
-    def inertia(self, mass: float) -> FloatArray:
+    def compute_inertia(self, mass: float) -> FloatArray:
         """Return the inertia (3, 3) [kg m^2] of a solid box of `mass` [kg]."""
         x, y, z = (s * s for s in self.size)
         return np.diag([y + z, x + z, x + y]) * (mass / 12.0)
@@ -122,11 +122,11 @@ class Body:
 
     def to_local(self, point: FloatArray) -> FloatArray:
         """Return a world point (3,) [m] in the body's frame."""
-        return rotate_back(rotation(self.quaternion), point - self.position)
+        return rotate_vector_back(convert_to_rotation_matrix(self.quaternion), point - self.position)
 
     def direction_to_local(self, direction: FloatArray) -> FloatArray:
         """Return a world direction (3,) in the body's frame."""
-        return rotate_back(rotation(self.quaternion), direction)
+        return rotate_vector_back(convert_to_rotation_matrix(self.quaternion), direction)
 
 
 DISTANCE, BALL, HINGE = "distance", "ball", "hinge"
@@ -182,7 +182,7 @@ class Joint:
         return rows + (self.motor_speed is not None)
 
 
-def rotation(q: FloatArray) -> FloatArray:
+def convert_to_rotation_matrix(q: FloatArray) -> FloatArray:
     """Return the rotation matrix (3, 3), body to world, of a unit quaternion (4,) w x y z."""
     w, x, y, z = q
     return np.array(
@@ -194,36 +194,36 @@ def rotation(q: FloatArray) -> FloatArray:
     )
 
 
-def quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
+def make_quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
     """Return the unit quaternion (4,) of a rotation by `angle` [rad] about `axis` (3,)."""
     x = np.asarray(axis, float)
-    sine, cosine = sine_cosine(angle / 2)
-    return np.concatenate([[cosine], sine * (x / norm(x))])
+    sine, cosine = compute_sine_and_cosine(angle / 2)
+    return np.concatenate([[cosine], sine * (x / compute_norm(x))])
 
 
-def numbers(label: str, value: Any, n: int) -> FloatArray:
+def check_numbers(label: str, value: Any, n: int) -> FloatArray:
     """Return `value` as a new finite array (n,); `label` begins the error messages."""
-    if shape_of(label, value) == ():
+    if get_shape(label, value) == ():
         raise InputError(f"{label} is {value!r}; {n} numbers are needed")
     return as_array(label, value, (n,)).copy()
 
 
-def unit(label: str, value: object) -> FloatArray:
+def check_unit_vector(label: str, value: object) -> FloatArray:
     """Return `value` as a unit vector (3,); raise InputError if it is zero."""
-    x = normalised(numbers(label, value, 3))
+    x = normalise(check_numbers(label, value, 3))
     if x is None:
         raise InputError(f"{label} is zero; a direction is needed")
     return x
 
 
-def normalised(x: FloatArray, min_length: float = 0.0) -> FloatArray | None:
-    """Return `x` (n,) scaled to length 1, or None if its length is at most `min_length`."""
-    size = norm(x)
+def normalise(x: FloatArray, min_length: float = 0.0) -> FloatArray | None:
+    """Return `x` (n,) scaled to length 1, or None if its length does not exceed `min_length`."""
+    size = compute_norm(x)
     return x / size if size > min_length else None
 
 
-def inertia_of(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
-    """Return the inertia (3, 3) [kg m^2]: the given one, checked, or that of the solid shape with `mass` [kg].
+def choose_inertia(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
+    """Return the inertia (3, 3) [kg m^2]: the given one, checked, or the inertia of the solid shape with `mass` [kg].
 
     Raises
     ------
@@ -232,10 +232,10 @@ def inertia_of(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
     """
     if inertia is None:
         with np.errstate(all="ignore"):
-            x = np.asarray((shape if shape is not None else Sphere(0.1)).inertia(mass))
+            x = np.asarray((shape if shape is not None else Sphere(0.1)).compute_inertia(mass))
         quantity = f"inertia of {label}, of mass {mass:g} kg and {shape or 'radius 0.1 m'},"
     else:
-        x, quantity = _tensor(label, inertia), f"inertia of {label}"
+        x, quantity = _check_inertia_tensor(label, inertia), f"inertia of {label}"
     moments = np.linalg.eigvalsh(x) if np.isfinite(x).all() else x
     if not mass >= MIN_MAGNITUDE or not np.all((moments >= MIN_MAGNITUDE) & (moments <= MAX_MAGNITUDE)):
         raise InputError(
@@ -245,9 +245,9 @@ def inertia_of(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
     return x
 
 
-def _tensor(label: str, inertia: Any) -> FloatArray:
+def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
     """Return the tensor (3, 3) [kg m^2] of principal moments (3,) or a tensor; raise InputError if no body has it."""
-    shape = shape_of(f"inertia of {label}", inertia)
+    shape = get_shape(f"inertia of {label}", inertia)
     if shape not in ((3,), (3, 3)):
         raise InputError(f"inertia of {label} is {inertia!r}; 3 moments or a (3, 3) tensor is needed")
     x = as_array(f"inertia of {label} [kg m^2]", inertia, shape)

@@ -12,7 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_sizes, shape_of
+from lavender.base.arrays import (
+    FloatArray,
+    check_bool,
+    check_float,
+    check_int,
+    check_nonnegative_magnitudes,
+    get_shape,
+)
 from lavender.base.errors import InputError, UnknownName, check_name
 from lavender.problem.friction import check_shape
 from lavender.problem.ordering import ENGINE_ORDERS
@@ -26,10 +33,10 @@ from lavender.sim.scene.parts import (
     Joint,
     Plane,
     Sphere,
-    inertia_of,
-    normalised,
-    numbers,
-    unit,
+    check_numbers,
+    check_unit_vector,
+    choose_inertia,
+    normalise,
 )
 from lavender.sim.scene.steppers import StepperSpec, get_stepper
 from lavender.solvers.registry import SolverSpec, get
@@ -90,7 +97,7 @@ class Parameters:
     patch_radius : float, m
         Value for bodies that have none of their own; 0: no torsional friction.
     rolling_radius : float, m
-        mu_r of every contact with friction: the rolling moment is at most mu_r lambda_n; 0: no rolling friction.
+        mu_r of every contact with friction: the rolling moment does not exceed mu_r lambda_n; 0: no rolling friction.
     friction_shape : {"disk", "box"}
         With "box", each tangent has its own bound, as in many engines; there is then no torsional friction.
     position_iterations : int, optional
@@ -134,9 +141,9 @@ class Parameters:
         for name, allowed in PARAMETER_RANGES.items():
             put(self, name, check_float(name, getattr(self, name), **allowed))
         for name in ("friction", "patch_radius", "rolling_radius"):
-            check_sizes(name, np.array([getattr(self, name)]))
+            check_nonnegative_magnitudes(name, np.array([getattr(self, name)]))
         gravity: Any = self.gravity
-        if shape_of("gravity", gravity) == ():
+        if get_shape("gravity", gravity) == ():
             size = check_float("gravity", gravity)
             if size < 0.0:  # The z component was probably meant; bodies would fall upwards.
                 raise InputError(
@@ -144,20 +151,20 @@ class Parameters:
                     f"(0, 0, {size:g}) m/s^2"
                 )
             gravity = (0.0, 0.0, -size)
-        put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
+        put(self, "gravity", tuple(check_numbers("gravity", gravity, 3).tolist()))
         for name in ("solver_options", "stepper_options"):
             options = getattr(self, name)
             if not isinstance(options, Mapping):
                 raise InputError(f"{name} is {options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
         own, stepper = self.solver == "sequential_impulses", get_stepper(self.stepper)
-        put(self, "solver_iterations", self._sweeps(get(self.solver), stepper))
-        put(self, "stepper_options", stepper.values(self.stepper_options))
+        put(self, "solver_iterations", self._check_sweeps(get(self.solver), stepper))
+        put(self, "stepper_options", stepper.complete_options(self.stepper_options))
         max_substep: Any = self.max_substep
         if max_substep is None:
             max_substep = DEFAULT_MAX_SUBSTEP if own else self.dt
         put(self, "max_substep", check_float("max_substep", max_substep, above=0.0))
-        put(self, "substeps", self._count_of_substeps())
+        put(self, "substeps", self._choose_substeps())
         put(self, "warm_start", check_bool("warm_start", self.warm_start))
         order: Any = self.order
         if order is None:
@@ -182,7 +189,7 @@ class Parameters:
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
 
-    def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
+    def _check_sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
         """Return the checked `solver_iterations`, or their default."""
         sweeps = self.solver_iterations
         if self.solver != "sequential_impulses":
@@ -198,7 +205,7 @@ class Parameters:
             )
         return 16 if sweeps is None else check_int("solver_iterations", sweeps, *stepper.sweeps)
 
-    def _count_of_substeps(self) -> int:
+    def _choose_substeps(self) -> int:
         """Return the checked number of substeps, or the smallest number that respects `max_substep`."""
         substeps: Any = self.substeps
         if substeps is None:
@@ -218,7 +225,7 @@ COMMON_PARAMETERS = tuple(f.name for f in fields(Parameters))
 Builder = Callable[..., None]
 #: Builders of the named scenes. Importing the gallery adds its builders.
 SCENES: dict[str, Builder] = {}
-#: Defaults of a named scene that differ from those of `Parameters`.
+#: Defaults of a named scene that differ from the defaults of `Parameters`.
 DEFAULTS: dict[str, dict[str, Any]] = {}
 
 
@@ -228,7 +235,7 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
     Parameters
     ----------
     **defaults
-        Defaults of the scene for the parameters that every scene has, if they differ from those of `Parameters`.
+        Defaults of the scene for the parameters that every scene has, if they differ from the defaults of `Parameters`.
 
     Returns
     -------
@@ -341,7 +348,7 @@ class Scene:
         Raises
         ------
         UnknownName
-            No such parameter; a scene that was built by hand only has those of `Parameters`.
+            No such parameter; a scene that was built by hand only has the parameters of `Parameters`.
         InputError
             The gallery would build another number of bodies, and joints were added by body numbers.
         """
@@ -419,31 +426,31 @@ class Scene:
         mass = 0.0 if static else check_float(f"mass of {label} [kg]", mass)
         if mass < 0.0 or (mass == 0.0 and not static):
             raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
-        q = numbers(f"quaternion of {label}", quaternion, 4)
-        unit_q = normalised(q, 1e-12)
+        q = check_numbers(f"quaternion of {label}", quaternion, 4)
+        unit_q = normalise(q, 1e-12)
         if unit_q is None:
             raise InputError(f"quaternion of {label} is {q.tolist()}; one that is not zero is needed")
-        v = numbers(f"velocity of {label} [m/s]", velocity, 3)
-        omega = numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
+        v = check_numbers(f"velocity of {label} [m/s]", velocity, 3)
+        omega = check_numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
         if static and (v.any() or omega.any()):
             raise InputError(f"{label} is static; it has no velocity")
         body = Body(
             name=label,
             shape=shape,
             mass=mass,
-            inertia=np.zeros((3, 3)) if static else inertia_of(label, inertia, shape, mass),
-            position=numbers(f"position of {label} [m]", position, 3),
+            inertia=np.zeros((3, 3)) if static else choose_inertia(label, inertia, shape, mass),
+            position=check_numbers(f"position of {label} [m]", position, 3),
             quaternion=unit_q,
             velocity=v,
             angular_velocity=omega,
-            friction=_optional_number(f"friction of {label}", friction, **PARAMETER_RANGES["friction"]),
-            restitution=_optional_number(
+            friction=_check_optional_number(f"friction of {label}", friction, **PARAMETER_RANGES["friction"]),
+            restitution=_check_optional_number(
                 f"restitution of {label}", restitution, **PARAMETER_RANGES["restitution"]
             ),
-            patch_radius=_optional_number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+            patch_radius=_check_optional_number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
         )
         for name in ("friction", "patch_radius"):
-            check_sizes(f"{name} of {label}", np.array([getattr(body, name) or 0.0]))
+            check_nonnegative_magnitudes(f"{name} of {label}", np.array([getattr(body, name) or 0.0]))
         self.bodies.append(body)
         return number_
 
@@ -517,16 +524,18 @@ class Scene:
         """
         check_name("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
-        a, b = self._joined(label, a, b)
+        a, b = self._check_joined_bodies(label, a, b)
         ends = (anchor, anchor_a, anchor_b, length)
         pa, pb, length = (
-            self._distance_ends(label, (a, b), *ends, axis)
+            self._check_distance_ends(label, (a, b), *ends, axis)
             if kind == DISTANCE
-            else _common_point(label, *ends)
+            else _check_common_point(label, *ends)
         )
         if (axis is None) == (kind == HINGE):
             raise InputError(f"{label}: axis= goes with a hinge, and a hinge needs one")
-        world_axis = unit(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
+        world_axis = (
+            check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
+        )
         if (motor_speed is not None or motor_torque is not None) and kind != HINGE:
             raise InputError(f"{label}: only a hinge has a motor")
         if (motor_speed is None) != (motor_torque is None):
@@ -536,21 +545,22 @@ class Scene:
             name=label,
             a=a,
             b=b,
-            anchor_a=self._local(label, a, pa),
-            anchor_b=self._local(label, b, pb),
+            anchor_a=self._convert_to_local(label, a, pa),
+            anchor_b=self._convert_to_local(label, b, pb),
             axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
             axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
             length=length,
             hertz=check_float(f"hertz of {label}", hertz, low=0.0),
             damping=check_float(f"damping of {label}", damping, low=0.0),
-            motor_speed=_optional_number(f"motor_speed of {label} [rad/s]", motor_speed),
-            motor_torque=_optional_number(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
+            motor_speed=_check_optional_number(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=_check_optional_number(f"motor_torque of {label} [N m]", motor_torque, low=0.0)
+            or 0.0,
             collide=check_bool(f"collide of {label}", collide),
         )
         self.joints.append(joint)
         return len(self.joints) - 1
 
-    def _joined(self, label: str, a: Any, b: Any) -> tuple[int, int]:
+    def _check_joined_bodies(self, label: str, a: Any, b: Any) -> tuple[int, int]:
         """Return the checked numbers of the two bodies of a joint."""
         for body in (a, b):
             is_integer = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
@@ -564,34 +574,36 @@ class Scene:
             )
         return int(a), int(b)
 
-    def _distance_ends(
+    def _check_distance_ends(
         self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
     ) -> tuple[FloatArray, FloatArray, float]:
         """Return the anchors (3,) [m] and the length [m] of a distance joint."""
         if anchor is not None or axis is not None:
             raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
-        pa, pb = (self._anchor(label, *end) for end in zip("ab", bodies, (a, b), strict=True))
+        pa, pb = (self._check_anchor(label, *end) for end in zip("ab", bodies, (a, b), strict=True))
         with np.errstate(over="ignore"):
-            distance = arithmetic.norm(pb - pa)
+            distance = arithmetic.compute_norm(pb - pa)
         length = check_float(f"length of {label} [m]", distance if length is None else length, low=0.0)
         if length == 0.0:
             raise InputError(f"{label} has length 0; use a ball joint")
         return pa, pb, length
 
-    def _anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
+    def _check_anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
         """Return the anchor (3,) [m] in the world, by default the body's centre."""
         if point is not None:
-            return numbers(f"anchor_{side} of {label} [m]", point, 3)
+            return check_numbers(f"anchor_{side} of {label} [m]", point, 3)
         if body < 0:
             raise InputError(f"{label}: the world has no centre; give the anchor at its side")
         return self.bodies[body].position
 
-    def _local(self, label: str, body: int, point: FloatArray) -> FloatArray:
+    def _convert_to_local(self, label: str, body: int, point: FloatArray) -> FloatArray:
         """Return a world point (3,) [m] in the frame of the body."""
         if body < 0:
             return point
         with np.errstate(over="ignore", invalid="ignore"):
-            return numbers(f"anchor of {label}, seen from its body [m]", self.bodies[body].to_local(point), 3)
+            return check_numbers(
+                f"anchor of {label}, seen from its body [m]", self.bodies[body].to_local(point), 3
+            )
 
     # -- identity -------------------------------------------------------------------------------
 
@@ -622,15 +634,15 @@ class Scene:
         return f"<Scene {self.name or 'by hand'!r}: {self.n_bodies} bodies, {self.n_joints} joints>"
 
 
-def _optional_number(label: str, value: Any, **allowed: float) -> float | None:
+def _check_optional_number(label: str, value: Any, **allowed: float) -> float | None:
     return None if value is None else check_float(label, value, **allowed)
 
 
-def _common_point(
+def _check_common_point(
     label: str, anchor: Any, a: Any, b: Any, length: Any
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the common world point of a ball or hinge twice, and length 0."""
     if anchor is None or a is not None or b is not None or length is not None:
         raise InputError(f"{label} takes anchor=, one world point, and no length")
-    point = numbers(f"anchor of {label} [m]", anchor, 3)
+    point = check_numbers(f"anchor of {label} [m]", anchor, 3)
     return point, point, 0.0

@@ -91,7 +91,7 @@ class StepperSpec:
     exact_problem: bool = False
     options: Mapping[str, Option] = field(default_factory=dict)
 
-    def values(self, options: Mapping[str, Any]) -> dict[str, float]:
+    def complete_options(self, options: Mapping[str, Any]) -> dict[str, float]:
         """Return the values of all options, with defaults for those that `options` does not contain.
 
         Raises
@@ -114,7 +114,7 @@ class StepperSpec:
                 values[name] = check_float(label, x, low=option.low, high=option.high)
         return values
 
-    def check(self, spin: bool, restitution: bool, rolling: bool) -> None:
+    def check_scene_properties(self, spin: bool, restitution: bool, rolling: bool) -> None:
         """Raise `InputError` if the stepper does not support a scene with these properties."""
         for needed, supported, feature, alternative in (
             (spin, self.spin, "spin friction; leave patch_radius", "'impulses'"),
@@ -175,7 +175,7 @@ SOFT_STEP = StepperSpec(
 #: Positions are corrected constraint by constraint; velocities are computed from positions (Müller et al., 2020).
 #:
 #:     dlambda = (-C - alpha' lambda)/(w + alpha'),  alpha' = alpha/h^2,  w = sum of 1/m + (r x n).I^-1 (r x n)
-#:     v = (x - x0)/h;  friction reduces sliding by at most mu lambda_n; the normal velocity becomes -e v_n(before)
+#:     v = (x - x0)/h;  friction reduces sliding by up to mu lambda_n; the normal velocity becomes -e v_n(before)
 #:
 #: Nothing is warm-started, so that one sweep in each of many substeps is more accurate than many sweeps in one. A stack
 #: creeps if the sweeps of friction are too few to reach its ends. See `lavender_ext/engine/xpbd.pxd`.

@@ -25,14 +25,14 @@ def web(context: click.Context, port: int, no_browser: bool) -> None:
     The kernels are compiled to WebAssembly. The commands build the module and the page.
     """
     if context.invoked_subcommand is None:
-        _show(port, no_browser)
+        _serve_page(port, no_browser)
 
 
-def _say(text: str) -> None:
+def _print_message(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _show(port: int, no_browser: bool) -> None:
+def _serve_page(port: int, no_browser: bool) -> None:
     """Serve the page from a temporary folder until Ctrl-C."""
     import webbrowser
     from tempfile import TemporaryDirectory
@@ -40,8 +40,8 @@ def _show(port: int, no_browser: bool) -> None:
     from lavender.sim.web import pages
 
     with TemporaryDirectory(prefix="lavender-web-") as folder:
-        pages.write_page(Path(folder), _say)
-        with pages.server(Path(folder), port) as server:
+        pages.write_page(Path(folder), _print_message)
+        with pages.create_file_server(Path(folder), port) as server:
             address = f"http://127.0.0.1:{server.server_address[1]}/"
             click.echo(f"{address}   Ctrl-C ends")
             if not no_browser:
@@ -80,7 +80,7 @@ def page(folder: Path) -> None:
     from lavender.sim.web import pages
 
     click.get_current_context().with_resource(lock_output(folder, folder=True))
-    click.echo(str(pages.write_page(folder, _say)))
+    click.echo(str(pages.write_page(folder, _print_message)))
 
 
 @web.command()
@@ -91,7 +91,7 @@ def check() -> None:
     """
     from lavender.sim.web import pages
 
-    if not pages.check(_say):
+    if not pages.compare_with_native_kernels(_print_message):
         raise click.exceptions.Exit(1)
 
 

@@ -112,7 +112,7 @@ class Built:
     compiler: str
 
 
-def missing_requirement() -> str:
+def explain_missing_requirement() -> str:
     """Return the reason why no module can be built here, or an empty text."""
     if importlib.util.find_spec("Cython") is None:
         return "Cython is not installed (pip install 'lavender-contact[wasm]')"
@@ -127,14 +127,14 @@ def missing_requirement() -> str:
     return ""
 
 
-def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
+def hash_sources(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
     """Return a hash of all files that a build of these modules reads; arguments as for `build`."""
-    return str(EXTRACT_C["source_hash"](root, modules))
+    return str(EXTRACT_C["hash_sources"](root, modules))
 
 
 def is_current(path: Path, root: Path, part: Part) -> bool:
     """Return whether `path` is a module of the part that was built from the sources below `root`."""
-    return path.exists() and path.read_bytes().endswith(source_hash(root, part.modules).encode())
+    return path.exists() and path.read_bytes().endswith(hash_sources(root, part.modules).encode())
 
 
 def build(
@@ -169,11 +169,11 @@ def build(
     BuildFailed
         There is no compiler; the kernels need Python, an import or static data; the module is too large.
     """
-    reason = missing_requirement()
+    reason = explain_missing_requirement()
     if reason:
         raise BuildFailed(reason)
     modules = list(modules)
-    names = EXTRACT_C["core_functions"](root, modules)
+    names = EXTRACT_C["list_core_functions"](root, modules)
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
         source = Path(folder, "module.c")
         try:
@@ -183,7 +183,7 @@ def build(
             raise BuildFailed(str(error)) from None
         data = _compile(source, names, ["--import-memory"] if imports_memory else [])
     _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
-    data += section(SOURCES_SECTION, source_hash(root, modules).encode())
+    data += make_custom_section(SOURCES_SECTION, hash_sources(root, modules).encode())
     out = out.resolve()  # A link stays; its target is replaced.
     if out.exists() and not out.is_file():
         raise BuildFailed(f"cannot write {out}: it is no file, and is not replaced; give the name of a file")
@@ -191,7 +191,7 @@ def build(
         write_atomically(out, data)
     except OSError as error:
         raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
-    return Built(len(data), tuple(sorted(names)), shlex.join(_tools()[0]))
+    return Built(len(data), tuple(sorted(names)), shlex.join(_find_tools()[0]))
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -206,7 +206,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def _compile(source: Path, names: Iterable[str], extra_options: Iterable[str] = ()) -> bytes:
     """Compile and link one C file without Python headers to a module that exports the functions `names`."""
-    compiler, linker, named = _tools()
+    compiler, linker, named = _find_tools()
     # Older versions of clang call memset and memcpy; zig uses instructions instead.
     flags = ["-std=c11", "-O3", "-g0", "-w", "-ffp-contract=off", "-ffunction-sections"]
     flags += ["-mbulk-memory"] if named else []
@@ -228,7 +228,7 @@ def _compile(source: Path, names: Iterable[str], extra_options: Iterable[str] = 
     return linked.read_bytes()
 
 
-def _tools() -> tuple[list[str], list[str], bool]:
+def _find_tools() -> tuple[list[str], list[str], bool]:
     """Return the compiler, the linker, and whether an environment variable names the compiler."""
     zig = [sys.executable, "-m", "ziglang"]
     named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
@@ -271,8 +271,8 @@ def _check_module(module: bytes, max_bytes: int) -> None:
         raise BuildFailed(f"the module has {len(module)} bytes; below {max_bytes} are allowed")
 
 
-def section(name: str, content: bytes) -> bytes:
-    """Return a custom section to append to a module; it is limited to 127 bytes, whose length is one byte in LEB128."""
+def make_custom_section(name: str, content: bytes) -> bytes:
+    """Return a custom section to append to a module; it is limited to 127 bytes, a length of one byte in LEB128."""
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:
         raise ValueError("a custom section longer than 127 bytes")

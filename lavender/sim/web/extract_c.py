@@ -148,18 +148,20 @@ class Item:
             if token.kind != "body":
                 out.append(token)
                 continue
-            inside = tokens(token.text[1:])
+            inside = tokenize_c(token.text[1:])
             out += [Token("mark", "{", token.before), *inside]
         return out
 
     @cached_property
-    def text(self) -> str:
+    def output_text(self) -> str:
         """Text of the declaration in the output."""
         # Words in strings would be renamed, too; no string of a kernel contains such a word.
-        return WORD.sub(lambda match: _output_name(match.group(), self.kept_names), _text(self.all_tokens))
+        return WORD.sub(
+            lambda match: _make_output_name(match.group(), self.kept_names), _join_tokens(self.all_tokens)
+        )
 
     @cached_property
-    def uses(self) -> set[str]:
+    def used_names(self) -> set[str]:
         """Words that may be names of other declarations."""
         used: set[str] = set()
         last = ""
@@ -169,15 +171,15 @@ class Item:
                 words = WORD.findall(token.text)
             last = "->" if last == "-" and token.text == ">" else token.text
             used.update(words)
-        return {_output_name(name, self.kept_names) for name in used}
+        return {_make_output_name(name, self.kept_names) for name in used}
 
     def rename(self, origin: str, kept_names: frozenset[str]) -> None:
-        """Set the module and the kept names, and replace the defined names by those of the output."""
+        """Set the module and the kept names, and replace the defined names by their names in the output."""
         self.origin, self.kept_names = origin, kept_names
-        self.defines = {_output_name(name, kept_names) for name in self.defines}
+        self.defines = {_make_output_name(name, kept_names) for name in self.defines}
 
 
-def tokens(text: str, bodies: bool = False) -> Iterator[Token]:
+def tokenize_c(text: str, bodies: bool = False) -> Iterator[Token]:
     """Yield words, literals, marks and preprocessor lines of C; comments are white space.
 
     With `bodies`, the text in braces after a closing parenthesis is one token, including its braces.
@@ -193,7 +195,7 @@ def tokens(text: str, bodies: bool = False) -> Iterator[Token]:
                 continue
             before += match["space"] or ""
             if bodies and word == "{" and last == ")":
-                kind, at = "body", _end_of_block(text, match.end())
+                kind, at = "body", _find_end_of_block(text, match.end())
                 word = text[match.start("mark") : at]
             last = word
             yield Token(kind, word.lstrip() if kind == "directive" else word, before)
@@ -202,8 +204,8 @@ def tokens(text: str, bodies: bool = False) -> Iterator[Token]:
                 break
 
 
-def _end_of_block(text: str, at: int) -> int:
-    """Return the position after the brace that closes the block whose first character is at `at`."""
+def _find_end_of_block(text: str, at: int) -> int:
+    """Return the position after the brace that closes the block with its first character at `at`."""
     depth = 1
     for match in BRACE.finditer(text, at):
         depth += (match[0] == "{") - (match[0] == "}")
@@ -212,30 +214,32 @@ def _end_of_block(text: str, at: int) -> int:
     return len(text)
 
 
-def read(text: str) -> list[Item]:
+def parse_declarations(text: str) -> list[Item]:
     """Return the declarations of a C file; those between `#if` and `#endif` form one group."""
     # Cython's files have all declarations in the last branch of this condition.
     guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")
-    return list(_declarations(list(tokens(guarded[2].rpartition("\n#endif")[0] or text, bodies=True))))
+    return list(
+        _iterate_declarations(list(tokenize_c(guarded[2].rpartition("\n#endif")[0] or text, bodies=True)))
+    )
 
 
-def _declarations(stream: list[Token]) -> Iterator[Item]:
+def _iterate_declarations(stream: list[Token]) -> Iterator[Item]:
     """Yield the declarations of a sequence of tokens."""
     at = 0
     while at < len(stream):
-        word, stop = _word(stream[at]), at + 1
+        word, stop = _get_directive(stream[at]), at + 1
         if word in OPENING:
-            stop = _end_of_group(stream, at)
-            yield _group(stream[at:stop])
+            stop = _find_end_of_group(stream, at)
+            yield _make_group(stream[at:stop])
         elif word == "define":
             yield Item("macro", [stream[at]], {WORD.findall(stream[at].text)[1]})
         elif not word:
-            stop = _end_of_declaration(stream, at)
-            yield _item(stream[at:stop])
+            stop = _find_end_of_declaration(stream, at)
+            yield _make_item(stream[at:stop])
         at = stop
 
 
-def _word(token: Token) -> str:
+def _get_directive(token: Token) -> str:
     """Return the first word of a preprocessor line; an empty text for any other token."""
     if token.kind != "directive":
         return ""
@@ -243,18 +247,18 @@ def _word(token: Token) -> str:
     return match.group() if match else ""
 
 
-def _end_of_group(stream: list[Token], at: int) -> int:
+def _find_end_of_group(stream: list[Token], at: int) -> int:
     """Return the position after the #endif of the conditional that opens at `at`."""
     depth = 0
     for i in range(at, len(stream)):
-        word = _word(stream[i])
+        word = _get_directive(stream[i])
         depth += (word in OPENING) - (word == "endif")
         if depth == 0:
             return i + 1
     return len(stream)
 
 
-def _end_of_declaration(stream: list[Token], at: int) -> int:
+def _find_end_of_declaration(stream: list[Token], at: int) -> int:
     """Return the position after the declaration that begins at `at`."""
     depth = 0
     for i in range(at, len(stream)):
@@ -270,7 +274,7 @@ def _end_of_declaration(stream: list[Token], at: int) -> int:
     return len(stream)
 
 
-def _text(part: list[Token]) -> str:
+def _join_tokens(part: list[Token]) -> str:
     """Return the text of tokens, without empty lines, and with preprocessor lines on lines of their own."""
     out = []
     for i, token in enumerate(part):
@@ -283,16 +287,16 @@ def _text(part: list[Token]) -> str:
     return re.sub(r"[ \t]+\n", "\n", "".join(out))
 
 
-def _group(part: list[Token]) -> Item:
+def _make_group(part: list[Token]) -> Item:
     """Return the group of all declarations between `#if` and `#endif`."""
     group = Item("group", part)
-    for item in _declarations([token for token in part if token.kind != "directive"]):
+    for item in _iterate_declarations([token for token in part if token.kind != "directive"]):
         group.defines |= item.defines
-    group.defines |= {WORD.findall(token.text)[1] for token in part if _word(token) == "define"}
+    group.defines |= {WORD.findall(token.text)[1] for token in part if _get_directive(token) == "define"}
     return group
 
 
-def _item(part: list[Token]) -> Item:
+def _make_item(part: list[Token]) -> Item:
     """Return one declaration with its kind and the names that it defines, from its tokens."""
     words = ["{" if token.kind == "body" else token.text for token in part]
     names = [i for i, token in enumerate(part) if token.kind == "name"]
@@ -339,7 +343,7 @@ class _Table:
             for name in item.defines:
                 self.by_name.setdefault(name, []).append(item)
 
-    def reach(self, roots: Iterable[str]) -> list[Item]:
+    def collect_needed(self, roots: Iterable[str]) -> list[Item]:
         """Return all declarations that the names need, ordered so that each precedes its use."""
         done: dict[int, Item] = {}
         for name in sorted(roots):
@@ -357,15 +361,19 @@ class _Table:
         if name in path:
             raise ExtractionError(f"{' > '.join(path)} > {name} is a cycle")
         for other in candidates:
-            if other.kind == item.kind == "function" and other.part != item.part and other.text != item.text:
+            if (
+                other.kind == item.kind == "function"
+                and other.part != item.part
+                and other.output_text != item.output_text
+            ):
                 raise ExtractionError(f"{name} is not the same in {item.origin} and {other.origin}")
         if item.kind in ("variable", "prototype"):
-            if item.kind == "prototype" and item.text.startswith(("struct", "union")):
+            if item.kind == "prototype" and item.output_text.startswith(("struct", "union")):
                 return
             raise ExtractionError(
                 f"{path[-1] if path else 'a root'} needs {name}, which only the Python part defines ({item.origin})"
             )
-        for used in sorted(item.uses - item.defines):
+        for used in sorted(item.used_names - item.defines):
             self._visit(used, done, (*path, name))
         done[id(item)] = item
 
@@ -394,13 +402,15 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
     kept_names = frozenset(roots)
     items = []
     for name, text in translations:
-        declarations = read(text)
+        declarations = parse_declarations(text)
         for item in declarations:
             item.rename(name, kept_names)
         items += declarations
-    table, front_items = _Table(items), read(front)
+    table, front_items = _Table(items), parse_declarations(front)
     defined = set().union(*(item.defines for item in front_items))
-    reached = table.reach(set().union(*(item.uses for item in front_items), kept_names) - defined)
+    reached = table.collect_needed(
+        set().union(*(item.used_names for item in front_items), kept_names) - defined
+    )
     missing = sorted(kept_names - set(table.by_name))
     if missing:
         raise ExtractionError(f"no such core functions: {', '.join(missing)}")
@@ -409,15 +419,15 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
 
 def _make_static(item: Item, kept_names: frozenset[str]) -> str:
     """Return the text of a declaration; a function is `static` unless it keeps its name."""
-    text = item.text
+    text = item.output_text
     if item.kind == "function":
         text = re.sub(r"^(?:static\s+)?(?:CYTHON_INLINE\s+)?", "", text)
-        inline = "inline " if "CYTHON_INLINE" in item.uses else ""
+        inline = "inline " if "CYTHON_INLINE" in item.used_names else ""
         text = text if item.defines & kept_names else f"static {inline}{text}"
     return text
 
 
-def _output_name(name: str, kept_names: frozenset[str]) -> str:
+def _make_output_name(name: str, kept_names: frozenset[str]) -> str:
     """Return a name without Cython's prefix; only names of variables end in an underscore."""
     if not name.startswith("__pyx_"):
         if name == "Py_ssize_t":
@@ -443,22 +453,22 @@ def _output_name(name: str, kept_names: frozenset[str]) -> str:
 # -- Cython -------------------------------------------------------------------------------------------------
 
 
-def path_of(root: Path, module: str | Path, suffix: str = ".pyx") -> Path:
+def get_module_path(root: Path, module: str | Path, suffix: str = ".pyx") -> Path:
     """Return the file of a module of lavender_ext; a path of another module is returned unchanged."""
     if isinstance(module, Path):
         return module
     return root.joinpath("lavender_ext", *module.split(".")).with_suffix(suffix)
 
 
-def core_functions(root: Path, modules: Iterable[str | Path]) -> list[str]:
+def list_core_functions(root: Path, modules: Iterable[str | Path]) -> list[str]:
     """Return the names of the core functions `cdef public ... lav_*` in the sources of modules."""
-    texts = [path_of(root, module).read_text(encoding="utf-8") for module in modules]
+    texts = [get_module_path(root, module).read_text(encoding="utf-8") for module in modules]
     return [name for text in texts for name in PUBLIC.findall(text)]
 
 
-def _sources(root: Path, module: str | Path) -> set[Path]:
+def _list_sources(root: Path, module: str | Path) -> set[Path]:
     """Return the files of lavender_ext that the translation of a module reads."""
-    pending, sources = [path_of(root, module)], set()
+    pending, sources = [get_module_path(root, module)], set()
     while pending:
         path = pending.pop()
         if path in sources or not path.exists():
@@ -466,13 +476,13 @@ def _sources(root: Path, module: str | Path) -> set[Path]:
         sources.add(path)
         names = CIMPORT.findall(path.read_text(encoding="utf-8"))
         pending += [path.with_suffix(".pxd")]
-        pending += [path_of(root, name, ".pxd") for name in names]
+        pending += [get_module_path(root, name, ".pxd") for name in names]
     return sources
 
 
-def source_hash(root: Path, modules: Iterable[str | Path], more: Iterable[Path] = ()) -> str:
+def hash_sources(root: Path, modules: Iterable[str | Path], more: Iterable[Path] = ()) -> str:
     """Return a hash of all files from which these modules are extracted, and of the files `more`."""
-    paths = {path for name in modules for path in _sources(root, name)}
+    paths = {path for name in modules for path in _list_sources(root, name)}
     tools = (root / "lavender_ext" / "build_options.py", Path(__file__))
     digest = hashlib.sha256()
     for path in [*sorted(paths), *tools, *more]:
@@ -508,11 +518,11 @@ def translate(
         cache = None  # The build has all run-time checks, or is not complete.
 
     def translate_module(module: str | Path) -> tuple[str, str]:
-        source = path_of(root, module)
+        source = get_module_path(root, module)
         name = module.stem if isinstance(module, Path) else module
         cached = cache.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if cache else None
         if cached and cached.exists():
-            newest = max(path.stat().st_mtime for path in _sources(root, module))
+            newest = max(path.stat().st_mtime for path in _list_sources(root, module))
             if cached.stat().st_mtime > newest:
                 return name, cached.read_text(encoding="utf-8")
         out = work / f"{name}.c"

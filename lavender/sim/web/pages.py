@@ -19,7 +19,7 @@ import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes, write_text
 from lavender.sim.web import compile as wasm
-from lavender.sim.web.scenes import page_scenes
+from lavender.sim.web.scenes import collect_page_data
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
@@ -42,7 +42,7 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
         raise LavenderError(str(error)) from None
 
 
-def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
+def get_module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
     """Return a module of the present kernels: the one in the package, or a new one, which is stored there if possible.
 
     Parameters
@@ -59,7 +59,7 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
     shipped = SHIPPED / f"{name}.wasm"
 
     def make() -> bytes:
-        if reason := wasm.missing_requirement():
+        if reason := wasm.explain_missing_requirement():
             state = "is of other kernels" if shipped.exists() else "is not in this installation"
             raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
         say(f"building the WebAssembly module {name} (about 10 s, once)")
@@ -84,19 +84,19 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
         A module cannot be built.
     """
     make_folder(check_writable(folder, folder=True))
-    modules = {name: module(say, name) for name in wasm.PARTS}
+    modules = {name: get_module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
         for name, data in modules.items():
             write_bytes(folder / f"{name}.wasm", data)
-        text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
+        text = json.dumps(collect_page_data(), allow_nan=False, separators=(",", ":"))
         write_text(folder / "scenes.json", text)
     except (OSError, shutil.Error) as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"
 
 
-def check(say: Callable[[str], Any] = lambda text: None) -> bool:
+def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -> bool:
     """Return whether the modules under Node give the bits of the native kernels; print the differences.
 
     Raises
@@ -115,7 +115,7 @@ def check(say: Callable[[str], Any] = lambda text: None) -> bool:
         raise LavenderError(
             "node, which runs the check, is not installed: install Node 18 or newer (nodejs.org, or apt)"
         )
-    modules = {name: module(say, name) for name in wasm.PARTS}
+    modules = {name: get_module(say, name) for name in wasm.PARTS}
     with TemporaryDirectory(prefix="lavender-web-") as folder:
         for name, data in modules.items():
             Path(folder, f"{name}.wasm").write_bytes(data)
@@ -158,7 +158,7 @@ class Handler(SimpleHTTPRequestHandler):
         """Print nothing about single requests."""
 
 
-def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
+def create_file_server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
     """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one."""
     return create_server(partial(Handler, directory=str(folder)), port)
 

@@ -258,7 +258,7 @@ PRESETS = (
 )
 
 
-def layout() -> dict[str, Any]:
+def describe_layout() -> dict[str, Any]:
     """Return the arrays and the numbered entries of this build of the kernels.
 
     Returns
@@ -275,11 +275,11 @@ def layout() -> dict[str, Any]:
         "joint": JOINT,
         "joint_kinds": JOINT_KINDS,
         "orders": ORDER_NUMBER,
-        "steppers": {name: _stepper(name) for name in ("impulses", "soft_step")},
+        "steppers": {name: _encode_stepper(name) for name in ("impulses", "soft_step")},
     }
 
 
-def _stepper(name: str) -> dict[str, dict[str, Any]]:
+def _encode_stepper(name: str) -> dict[str, dict[str, Any]]:
     """Return the entries of `head` and `setting` that a stepper sets."""
     state = Simulation(Scene("stack", stepper=name)).snapshot()
     first = offsets(state.size)
@@ -288,7 +288,7 @@ def _stepper(name: str) -> dict[str, dict[str, Any]]:
     return {"head": numbers, "setting": {p: float(setting[SETTING[p]]) for p in ("hertz", "ratio", "push")}}
 
 
-def describe(start: Snapshot) -> dict[str, Any]:
+def describe_snapshot(start: Snapshot) -> dict[str, Any]:
     """Return the sizes of a snapshot and, as lists of numbers, its arrays that are not all zero.
 
     The numbers are exact in JSON, which uses the shortest text that reads back as the same double.
@@ -304,7 +304,7 @@ def describe(start: Snapshot) -> dict[str, Any]:
     return {"size": start.size.tolist(), "arrays": arrays}
 
 
-def page_scenes() -> dict[str, Any]:
+def collect_page_data() -> dict[str, Any]:
     """Return all data that the page reads: layout, scenes and presets."""
     scenes = []
     for name, title, note, measure in PAGE:
@@ -320,7 +320,7 @@ def page_scenes() -> dict[str, Any]:
                 "substeps": common.substeps,
                 "newton_substeps": Scene(name, solver="newton").parameters.substeps,
                 "bodies": [body.name for body in scene.bodies],
-                **describe(Simulation(scene).snapshot()),
+                **describe_snapshot(Simulation(scene).snapshot()),
             }
         )
     presets = [
@@ -339,4 +339,4 @@ def page_scenes() -> dict[str, Any]:
         }
         for preset in (*PRESETS, *EXPERIMENTS)
     ]
-    return {"layout": layout(), "scenes": scenes, "presets": presets}
+    return {"layout": describe_layout(), "scenes": scenes, "presets": presets}

@@ -96,13 +96,13 @@ class _FilmHandler(Handler):
             return
         address = urlsplit(self.path)
         if address.path == "/film.json":
-            self._answer("application/json", json.dumps(self._film.header).encode(), {})
+            self._send_answer("application/json", json.dumps(self._film.header).encode(), {})
         elif address.path == "/frames":
-            self._frames(parse_qs(address.query))
+            self._answer_frames(parse_qs(address.query))
         else:
             super().do_GET()
 
-    def _frames(self, query: dict[str, list[str]]) -> None:
+    def _answer_frames(self, query: dict[str, list[str]]) -> None:
         """Answer a request for frames; start again from 0 if the stride of the film has changed."""
         try:
             first, stride = (int(query.get(name, ["0"])[0]) for name in ("from", "stride"))
@@ -118,9 +118,9 @@ class _FilmHandler(Handler):
         frames = film.frames(first)[:MAX_FRAMES_PER_ANSWER]
         is_complete = ended and first + len(frames) >= len(film)
         headers = {"X-First": str(first), "X-Stride": str(film.stride), "X-Ended": str(int(is_complete))}
-        self._answer("application/octet-stream", frames.astype("<f4").tobytes(), headers)
+        self._send_answer("application/octet-stream", frames.astype("<f4").tobytes(), headers)
 
-    def _answer(self, kind: str, data: bytes, headers: dict[str, str]) -> None:
+    def _send_answer(self, kind: str, data: bytes, headers: dict[str, str]) -> None:
         """Send `data` of content type `kind` with additional headers."""
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)

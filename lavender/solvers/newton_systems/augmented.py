@@ -22,7 +22,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.solvers.setup_times import SCIPY_CALLS_TIME, SPARSE_FACTOR_WORK_TIME, loading_time, sparse_work
 from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
@@ -114,7 +114,7 @@ class Augmented:
         if not np.isfinite(matrix.data).all():
             return False
         try:
-            self.lu = sparse_lu(matrix)
+            self.lu = factor_sparse_lu(matrix)
         except RuntimeError:
             return False
         self.matrix = sp.csr_array(matrix)

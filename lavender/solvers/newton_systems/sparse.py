@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.solvers.factors import PIVOT_TOLERANCE, Panels
 from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
@@ -117,7 +117,7 @@ class SparseRows:
         matrix = self.rows.copy()
         matrix.eliminate_zeros()
         try:
-            self.superlu_solve = sparse_lu(matrix, permc_spec="COLAMD").solve
+            self.superlu_solve = factor_sparse_lu(matrix, permc_spec="COLAMD").solve
         except RuntimeError:
             return False
         return True

@@ -18,7 +18,12 @@ from worked import python
 import lavender as lv
 from lavender import registry
 from lavender.external import as_qp, backends, qp_solver
-from lavender.external.as_qp import choose_form, impulse_form, residual_target, velocity_form
+from lavender.external.as_qp import (
+    build_impulse_form,
+    build_velocity_form,
+    choose_form,
+    compute_backend_tolerance,
+)
 from lavender.external.running import Answer, capture_output
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
@@ -230,7 +235,7 @@ def test_contacts_that_separate_are_taken_out_with_their_friction(name):
     for one, taken_out in ((problem, []), (away, list(rows))):
         solution = lv.solve(one, name)
         assert solution.success, str(solution)
-        assert impulse_form(one, assume=True).assumed.tolist() == taken_out
+        assert build_impulse_form(one, assume=True).assumed.tolist() == taken_out
     assert not solution.impulse[list(rows)].any()
 
 
@@ -544,18 +549,18 @@ def test_units_do_not_reach_the_backend():
         )
         for k, s in ((1.0, 1.0), (4.0, 8.0))
     ]
-    for form in (impulse_form, velocity_form):
+    for form in (build_impulse_form, build_velocity_form):
         one, two = map(form, made)
         assert one.q.tobytes() == two.q.tobytes() and one.b.tobytes() == two.b.tobytes()
         assert (one.P != two.P).nnz == 0 and (one.A != two.A).nnz == 0
     # A residual is relative to speeds.
-    assert residual_target(made[0], 1e-6) == residual_target(made[1], 1e-6)
+    assert compute_backend_tolerance(made[0], 1e-6) == compute_backend_tolerance(made[1], 1e-6)
 
 
 def test_a_linear_system_as_equalities_has_its_solution():
     a, b = spd(5)
-    qp = impulse_form(lv.Problem.linear(a, b), equality=True)
-    x, _, _ = qp.start(np.linalg.solve(a, b))
+    qp = build_impulse_form(lv.Problem.linear(a, b), equality=True)
+    x, _, _ = qp.make_start(np.linalg.solve(a, b))
     assert qp.n_zero == 5 and not qp.q.any()
     np.testing.assert_allclose(qp.A @ x, qp.b, rtol=1e-10)
 

@@ -107,7 +107,7 @@ def test_states_fit_impulse_and_slack(kind):
             elif name == "at a bound":
                 assert min(abs(lam[j] - c.lower[j]), abs(lam[j] - c.upper[j])) < near
         if state.name == "slides" and len(rows) == 3 and "box" not in kind:
-            reach = np.where(c.reach[rows[1:]] > 0.0, c.reach[rows[1:]], 1.0)
+            reach = np.where(c.friction_coefficient[rows[1:]] > 0.0, c.friction_coefficient[rows[1:]], 1.0)
             share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
             assert (
                 share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6)

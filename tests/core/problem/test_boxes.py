@@ -11,7 +11,7 @@ from random_problems import as_matrix, dragged, random_boxes, random_ellipses, s
 
 import lavender as lv
 from lavender import registry
-from lavender.problem.cones import project
+from lavender.problem.cones import project_impulse
 
 LAWS = ("coulomb", "cone")
 
@@ -125,7 +125,7 @@ def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations)
     problem = replace(problem, compliance=np.zeros(problem.m))
     found = lv.solve(problem, "auto", tol=1e-8).impulse
     near = found + 1e-6 * np.random.default_rng(seed).normal(size=problem.m)
-    start = project(problem.cones, near)
+    start = project_impulse(problem.cones, near)
     end = lv.solve(problem, name, impulse=start, tol=1e-8, max_iter=iterations)
     # a solution at the floor of rounding may be as far above zero as the start
     bound = max(lv.residual(problem, start).relative, 1e-8, 2.0 * end.residual.roundoff_floor)
@@ -151,13 +151,13 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
     assert cones.has_ellipse
     assert not cones.is_polyhedral
     np.testing.assert_allclose(cones.coefficients, mu, rtol=1e-15)
-    np.testing.assert_allclose(cones.reach.reshape(-1, 3)[:, 1:], mu, rtol=1e-15)
+    np.testing.assert_allclose(cones.friction_coefficient.reshape(-1, 3)[:, 1:], mu, rtol=1e-15)
     np.testing.assert_allclose(cones.stretch.reshape(-1, 3)[:2], [[1, 1, 0.4], [1, 0.025, 1]], rtol=1e-15)
     assert lv.Cones.contacts([(0.5, 0.5), (0.0, 0.0)]) == lv.Cones.contacts([0.5, 0.0])
     assert (lv.Cones.free(2) + cones).has_ellipse
     assert lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.5)]).disk.cones.kind.tolist() == [lv.CONTACT]
     x = np.array([1.0, 3.0, 4.0, 1.0, 0.0, 0.1, 1.0, 0.3, 0.0, -1.0, 1.0, 1.0])
-    t = lv.cones.project(cones, x).reshape(-1, 3)
+    t = lv.cones.project_impulse(cones, x).reshape(-1, 3)
     np.testing.assert_allclose(np.hypot(*(t[0, 1:] / mu[0])), 1.0)
     np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
 

@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 import lavender as lv
 from lavender import registry
 from lavender.base.deadline import NEVER, Deadline
-from lavender.judge.certificates import prove
+from lavender.judge.certificates import prove_infeasibility
 
 OURS = lv.available(external=False)
 
@@ -55,12 +55,14 @@ def test_what_is_proved_is_said(name):
 
 def test_a_direction_is_not_polished_where_that_ends_after_the_deadline():
     problem, y = opposed(0.0), np.array([1.0, 1.0 + 1e-9])
-    late = prove(problem, y, 1e-6, Deadline(1e-12))
+    late = prove_infeasibility(problem, y, 1e-6, Deadline(1e-12))
     assert late.reason and late.skipped_time > 0.0
-    assert prove(problem, y, 1e-6) is late  # whoever checks the claim takes no time for it either
-    assert prove(problem, y, 1e-6, Deadline(1e-12)) is late
-    assert not prove(problem, y, 1e-6, NEVER).reason  # one who has it does
-    assert not prove(problem, y, 1e-6).reason
+    assert (
+        prove_infeasibility(problem, y, 1e-6) is late
+    )  # whoever checks the claim takes no time for it either
+    assert prove_infeasibility(problem, y, 1e-6, Deadline(1e-12)) is late
+    assert not prove_infeasibility(problem, y, 1e-6, NEVER).reason  # one who has it does
+    assert not prove_infeasibility(problem, y, 1e-6).reason
 
 
 def held(law, soft, form):
@@ -146,7 +148,7 @@ def test_no_solution_has_less_impulse_than_a_direction_says(law, form):
             )
             free = np.isneginf(c.lower) & np.isposinf(c.upper) & ~c.contact_rows
             y[free] = rng.normal(size=free.sum())
-            found = prove(problem, y)
+            found = prove_infeasibility(problem, y)
             assert found.reason or not y.any()
             assert found.impulse_bound <= np.abs(solution.impulse).sum() * (1.0 + 1e-6), seed
             told += found.impulse_bound > 0.0

@@ -26,8 +26,9 @@ from lavender import registry
 
 # Worked out anew at each call, and the caller's own.
 ANEW = {
-    "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "apart_rows", "spin_rows",
-    "rolling_rows", "reach", "coefficients", "stretch", "parents", "block_bodies", "is_contact", "is_box", "is_ellipse",
+    "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "separate_rows", "spin_rows",
+    "rolling_rows", "friction_coefficient", "coefficients", "stretch", "parents", "block_bodies",
+    "is_contact", "is_box", "is_ellipse",
 }  # fmt: skip
 
 

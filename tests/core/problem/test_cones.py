@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from random_problems import random_contact_problem, seeds
 
 import lavender as lv
-from lavender.problem.cones import project
+from lavender.problem.cones import project_impulse
 
 INVALID_PROBLEM = {
     "a kind that does not exist": (lambda: lv.Cones([0, 1], [9], [0], [1], [0], [0]), "9"),
@@ -112,8 +112,8 @@ def test_bounds_of_contact_rows_are_spelled_in_one_way():
 def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
     cones = random_contact_problem(seed, joints=2, contacts=4).cones
     x = size * np.random.default_rng(seed).standard_normal(cones.n_rows)
-    y = project(cones, x)
-    twice = project(cones, y)
+    y = project_impulse(cones, x)
+    twice = project_impulse(cones, y)
     # Scaling a tangent back to its disk rounds once each time.
     np.testing.assert_allclose(twice, y, rtol=1e-15, atol=0.0)
     for i in range(cones.n_blocks):

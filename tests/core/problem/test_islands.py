@@ -19,7 +19,7 @@ from random_problems import (
 )
 
 import lavender as lv
-from lavender.solvers.islands import islands
+from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import get
 
 # Sums over an island's rows alone and next to others add in the same order, but what is made of the data (M's factor, d
@@ -50,7 +50,7 @@ def rows_side_by_side(first, second):
     row_order = np.concatenate([np.arange(cones.ptr[i], cones.ptr[i] + size[i]) for i in order]).astype(int)
     b = np.concatenate([first.b, second.b])[row_order]
     compliance = np.concatenate([first.compliance, second.compliance])[row_order]
-    both = lv.Problem(b, cones.take(order), rows=rows, compliance=compliance, friction=first.friction)
+    both = lv.Problem(b, cones.select(order), rows=rows, compliance=compliance, friction=first.friction)
     return both, row_order
 
 
@@ -101,8 +101,8 @@ def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind,
     slack = ROUNDING * worst + 4.0 * max(r.roundoff_floor for r in alone)
     assert abs(found.relative - worst) <= slack
     if kind != "ellipses":  # whose numbers are those of stretched rows
-        count = sum(islands(p)[0] for p in (first, second))
-        assert len(found.islands.relative) == islands(both)[0] == count
+        count = sum(find_islands(p)[0] for p in (first, second))
+        assert len(found.islands.relative) == find_islands(both)[0] == count
         np.testing.assert_allclose(
             np.sort(found.islands.relative),
             np.sort(np.concatenate([r.islands.relative for r in alone])),
@@ -219,6 +219,6 @@ def test_a_row_that_nothing_moves_has_no_scale_of_its_own():
 def test_bodies_that_share_nothing_are_islands_in_every_form():
     problem = random_contact_problem(3, tangents=2, spin=False)
     both, _ = rows_side_by_side(problem, random_contact_problem(4, tangents=2, spin=False))
-    counts = [islands(convert(both))[0] for convert in FORMS.values()]
+    counts = [find_islands(convert(both))[0] for convert in FORMS.values()]
     assert counts[0] > 1
     assert len(set(counts)) == 1

@@ -234,7 +234,7 @@ def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
         y[cones.normal_rows] = rng.uniform(0.1, 1.0, 2)
         for i, (rows, _) in ((k, part) for k in range(2) for part in parts(cones, k)):
             way = rng.normal(size=len(rows))
-            y[rows] = share * y[cones.ptr[i]] * cones.reach[rows] * way / np.linalg.norm(way)
+            y[rows] = share * y[cones.ptr[i]] * cones.friction_coefficient[rows] * way / np.linalg.norm(way)
     y = y * rng.choice([1.0, 1.0, 1.0, -1.0])
     m, g = len(y), rng.normal(size=(len(y), len(y)))
     off = rng.random() < 0.8

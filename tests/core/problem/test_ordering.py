@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
 
 import lavender as lv
-from lavender.problem.ordering import SWEEP_ORDERS, block_order, body_ranks, colors, levels
+from lavender.problem.ordering import (
+    SWEEP_ORDERS,
+    compute_block_order,
+    compute_colors,
+    compute_levels,
+    rank_bodies,
+)
 
 
 @settings(max_examples=10)
@@ -14,7 +20,7 @@ from lavender.problem.ordering import SWEEP_ORDERS, block_order, body_ranks, col
 @pytest.mark.parametrize("order", SWEEP_ORDERS)
 def test_named_orders_are_permutations_with_joints_first(order, seed):
     problem = random_contact_problem(seed)
-    o = block_order(problem, order, seed=seed if order == "random" else 0)
+    o = compute_block_order(problem, order, seed=seed if order == "random" else 0)
     assert sorted(o.blocks.tolist()) == list(range(problem.n_blocks))
     assert o.split == problem.rows.n_joints
     assert sorted(o.blocks[: o.split].tolist()) == list(range(o.split))
@@ -23,7 +29,7 @@ def test_named_orders_are_permutations_with_joints_first(order, seed):
 @given(seed=seeds)
 def test_colors_share_no_moving_body(seed):
     problem = random_contact_problem(seed, bodies=6, contacts=20)
-    o, color = block_order(problem, "colored"), colors(problem)
+    o, color = compute_block_order(problem, "colored"), compute_colors(problem)
     body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
     for c in range(color.max() + 1):
         moving = body[color == c].ravel()
@@ -36,7 +42,7 @@ def test_colors_share_no_moving_body(seed):
 @given(seed=seeds)
 def test_colors_of_a_matrix_share_no_entry(seed):
     problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
-    color, a, ptr = colors(problem), problem.dense(), problem.cones.ptr
+    color, a, ptr = compute_colors(problem), problem.dense(), problem.cones.ptr
     for i in range(problem.n_blocks):
         for j in range(i):
             if color[i] == color[j]:
@@ -47,7 +53,7 @@ def test_more_than_63_colors_are_found():
     """100 contacts of one body with 100 others: every one needs its own colour."""
     n = 100
     rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))
-    assert sorted(colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
+    assert sorted(compute_colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
 
 
 def test_levels_count_from_the_ground():
@@ -56,14 +62,16 @@ def test_levels_count_from_the_ground():
     shuffled = np.random.default_rng(3).permutation(n)
     rows = touching(body[shuffled])
     problem = lv.Problem.from_rows(rows)
-    np.testing.assert_array_equal(levels(problem), shuffled)
-    np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
-    np.testing.assert_array_equal(shuffled[block_order(problem, "top_down").blocks], np.arange(n)[::-1])
+    np.testing.assert_array_equal(compute_levels(problem), shuffled)
+    np.testing.assert_array_equal(shuffled[compute_block_order(problem, "bottom_up").blocks], np.arange(n))
+    np.testing.assert_array_equal(
+        shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1]
+    )
     matrix = as_matrix(problem)
     ground = np.flatnonzero(shuffled == 0)
-    np.testing.assert_array_equal(levels(matrix, ground), shuffled)
+    np.testing.assert_array_equal(compute_levels(matrix, ground), shuffled)
     with pytest.raises(lv.CapabilityError, match="ground"):
-        block_order(matrix, "bottom_up")
+        compute_block_order(matrix, "bottom_up")
 
 
 def test_symmetric_is_forwards_then_backwards():
@@ -80,7 +88,7 @@ def test_ranks_are_a_permutation_that_brings_neighbours_near():
     chain = rng.permutation(n)
     body = np.stack([chain[:-1], chain[1:]], axis=1)
     rows = touching(body, inv_inertia=np.zeros((n, 3, 3)))
-    rank = body_ranks(lv.Problem.from_rows(rows))
+    rank = rank_bodies(lv.Problem.from_rows(rows))
     assert np.array_equal(np.sort(rank), np.arange(n))
     assert np.abs(np.diff(rank[body], axis=1)).max() == 1
 
@@ -102,4 +110,4 @@ def test_what_makes_no_order_is_refused_with_its_reason(name):
     options, error, sign = INVALID_PROBLEM[name]
     problem = lv.Problem.lcp(np.eye(3), np.ones(3))
     with pytest.raises(error, match=sign):
-        block_order(problem, **options)
+        compute_block_order(problem, **options)

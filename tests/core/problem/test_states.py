@@ -14,7 +14,7 @@ from random_problems import conditioned, side_by_side
 
 import lavender as lv
 from lavender.judge import error_bound
-from lavender.judge.states import states_of
+from lavender.judge.states import compute_states
 
 
 def scaled(rng, n, condition):
@@ -106,7 +106,7 @@ def test_the_bound_holds_for_every_kind_law_and_form_at_any_distance(kind):
             rng = np.random.default_rng(seed)
             for i, size in enumerate(sizes):
                 off = size * (exact.impulse + 0.1) * rng.standard_normal(problem.m)
-                states = states_of(problem, exact.impulse + off)
+                states = compute_states(problem, exact.impulse + off)
                 known[i] += compare(problem, exact, exact.impulse + off, states)
                 finite[i] += len(states) - len(states.unknown)
                 blocks[i] += len(states)
@@ -160,8 +160,8 @@ def planted(seed):
         kinds += [{"tangents": 4}] if law == "cone" else []
         cones = lv.Cones.contacts(rng.uniform(0.1, 1.2, k), **kinds[rng.integers(len(kinds))])
     m = cones.n_rows
-    lam, w, at_boundary, reach = np.zeros(m), np.zeros(m), set(), cones.reach
-    components = [(i, rows) for i, rows in cones.parts() if reach[rows[0]] > 0.0]
+    lam, w, at_boundary, reach = np.zeros(m), np.zeros(m), set(), cones.friction_coefficient
+    components = [(i, rows) for i, rows in cones.friction_components() if reach[rows[0]] > 0.0]
     for i in range(cones.n_blocks):
         j, is_planted = cones.ptr[i], bool(rng.random() < 0.3)
         own = [rows for block, rows in components if block == i]
@@ -246,8 +246,8 @@ def test_an_island_has_the_bound_that_it_has_alone():
     singular = lv.Problem.contact(np.ones((6, 6)), np.ones(6), mu=[0.5, 0.3], friction="cone")
     together = side_by_side([*parts, singular])
     impulses = [lv.solve(p, tol=1e-6).impulse for p in (*parts, singular)]
-    states = states_of(together, np.concatenate(impulses))
-    alone = [states_of(p, x).tolerance for p, x in zip((*parts, singular), impulses, strict=True)]
+    states = compute_states(together, np.concatenate(impulses))
+    alone = [compute_states(p, x).tolerance for p, x in zip((*parts, singular), impulses, strict=True)]
     assert np.array_equal(states.tolerance, np.concatenate(alone))
     assert states.unknown == (6, 7)
 
@@ -257,12 +257,12 @@ def test_large_islands_and_wild_answers_have_no_bound(monkeypatch):
     good = lv.solve(problem, tol=1e-12)
     assert not good.states.unknown
     for bad in (np.nan, np.inf, 1e200):
-        states = states_of(problem, np.full(5, bad))
+        states = compute_states(problem, np.full(5, bad))
         assert len(states.names) == 5 and not set(range(5)) - set(states.unknown) - set(states.boundary)
     for name, limit in (("MAX_ISLAND_ROWS", 4), ("MAX_MATRIX_ENTRIES", 24.0)):
         with monkeypatch.context() as patch:
             patch.setattr(error_bound, name, limit)
-            assert states_of(problem, good.impulse).unknown == (0, 1, 2, 3, 4)
+            assert compute_states(problem, good.impulse).unknown == (0, 1, 2, 3, 4)
     empty = lv.solve(lv.Problem.linear(np.zeros((0, 0)), [])).states
     assert len(empty) == 0 and empty.boundary == empty.unknown == () and empty.boundary_fraction == 0.0
 

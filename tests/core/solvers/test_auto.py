@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from random_problems import FORMS, as_matrix, random_contact_problem, seeds
 
 import lavender as lv
-from lavender.solvers.islands import islands, restrict, rows_of
+from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -17,17 +17,17 @@ def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
     problem = FORMS[form](
         random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6)
     )
-    count, label = islands(problem)
+    count, label = find_islands(problem)
     # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.
-    count_of_matrix, label_of_matrix = islands(as_matrix(problem))
+    count_of_matrix, label_of_matrix = find_islands(as_matrix(problem))
     assert count == count_of_matrix
     assert np.array_equal(label, label_of_matrix)
     assert np.array_equal(np.unique(label), np.arange(count))
     a, lam = problem.dense(), np.random.default_rng(seed).normal(size=problem.m)
     for i in range(count):
         blocks = np.flatnonzero(label == i)
-        rows = rows_of(problem, blocks)
-        part = restrict(problem, blocks, rows)
+        rows = get_rows_of_blocks(problem, blocks)
+        part = restrict_to_blocks(problem, blocks, rows)
         assert part.operator == problem.operator
         # Sums over one body in another order: a few roundings.
         np.testing.assert_allclose(part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max())
@@ -41,6 +41,8 @@ def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
 def test_an_island_may_ask_for_dust():
     """1e-300 m/s beside 1 m/s: no problem alone may ask for so little, beside which nothing is."""
     problem = lv.Problem(np.array([1.0, 1e-300]), lv.Cones.free(2), np.eye(2))
-    _, label = islands(problem)
-    parts = [restrict(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)]
+    _, label = find_islands(problem)
+    parts = [
+        restrict_to_blocks(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)
+    ]
     assert [part.b.tolist() for part in parts] == [[1.0], [0.0]]

@@ -17,7 +17,7 @@ from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.base.lazy_import import import_numerics
 from lavender.judge import residuals
-from lavender.judge.residuals import judging_time
+from lavender.judge.residuals import estimate_judging_time
 from lavender.problem.derived import once
 from lavender.problem.operators import Operators
 from lavender.solvers import factors
@@ -193,7 +193,7 @@ def slow_disks(clock, monkeypatch):
         return found
 
     def slow_metric(problem):
-        clock.now += residuals.setup_time(problem)
+        clock.now += residuals.estimate_judge_setup_time(problem)
         return make_metric(problem)
 
     monkeypatch.setattr(disk, "function", slow_disk)
@@ -406,6 +406,10 @@ def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatc
     problem = lv.Problem.from_jacobian(
         jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
     )
-    limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming_time(problem)
+    limit = (
+        residuals.estimate_judge_setup_time(problem)
+        + estimate_judging_time(problem)
+        + 0.5 * forming_time(problem)
+    )
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

@@ -9,9 +9,9 @@ from random_problems import good, seeds, without_solution
 
 import lavender as lv
 from benchmarks.core_problems import fresh
-from lavender.base.lu import sparse_lu
+from lavender.base.lu import factor_sparse_lu
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import judging_time
+from lavender.judge.residuals import estimate_judging_time
 from lavender.solvers import pivoting
 from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
@@ -235,8 +235,8 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
     """It writes outside its arrays there: a process that had 442 of these ended in a segmentation fault."""
     a = sp.csr_array(([1.0, 1.0, 1.0], ([0, 1, 2], [0, 0, 0])), (3, 3))
     with pytest.raises(RuntimeError, match="singular"):
-        sparse_lu(a)
-    assert sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [
+        factor_sparse_lu(a)
+    assert factor_sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [
         1.0,
         1.0,
     ]
@@ -279,7 +279,7 @@ def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeyp
             return code
 
     monkeypatch.setattr(pivoting, "Pivoting", Played)
-    limit = judging_time(fresh(problem)) + 5e-4 + share * each
+    limit = estimate_judging_time(fresh(problem)) + 5e-4 + share * each
     found = lv.solve(fresh(problem), "direct", time_limit=limit)
     assert clock.now <= limit
     assert found.residual.relative <= lv.residual(problem, problem.start()).relative

@@ -8,7 +8,7 @@ from random_problems import as_matrix, random_contact_problem, sweeps
 
 import lavender as lv
 from benchmarks.core_problems import lattice_pile
-from lavender.problem.ordering import block_order, body_ranks, colors
+from lavender.problem.ordering import compute_block_order, compute_colors, rank_bodies
 from lavender.solvers import layout, sweeping
 
 NAME = "sequential_impulses"
@@ -84,8 +84,8 @@ def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatc
     free = replace(matrix, cones=lv.Cones.free(matrix.m))
     for problem in (pile, jointed, matrix, free):
         if lv.get(name).refuses(problem) is None:
-            color = colors(problem)
-            is_contact = np.arange(problem.n_blocks) >= block_order(problem).split
+            color = compute_colors(problem)
+            is_contact = np.arange(problem.n_blocks) >= compute_block_order(problem).split
             orders = [np.lexsort((rng.random(len(color)), color, is_contact)) for _ in range(3)]
             for budget in ({"tol": 0.0, "max_iter": 3}, {"tol": 1e-6, "max_iter": 60}):
                 results = [lv.solve(problem, name, order=order, **budget) for order in ("colored", *orders)]
@@ -98,18 +98,18 @@ def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     body = pile.rows.contact_body
     moving = (body >= 0).all(axis=1)
-    rank = body_ranks(pile)
+    rank = rank_bodies(pile)
     assert sorted(rank.tolist()) == list(range(pile.rows.n_bodies))
     span = np.abs(np.diff(rank[body[moving]].astype(int))).mean()
     assert span < 0.5 * np.abs(np.diff(body[moving].astype(int))).mean()
-    blocks = block_order(pile, "local").blocks
+    blocks = compute_block_order(pile, "local").blocks
     low = np.where(body < 0, len(rank), rank[body]).min(axis=1)[blocks]
     assert (np.diff(low) >= 0).all()
 
 
 def test_local_takes_a_matrix_too(pile):
     matrix = lv.Problem.contact(pile.delassus(), pile.b, pile.cones.mu)
-    blocks = block_order(matrix, "local").blocks
+    blocks = compute_block_order(matrix, "local").blocks
     assert sorted(blocks.tolist()) == list(range(matrix.n_blocks))
     assert lv.solve(matrix, "pgs", order="local", tol=1e-6, max_iter=5000).success
 
@@ -123,7 +123,7 @@ def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
     prepared.solve(tol=0.0, max_iter=3)
     fresh = sweeps(other, NAME, 3, order=order)
     found = []
-    for module, name in ((sweeping, "block_order"), (layout, "body_ranks")):
+    for module, name in ((sweeping, "compute_block_order"), (layout, "rank_bodies")):
         true = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
     changed = prepared.solve(other, tol=0.0, max_iter=3)

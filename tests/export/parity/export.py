@@ -88,7 +88,7 @@ def solved(given, number):
     for solver, asked in {swept: [(0.0, 1, {}), (0.0, 7, order), (0.0, 40, {})], **SOLVED}.items():
         for tol, iterations, options in asked:
             try:
-                yield vectors.pack(given, solver, tol, iterations, options)[0]
+                yield vectors.make_test_vector(given, solver, tol, iterations, options)[0]
             except (NotSupported, lv.CapabilityError):
                 continue
 

@@ -79,7 +79,7 @@ def test_one_case_and_one_solver_need_no_list():
     one = bench.run("stack(n=3)", "pgs", plan)
     assert {(r.case, r.solver) for r in one} == {("stack(n=3)", "pgs")}
     case = lv.suite.case("stack(n=3)")
-    assert [item.name for item in bench.resolve(case)] == ["stack(n=3)"]
+    assert [item.name for item in bench.resolve_sources(case)] == ["stack(n=3)"]
     with pytest.raises(lv.InputError, match=r"give its \.problem"):
         lv.solve(case)
     with pytest.raises(lv.InputError, match="source is a list; Records"):
@@ -111,7 +111,7 @@ def test_an_answer_is_no_start(tmp_path, early):
     call_specs = [bench.CallSpec("pgs", "tol", 1e-6), bench.CallSpec("pgs", "tol", 1e-6, timing_mode="batch")]
     made = bench.time_alternately([path], call_specs, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
-    steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
+    steps = bench.make_sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
     records = bench.run(steps, ["pgs"], QUICK)
     made = bench.time_alternately(
         steps, [bench.CallSpec("pgs", "tol", 1e-6, timing_mode="steps")], records, QUICK
@@ -187,7 +187,9 @@ def test_a_method_of_free_rows_is_measured_as_its_method_with_bounds_and_a_note_
     assert [r.key for r in both] == [r.key for r in bench.run([stack(4)], ["pgs"], QUICK)]
     assert "→" not in both.skips[0].reason
     steps = bench.run(
-        bench.sequence(moving_stack(2), "load"), ["gauss_seidel"], bench.Plan((), budgets=(4,), repeats=1)
+        bench.make_sequence(moving_stack(2), "load"),
+        ["gauss_seidel"],
+        bench.Plan((), budgets=(4,), repeats=1),
     )
     assert {r.solver for r in steps} == {"pgs"} and steps.skips[0].solver == "gauss_seidel"
 
@@ -203,10 +205,10 @@ def test_each_record_is_on_disk_when_it_is_made(tmp_path):
 
     records = bench.run([stack(6)], ["pgs", "direct"], QUICK, path, watch=watch)
     assert seen == [True] * len(records)
-    assert bench.read(path).records == records.records
+    assert bench.read_records(path).records == records.records
     # Of an editor that marks UTF-8; put together, the mark stands before each part.
     path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
-    assert bench.read(path).records == records.records
+    assert bench.read_records(path).records == records.records
 
 
 CAMPAIGN = (
@@ -217,7 +219,7 @@ CAMPAIGN = (
 COMMANDS = {
     "problems": (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1),
     "a sequence": (
-        (bench.sequence(moving_stack(5), "load"), ["pgs"], bench.Plan((), budgets=(6,), repeats=1)), 1, 1
+        (bench.make_sequence(moving_stack(5), "load"), ["pgs"], bench.Plan((), budgets=(6,), repeats=1)), 1, 1
     ),
     "a campaign": (CAMPAIGN, 1, 1),
     "a campaign of two workers": (CAMPAIGN, 2, 2),
@@ -240,14 +242,14 @@ def test_the_same_command_goes_on_where_it_was_killed(given, workers, later, tmp
     whole, most = command(workers)
     content = path.read_bytes()
     path.write_bytes(content[: content.rindex(b'"kind": "record"')])
-    kept = len(bench.read(path))
+    kept = len(bench.read_records(path))
     again, made = command(later)
     assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
     assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
-    assert 0 < kept < len(whole) == len(bench.read(path)) and 0 < made < most
+    assert 0 < kept < len(whole) == len(bench.read_records(path)) and 0 < made < most
     # And nothing is left to do the third time.
     again, made = command(later)
-    assert len(again) == len(whole) == len(bench.read(path)) and made == 0
+    assert len(again) == len(whole) == len(bench.read_records(path)) and made == 0
     for line in path.read_bytes().splitlines():
         json.loads(line)
 
@@ -256,12 +258,12 @@ def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     path = tmp_path / "records.jsonl"
     first = bench.run([stack(5)], ["direct"], QUICK, path)
     ids = {r.run for r in first}
-    for name, value in (("__version__", "99"), ("cpu_name", lambda: "another")):
+    for name, value in (("__version__", "99"), ("get_cpu_name", lambda: "another")):
         monkeypatch.setattr(machine, name, value)
         ids |= {r.run for r in bench.run([stack(5)], ["direct"], QUICK, path)}
     assert len(ids) == 3
-    assert len(bench.read(path)) == 3 * len(first)
-    assert len(bench.read(path).latest()) == len(first)
+    assert len(bench.read_records(path)) == 3 * len(first)
+    assert len(bench.read_records(path).select_latest_run()) == len(first)
 
 
 def shown(records, folder):
@@ -280,14 +282,14 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     path, into = tmp_path / "records.jsonl", []
     with pytest.raises(KeyboardInterrupt):
         bench.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
-    kept = bench.read(path).records
+    kept = bench.read_records(path).records
     assert {r.solver for r in kept} == {"pgs"}
     assert into[0].records == kept
-    for records in (into[0], bench.read(path)):
-        assert Report(records).stopped and Report(records).stopped in shown(records, tmp_path)
+    for records in (into[0], bench.read_records(path)):
+        assert Report(records).stopped_warning and Report(records).stopped_warning in shown(records, tmp_path)
     whole = bench.run([stack(5)], ["pgs", "direct"], QUICK, path)
-    for records in (whole, bench.read(path)):
-        assert not Report(records).stopped and "Stopped" not in shown(records, tmp_path)
+    for records in (whole, bench.read_records(path)):
+        assert not Report(records).stopped_warning and "Stopped" not in shown(records, tmp_path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
@@ -323,7 +325,7 @@ def test_json_and_csv_hold_every_number(tmp_path):
         assert float(row["time_min"]) == r.time_min
         assert json.loads(row["work"]) == dict(r.work)
         assert tuple(json.loads(row["times"])) == r.times
-        assert row["cpu"] == bench.cpu_name()
+        assert row["cpu"] == bench.get_cpu_name()
         assert json.loads(row["versions"])["numpy"] == np.__version__
 
 
@@ -427,9 +429,9 @@ def test_unknown_and_missing_names_are_refused_before_loading(tmp_path):
     with pytest.raises(lv.UnknownName, match="pgs"):
         bench.run([stack(3)], ["pgz"])
     with pytest.raises(lv.InputError, match="no such file"):
-        bench.resolve([tmp_path / "nothing.npz"])
+        bench.resolve_sources([tmp_path / "nothing.npz"])
     with pytest.raises(lv.InputError, match="holds no problem file"):
-        bench.resolve([tmp_path])
+        bench.resolve_sources([tmp_path])
 
 
 @pytest.mark.parametrize(
@@ -483,7 +485,7 @@ def each_coupled_to_a_few():
     ],
 )
 def test_structure_is_recognised(problem, words):
-    assert bench.structure_of(problem) == words
+    assert bench.classify_structure(problem) == words
 
 
 def test_a_fingerprint_sees_every_number():
@@ -506,9 +508,9 @@ def test_a_fingerprint_sees_every_number():
         variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
     variants.append(dataclasses.replace(variants[-1], precision="float32"))
     variants += [dataclasses.replace(p, key=np.arange(5, dtype=np.uint64) + k) for k in (0, 1)]
-    prints = [bench_cases.fingerprint(v) for v in variants]
+    prints = [bench_cases.hash_problem(v) for v in variants]
     assert len(set(prints)) == len(variants)
-    assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]
+    assert bench_cases.hash_problem(stack(5, "renamed")) == prints[0]
 
 
 # -- what is timed --------------------------------------------------------------------------------
@@ -565,7 +567,7 @@ def test_what_is_timed_is_the_line_that_is_printed(timed):
     timed.clear()
     steps = moving_stack(2)
     records = bench.run(
-        bench.sequence(steps, "load"), ["pgs"], dataclasses.replace(plan, budgets=(), repeats=1)
+        bench.make_sequence(steps, "load"), ["pgs"], dataclasses.replace(plan, budgets=(), repeats=1)
     )
     assert ["impulse" in asked for _, asked, _ in timed] == [r.start == "carried" for r in records]
     for r, (solver, asked, guess) in zip(records, timed, strict=True):
@@ -615,7 +617,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         assert r.time_min == min(r.times)
         assert r.success == (r.mode == "tol")
         assert len(r.residual_per_repeat) == (r.repeats if r.mode == "time" else 0)
-    assert bench.read(path).records == known.records
+    assert bench.read_records(path).records == known.records
     again = bench.time_alternately(problems, call_specs, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records
 
@@ -623,9 +625,9 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
 def test_scipys_own_blas_has_one_thread_while_something_is_timed_though_it_is_loaded_late():
     said = python(
         "-c",
-        "from lavender.lab.bench.running.timing import one_thread\n"
+        "from lavender.lab.bench.running.timing import limit_to_one_thread\n"
         "from threadpoolctl import threadpool_info\n"
-        "with one_thread():\n"
+        "with limit_to_one_thread():\n"
         "    import scipy.linalg.lapack\n"
         "    print({pool['num_threads'] for pool in threadpool_info()})",
     ).stdout

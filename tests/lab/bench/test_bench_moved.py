@@ -9,7 +9,7 @@ from lavender import bench, suite
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.running.runner import add_motion_error
-from lavender.lab.collection import difficulty
+from lavender.lab.collection import count_sweeps_to_thousandth
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclose_reference
 from lavender.lab.report import write
@@ -86,7 +86,7 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
 def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration(tmp_path):
     plan = bench.Plan(tolerances=(1e-3, 1e-6), **SHORT)
     records = bench.run(["stack(n=8)", "threshold"], ["pgs", "newton", "lemke", "direct"], plan)
-    stack, border = statistics.difficulties(records)
+    stack, border = statistics.compute_difficulties(records)
     assert (
         stack.sweeps > 10 and stack.condition > 10.0 and stack.boundary_fraction == 0.0 and stack.same == ()
     )
@@ -95,7 +95,7 @@ def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_itera
         replace(r, iterations=0, solution_hash="x") if r.solver in ("lemke", "direct") else r for r in records
     ]
     shared = replace(records, records=told)
-    assert statistics.difficulties(shared)[0].same == ("direct", "lemke")
+    assert statistics.compute_difficulties(shared)[0].same == ("direct", "lemke")
     page = write(shared, tmp_path, figures=False).read_text(encoding="utf-8")
     assert "direct, lemke" in page and "exact solution" not in page
 
@@ -105,7 +105,7 @@ def test_a_guess_makes_no_case_easier():
     near = replace(problem, guess=lv.solve(problem, tol=1e-9).impulse * (1.0 + 1e-4), copy=False)
     plan = bench.Plan(tolerances=(1e-3,), **SHORT)
     cold, warm = (
-        statistics.difficulties(bench.run([p], ["pgs", "jacobi"], plan))[0] for p in (problem, near)
+        statistics.compute_difficulties(bench.run([p], ["pgs", "jacobi"], plan))[0] for p in (problem, near)
     )
     assert warm.sweeps == cold.sweeps > 10 and warm.same == ()
-    assert difficulty(near) == difficulty(problem)
+    assert count_sweeps_to_thousandth(near) == count_sweeps_to_thousandth(problem)

@@ -14,7 +14,7 @@ from lavender.lab.report import table_specs
 def test_a_sequence_carries_each_solvers_own_impulses():
     problems = moving_stack(5)
     plan = bench.Plan(tolerances=(1e-6,), budgets=(6,), repeats=1)
-    records = bench.run(bench.sequence(problems, "load"), ["pgs"], plan)
+    records = bench.run(bench.make_sequence(problems, "load"), ["pgs"], plan)
     impulse = problems[0].start()
     by = {(r.start, r.mode, r.step): r for r in records}
     for i, p in enumerate(problems):
@@ -29,7 +29,7 @@ def test_a_sequence_carries_each_solvers_own_impulses():
 
 
 def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
-    items = bench.sequence(moving_stack(5), "load")
+    items = bench.make_sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.
     plan = bench.Plan(tolerances=(), budgets=(6,), repeats=1, sequence_time_limit=1e-12)
     path = tmp_path / "records.jsonl"
@@ -38,10 +38,10 @@ def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
     assert all("after 1 of 5 steps" in s.reason for s in records.skips)
     (row,) = table_specs.tabulate_passes(
-        statistics.passes(records)
-    ).texts  # beside solvers that took all five
+        statistics.group_runs_by_pass(records)
+    ).cell_texts  # beside solvers that took all five
     assert [cell.endswith(" (1/5)") for cell in row].count(True) == 2
-    monkeypatch.setattr(runner, "measure", None)  # nothing is solved again
+    monkeypatch.setattr(runner, "measure_task", None)  # nothing is solved again
     assert bench.run(items, ["pgs"], plan, path).records == records.records
     (line,) = lv.report.recommend_solvers(records, [1.0])
     assert line.by_time[1.0].best is None  # one of five
@@ -60,14 +60,14 @@ def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
         for i in (1, 2):
             io.save(p, tmp_path / folder / f"scene-{i:06d}.npz")
     io.save(p, tmp_path / "mixed" / "other.npz")
-    items = bench.resolve([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
+    items = bench.resolve_sources([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
     assert [(i.sequence, i.step) for i in items] == [
         ("steps", 0), ("steps", 1), ("b/steps", 0), ("b/steps", 1), ("", -1), ("", -1), ("", -1),
     ]  # fmt: skip
     assert len({i.name for i in items}) == len(items)
-    assert all(i.sequence == "" for i in bench.resolve([tmp_path / "a" / "steps"], sequences=False))
+    assert all(i.sequence == "" for i in bench.resolve_sources([tmp_path / "a" / "steps"], sequences=False))
     # Figures and parts of the page are named after sequences: one name of a file for each.
-    alike = bench.resolve([tmp_path / "a" / name for name in ("my steps", "My_steps")])
+    alike = bench.resolve_sources([tmp_path / "a" / name for name in ("my steps", "My_steps")])
     assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}
 
 
@@ -79,11 +79,17 @@ def test_folders_in_a_folder_are_taken_too(tmp_path):
         io.save(stack(4), tmp_path / place)
     (tmp_path / "notes").mkdir()
     (tmp_path / "piles" / "back").symlink_to(tmp_path)  # is not read again
-    assert [i.name for i in bench.resolve([tmp_path, "stack(n=2)"])] == ["a", "stack(n=2)", "d", "b", "c"]
+    assert [i.name for i in bench.resolve_sources([tmp_path, "stack(n=2)"])] == [
+        "a",
+        "stack(n=2)",
+        "d",
+        "b",
+        "c",
+    ]
     (tmp_path / "a.npz").unlink()
-    assert [i.name for i in bench.resolve([tmp_path])] == ["d", "b", "c"]
+    assert [i.name for i in bench.resolve_sources([tmp_path])] == ["d", "b", "c"]
     with pytest.raises(lv.InputError, match="holds no problem file"):
-        bench.resolve([tmp_path / "deep" / "er" / "..", tmp_path / "notes"])
+        bench.resolve_sources([tmp_path / "deep" / "er" / "..", tmp_path / "notes"])
 
 
 def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
@@ -91,27 +97,29 @@ def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
 
     for i in (10, 9, 1):
         io.save(stack(4), tmp_path / f"step_{i}.npz")
-    assert [item.source[-len("step_10.npz") :].lstrip("/") for item in bench.steps_in(tmp_path)] == [
+    assert [
+        item.source[-len("step_10.npz") :].lstrip("/") for item in bench.list_steps_in_folder(tmp_path)
+    ] == [
         "step_1.npz",
         "step_9.npz",
         "step_10.npz",
     ]
     # Files that name no blocks may be anything: steps only where that is said.
-    assert [(i.name, i.sequence) for i in bench.resolve([tmp_path])] == [
+    assert [(i.name, i.sequence) for i in bench.resolve_sources([tmp_path])] == [
         ("step_1", ""), ("step_9", ""), ("step_10", ""),
     ]  # fmt: skip
-    assert [i.step for i in bench.resolve([tmp_path], sequences=True)] == [0, 1, 2]
+    assert [i.step for i in bench.resolve_sources([tmp_path], sequences=True)] == [0, 1, 2]
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(lv.InputError, match="needs two"):
-        bench.steps_in(empty)
+        bench.list_steps_in_folder(empty)
 
 
 def test_steps_of_two_sequences_are_never_one(tmp_path):
     path, plan = tmp_path / "records.jsonl", bench.Plan(tolerances=(), budgets=(6,), repeats=1)
-    bench.run(bench.sequence(moving_stack(5), "load"), ["pgs"], plan, path)
-    bench.run(bench.sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
-    (one,) = bench.statistics.passes(bench.read(path).latest())
+    bench.run(bench.make_sequence(moving_stack(5), "load"), ["pgs"], plan, path)
+    bench.run(bench.make_sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
+    (one,) = bench.statistics.group_runs_by_pass(bench.read_records(path).select_latest_run())
     assert (one.steps, len(one.times["cold"])) == (2, 2)
 
 
@@ -120,12 +128,12 @@ def test_a_folder_with_two_recordings_is_refused(tmp_path, names):
     for name in names:
         lv.io.save(stack(4), tmp_path / f"{name}.npz")
     with pytest.raises(lv.InputError, match="more than one recording"):
-        bench.steps_in(tmp_path)
+        bench.list_steps_in_folder(tmp_path)
 
 
 def test_a_level_of_a_sequence_is_solved_to_that_level():
     plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
-    records = bench.run(bench.sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
+    records = bench.run(bench.make_sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
     assert {r.tol for r in records if r.solver == "pgs"} == set(plan.tolerances)
     (line,) = lv.report.recommend_solvers(records)
     for advice in line.by_tolerance.values():

@@ -69,10 +69,10 @@ def test_an_exception_stops_the_workers_without_warnings_and_the_report_says_so(
     with pytest.raises(OSError, match="no room"):
         bench.run(NAMES, ["pgs", "direct"], PLAN, path, workers=2, watch=stop, into=stored)
     assert not recwarn.list
-    assert Report(bench.read(path)).stopped and Report(stored[0]).stopped
-    assert lines(stored[0]) == lines(bench.read(path))
+    assert Report(bench.read_records(path)).stopped_warning and Report(stored[0]).stopped_warning
+    assert lines(stored[0]) == lines(bench.read_records(path))
     bench.run(NAMES, ["pgs", "direct"], PLAN, path)
-    assert not Report(bench.read(path)).stopped
+    assert not Report(bench.read_records(path)).stopped_warning
 
 
 def test_a_file_that_has_changed_and_a_plan_that_asks_for_more_are_run_again(tmp_path):
@@ -104,7 +104,7 @@ def test_problems_files_and_solvers_of_this_process_are_sent_to_workers(tmp_path
     p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
     lv.io.save(p, tmp_path / "file.npz")
     (tmp_path / "bad.npz").write_bytes(b"broken")
-    steps = bench.sequence([p, p], "steps")
+    steps = bench.make_sequence([p, p], "steps")
     found = bench.run([p, tmp_path / "file.npz", tmp_path / "bad.npz", *steps], ["direct"], SHORT, workers=2)
     assert [(r.case, r.success) for r in found] == [
         (n, True) for n in ("mine", "file", "steps[0]", "steps[1]")
@@ -150,7 +150,7 @@ def test_ray_gives_the_same_bits():
 
 def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
     records = bench.run(NAMES, ["pgs", "direct"], PLAN)
-    rows = {(r.family, r.solver): r for r in statistics.robustness(records)}
+    rows = {(r.family, r.solver): r for r in statistics.compute_robustness(records)}
     dense = rows["dense", "direct"]
     assert (dense.cases, dense.reached[1e-6], dense.wrong, dense.died) == (4, 4, 0, 0)
     budget = [
@@ -221,7 +221,7 @@ def test_after_a_cluster_that_goes_midway_the_next_run_goes_on(tmp_path, monkeyp
     finally:
         cluster.kill()
         cluster.communicate()
-    assert 0 < len(bench.read(path).cases) < len(names)
+    assert 0 < len(bench.read_records(path).cases) < len(names)
     assert lines(bench.run(names, ["pgs"], plan, path)) == lines(bench.run(names, ["pgs"], plan))
 
 

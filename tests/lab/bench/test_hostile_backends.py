@@ -125,7 +125,7 @@ def watchdog():
 
 def task(problem, solver, time_limit=100.0, **more):
     # Minutes, for machines that are busy with something else; what hangs asks for less.
-    sha = bench_cases.fingerprint(problem)
+    sha = bench_cases.hash_problem(problem)
     return bench.Task("run", "case", sha, solver, "tol", 1e-6, 0, time_limit, **more)
 
 
@@ -159,13 +159,13 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
     monkeypatch.setattr(bench_worker, "GRACE_TIME", 0.5)
     p = stack()
     with Worker() as worker:
-        worker.measure(p, task(p, "pgs"))  # starts the process
+        worker.measure_task(p, task(p, "pgs"))  # starts the process
         start_time = time.monotonic()
-        assert worker.measure(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
+        assert worker.measure_task(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
         assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE_TIME)
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
-        assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
+        assert worker.measure_task(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
     if how == "escape":
         os.kill(pids[0], signal.SIGKILL)
 
@@ -184,9 +184,9 @@ Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
     p = stack()
     with Worker() as worker:
-        record, _ = worker.measure(p, task(p, "x_quit"))
+        record, _ = worker.measure_task(p, task(p, "x_quit"))
         assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
-        record, _ = worker.measure(p, task(p, "direct", options={"nonsense": 1}))
+        record, _ = worker.measure_task(p, task(p, "direct", options={"nonsense": 1}))
     assert record.status == "ERROR" and record.message.startswith("UnknownName: unknown option 'nonsense'")
 
 
@@ -285,11 +285,11 @@ def test_a_command_survives_what_ends_its_process(hostile, tmp_path, capsys):
 def test_memory_is_limited_without_asking(hostile, watchdog):
     p = stack()
     with Worker() as worker:  # 320 GB, untouched: nothing but a limit refuses it
-        record, _ = worker.measure(p, task(p, "x_eat"))
+        record, _ = worker.measure_task(p, task(p, "x_eat"))
     assert record.status in ("ERROR", "NUMERICAL_ERROR")
     assert "MemoryError" in record.message
-    assert worker.memory == machine.memory_share() == max(2**31, machine.memory() // 2)
-    assert machine.memory_share(10**9) == 2**31
+    assert worker.memory == machine.get_memory_share() == max(2**31, machine.get_total_memory() // 2)
+    assert machine.get_memory_share(10**9) == 2**31
 
 
 @POSIX
@@ -298,9 +298,9 @@ def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchd
     monkeypatch.setattr(bench_worker, "GRACE_TIME", 1.0)
     p = stack()
     with Worker() as worker:
-        record, _ = worker.measure(p, task(p, f"x_{how}"))
+        record, _ = worker.measure_task(p, task(p, f"x_{how}"))
         assert record.status in ("CRASHED (no answer)", "KILLED")
-        assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"
+        assert worker.measure_task(p, task(p, "pgs"))[0].status == "CONVERGED"
     assert not hostile.exists()
 
 
@@ -308,13 +308,13 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
     p = stack()
     start = np.linspace(0.0, 1.0, p.m)
     with Worker() as worker:
-        record, _ = worker.measure(p, task(p, "x_lie"))
+        record, _ = worker.measure_task(p, task(p, "x_lie"))
         assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
         assert "says CONVERGED" in record.status_conflict
         for solver, more in (("pgs", {}), ("direct", {}), ("pgs", {"start": "carried"})):
             asked = task(p, solver, **more)
-            far, there = worker.measure(p, asked, start)
-            near, here = timing.measure(p, asked, start)
+            far, there = worker.measure_task(p, asked, start)
+            near, here = timing.measure_task(p, asked, start)
             np.testing.assert_array_equal(here, there)
             times = {
                 n: 0.0
@@ -330,7 +330,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
     lead = 100.0  # s
     with Worker() as worker:
         asked = task(p, "pgs", start="carried", timing_mode="call", repeats=2, lead=lead)
-        record, impulse = worker.measure(p, asked, np.zeros(p.m))
+        record, impulse = worker.measure_task(p, asked, np.zeros(p.m))
         assert record.status == "CONVERGED" and impulse is not None
         assert len(record.times) == 1 and lead <= record.times[0] < lead + 60.0
 

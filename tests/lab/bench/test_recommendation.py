@@ -70,10 +70,10 @@ def close_race():
 def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
     first = close_race()
     by = {a.target: a for a in by_tolerance(first)}
-    assert {by[1e-6].best.solver, *by[1e-6].ties} == {"edge"}
+    assert {by[1e-6].best.solver, *by[1e-6].tied_solvers} == {"edge"}
     others = records_of(*(r for r in first if r.solver != "edge"))
     tolerance = recommendation.rank_to_tolerance(others, "all", CASES[:4], 1e-6)
-    assert (tolerance.best.solver, tolerance.ties) == ("auto", ("beta", "zeta"))
+    assert (tolerance.best.solver, tolerance.tied_solvers) == ("auto", ("beta", "zeta"))
     times = (1e-3, 2e-3, 5e-3)
     for seed in range(40):
         again = jittered(first, seed)
@@ -85,7 +85,7 @@ def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
         for old, new in pairs:
             assert (new.family, new.target) == (old.family, old.target)
             if old.best is not None and new.best is not None:
-                assert old.best.solver in {new.best.solver, *new.ties}
+                assert old.best.solver in {new.best.solver, *new.tied_solvers}
 
 
 def test_another_solver_changes_nobodys_score():
@@ -115,7 +115,7 @@ def test_time_budgets_are_those_given_and_the_sweeps_are_named():
         record("a", "direct", 4.0, 1e-12, work={"factorisations": 1}),
     )
     (line,) = report.recommend_solvers(found, [0.5, 5.0])
-    assert (line.name, line.size, line.sequence) == ("stack", 1, False)
+    assert (line.name, line.n_cases, line.sequence) == ("stack", 1, False)
     best = {x: (a.best.solver, a.best.how) for x, a in line.by_tolerance.items()}
     assert best == {1e-3: ("pgs", "8 sweeps"), 1e-6: ("pgs", "90 sweeps")}
     assert {t: a.best.solver for t, a in line.by_time.items()} == {0.5: "pgs", 5.0: "direct"}
@@ -127,10 +127,10 @@ def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_na
     for i in range(3):  # the pass ended after two of three steps
         found.add(info(f"stack[{i}]", sequence="stack", step=i))
     lines = report.recommend_solvers(found, [1.0])
-    assert [(x.name, x.size, x.sequence) for x in lines] == [("stack", 1, False), ("stack", 3, True)]
+    assert [(x.name, x.n_cases, x.sequence) for x in lines] == [("stack", 1, False), ("stack", 3, True)]
     for line, solved in zip(lines, (1, 2), strict=True):
         for best in (line.by_tolerance[1e-6].best, line.by_time[1.0].ranking[0]):
-            assert (best.solved, best.cases) == (solved, line.size)
+            assert (best.solved, best.cases) == (solved, line.n_cases)
     # charged the time limit of 2 s, as a case is
     score = lines[1].by_tolerance[1e-6].best.score
     assert score == pytest.approx((1e-3**2 * 2.0) ** (1 / 3), rel=0.05)
@@ -139,17 +139,17 @@ def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_na
 def test_sequences_are_compared_carried_against_cold():
     problems = [lv.Problem.lcp(chain(6).matrix, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
     plan = bench.Plan(tolerances=(1e-6,), budgets=(5,), repeats=1)
-    records = bench.run(bench.sequence(problems, "load"), ["pgs", "direct"], plan)
-    budget, tolerance, exact = statistics.passes(records)
+    records = bench.run(bench.make_sequence(problems, "load"), ["pgs", "direct"], plan)
+    budget, tolerance, exact = statistics.group_runs_by_pass(records)
     assert (budget.solver, budget.max_iter, budget.steps) == ("pgs", 5, 4)
     cold = [r for r in records if r.solver == "pgs" and r.mode == "budget" and r.start == "cold"]
-    assert budget.time["cold"] == sum(r.time_min for r in cold)
+    assert budget.total_times["cold"] == sum(r.time_min for r in cold)
     assert budget.residuals["cold"] == tuple(r.relative for r in cold)
-    assert budget.gain > 1.0
+    assert budget.carried_gain > 1.0
     assert tolerance.iterations["carried"] < tolerance.iterations["cold"]
     assert set(exact.residuals) == {"cold"}
     (line,) = report.recommend_solvers(records, [1e-9, 10.0])
-    assert (line.name, line.size, line.sequence) == ("load", 4, True)
+    assert (line.name, line.n_cases, line.sequence) == ("load", 4, True)
     # Only an exact solver, or a run to the tolerance, brings all four steps there; nothing is done in a nanosecond.
     best = line.by_tolerance[1e-6].best
     assert (best.solved, best.cases, best.how in ("to 1e-6, cold", "to 1e-6, carried")) == (4, 4, True)
@@ -166,7 +166,7 @@ def test_sequences_are_compared_carried_against_cold():
     curves = [(c.label, c.y) for c in at_budget.curves]
     assert curves == [("pgs", budget.residuals["carried"]), ("pgs (cold)", budget.residuals["cold"])]
     assert [c.y for c in to_tolerance.curves if c.solver == "direct"] == [exact.times["cold"]]
-    assert report.reaches(records) == []  # steps are no cases of their own
+    assert report.compute_reaches(records) == []  # steps are no cases of their own
 
 
 def test_misses_in_a_time_count():
@@ -185,7 +185,7 @@ def test_misses_in_a_time_count():
     rest = records_of(
         *(r for r in made if r.solver != "wide")
     )  # 7 of 10 are not nine of ten, in whatever time
-    assert build_verdict(rest, [1e-3]).text.endswith("residual on nine cases of ten in 1.00 ms.")
+    assert build_verdict(rest, [1e-3]).joined_text.endswith("residual on nine cases of ten in 1.00 ms.")
 
 
 # -- lines that were timed alternately ---------------------------------------------------------------------------
@@ -213,13 +213,13 @@ def race(records, tolerance=1e-6):
 
 def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
     found = race(interleaved({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
-    assert (found.named, found.shares[0], found.loss) == (("fast",), 1.0, 1.0)
+    assert (found.named_calls, found.shares[0], found.loss) == (("fast",), 1.0, 1.0)
 
 
 def test_cases_that_disagree_make_it_unsure_and_both_are_named():
     speeds = {"even": 1.0, "odd": lambda i: (0.5, 2.0)[i % 2]}
     found = race(interleaved(speeds, 0))
-    assert set(found.named) == {"even", "odd"}
+    assert set(found.named_calls) == {"even", "odd"}
     assert found.shares[0] < 0.9
     assert found.loss > 1.05
     text = build_verdict(interleaved(speeds, 0)).statements[1].text
@@ -240,8 +240,8 @@ def test_three_reports_of_a_near_tie_name_the_same_set(speeds, noise):
             race(interleaved(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
             for seed in range(first, first + 3)
         ]
-        assert all(fastest in f.named for f in found)
-        agreed.append(len({frozenset(f.named) for f in found}) == 1)
+        assert all(fastest in f.named_calls for f in found)
+        agreed.append(len({frozenset(f.named_calls) for f in found}) == 1)
     assert sum(agreed) >= 5  # of 6: two standard errors are no certainty
 
 

@@ -9,7 +9,7 @@ mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-c
 
 
 def test_both_sides_solve_every_step_to_the_same_residual(boxes):
-    steps = simulators.measure(mj, boxes(), 3, 10)
+    steps = simulators.measure_model(mj, boxes(), 3, 10)
     assert len(steps) == 3
     for s in steps:
         assert s.model == "boxes"
@@ -26,7 +26,9 @@ def test_ratios_are_geometric_means_by_the_number_of_rows():
             coulomb=None,
         )  # fmt: skip
 
-    text = tables.table([step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)])
+    text = tables.format_time_ratio_table(
+        [step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)]
+    )
     assert "| under 10 | 1 | 2 | 1.0 | 4.00 | 2.00 |" in text
     assert "| 300 and more | 1 | 1 | 1000.0 | 0.50 | 0.25 |" in text
     assert "1 are not solved to" in text

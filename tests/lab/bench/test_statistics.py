@@ -21,7 +21,7 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
         record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
         record("a", "y", 3.0, 0.5, tol=1e-3, **FALSE_CLAIM),
     )
-    x, y = report.reaches(found)
+    x, y = report.compute_reaches(found)
     assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
     assert (x.best, x.status) == (1e-8, "CONVERGED")
     assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
@@ -39,9 +39,9 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
 def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, conflict, mark, wrong):
     claim = {"status": "INFEASIBLE", "claim_check": check, "status_conflict": conflict}
     found = records_of(record("a", "x", 1.0, 0.5, **claim))
-    assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
-    assert [c.wrong for c in report.claims(found)] == [wrong]
-    table = table_specs.tabulate_reaches(report.reaches(found), TOLERANCES)
+    assert len(report.list_failures(found)) == (0 if check == "confirmed" else 1)
+    assert [c.wrong for c in report.count_claims(found)] == [wrong]
+    table = table_specs.tabulate_reaches(report.compute_reaches(found), TOLERANCES)
     assert str(table.rows[0][table.heads.index("claim")]) == mark
     assert table.marks == ["bad" if wrong else ""]
 
@@ -52,7 +52,7 @@ def test_profiles_count_misses_and_refusals_at_infinity():
         record("b", "fast", 2.0, 1e-1, success=False), record("b", "slow", 4.0, 1e-7),
         record("c", "slow", 1.0, 1e-7), record("d", "slow", 1.0, 1.0), record("d", "fast", 1.0, 1.0),
     )  # fmt: skip
-    profile = next(p for p in report.profiles(found) if p.tolerance == 1e-6)
+    profile = next(p for p in report.compute_profiles(found) if p.tolerance == 1e-6)
     assert profile.cases == 4
     assert dict(profile.curves) == {"fast": ((1.0, 0.25),), "slow": ((1.0, 0.5), (3.0, 0.75))}
 
@@ -63,7 +63,7 @@ def test_shifted_geometric_means_charge_misses_the_limit():
         record("a", "y", 1.0, 1e-7), record("b", "y", 0.5, 1.0, success=False),
         record("a", "z", 1.0, 1e-7),  # does not take b: not compared
     )  # fmt: skip
-    means = report.geometric_means(found)["lcp"][1e-6]
+    means = report.compute_geometric_means(found)["lcp"][1e-6]
     shift = statistics.MEAN_TIME_SHIFT
     assert set(means) == {"x", "y"}
     assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)
@@ -73,11 +73,11 @@ def test_shifted_geometric_means_charge_misses_the_limit():
 def test_families_are_structures_and_laws():
     words = {"a": ("stack",), "b": ("stack", "redundant")}
     made = [record(case, "x", 1.0, 1e-7) for case in "ab"]
-    assert list(report.families(records_of(*made, structure=words))) == ["stack", "redundant"]
+    assert list(report.group_cases_by_family(records_of(*made, structure=words))) == ["stack", "redundant"]
     alone = records_of(made[0], structure={"a": ("stack", "redundant", "friction")})
-    assert report.families(alone) == {"stack / redundant / friction": ["a"]}
+    assert report.group_cases_by_family(alone) == {"stack / redundant / friction": ["a"]}
     two_laws = records_of(*made, law={"b": "coulomb"})
-    assert report.families(two_laws) == {"stack, coulomb": ["b"], "stack, lcp": ["a"]}
+    assert report.group_cases_by_family(two_laws) == {"stack, coulomb": ["b"], "stack, lcp": ["a"]}
 
 
 def test_claims_failures_and_spreads():
@@ -89,7 +89,7 @@ def test_claims_failures_and_spreads():
                worst_name="row 3"),
         *(record("a", "x", 1.0, r, order=o, **BUDGET) for o, r in (("given", 1e-2), ("reverse", 4e-2))),
     )  # fmt: skip
-    by = {c.solver: c for c in report.claims(found)}
+    by = {c.solver: c for c in report.count_claims(found)}
     assert (by["x"].claims, by["x"].wrong) == (2, 1)
     assert (by["y"].crashed, by["y"].attempted, by["y"].reached) == (1, 1, 0)
     # If a run was repeated alternately, the first run counts; a run with a time limit is always interleaved.
@@ -97,14 +97,17 @@ def test_claims_failures_and_spreads():
         more = records_of(
             *found, record("a", "x", 1.0, 1e-2, mode=mode, interleave_group="one", **FALSE_CLAIM)
         )
-        assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
-        assert sum(bool(f.status_conflict) for f in report.failures(more)) == wrong
-    failed = [(f.solver, f.status) for f in report.failures(found)]
+        assert next(c.wrong for c in report.count_claims(more) if c.solver == "x") == wrong
+        assert sum(bool(f.status_conflict) for f in report.list_failures(more)) == wrong
+    failed = [(f.solver, f.status) for f in report.list_failures(found)]
     assert failed == [("x", "CONVERGED"), ("y", "CRASHED (SIGSEGV)"), ("w", "INFEASIBLE")]
-    (spread,) = report.spreads(found)
-    assert (spread.budget, spread.factor) == (8, 4.0)
+    (spread,) = report.compute_order_spreads(found)
+    assert (spread.budget, spread.worst_to_best_ratio) == (8, 4.0)
     assert (
-        statistics.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, roundoff_floor=2e-15).factor == 2.0
+        statistics.Spread(
+            "a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, roundoff_floor=2e-15
+        ).worst_to_best_ratio
+        == 2.0
     )
 
 
@@ -117,23 +120,23 @@ def test_changes_beyond_noise_are_named():
         record("a", "x", 3.0, 1e-7), record("a", "y", 1.1, 1e-7), record("a", "z", 1.0, 1e-7),
         record("a", "w", 1.0, 1e-4, success=False), record("a", "v", 1.9, 1e-7),
     )  # fmt: skip
-    found = {c.solver: c for c in statistics.changes(old, new) if c.tolerance == 1e-6}
+    found = {c.solver: c for c in statistics.compare_times(old, new) if c.tolerance == 1e-6}
     kinds = {"x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same"}
     assert {s: c.kind for s, c in found.items()} == kinds
     assert found["v"].noise == 2.0  # its repeats spread by half
     # A case whose numbers have changed is not compared.
     changed = records_of(record("a", "x", 3.0, 1e-7))
     changed.add(info("a", sha="another"))
-    assert statistics.changes(old, changed) == []
+    assert statistics.compare_times(old, changed) == []
 
 
 def test_a_slower_machine_is_no_slower_code():
     old = records_of(*(record("a", solver, 1e-3, 1e-7, calibration_time=1e-4) for solver in ("pgs", "auto")))
     slower = [dataclasses.replace(r, time_min=1.6 * r.time_min) for r in old]
     by = [dataclasses.replace(r, calibration_time=1.6 * r.calibration_time) for r in slower]
-    assert {c.kind for c in statistics.changes(old, records_of(*by))} == {"same"}
-    assert {c.kind for c in statistics.changes(old, records_of(*slower))} == {"slower"}
-    assert statistics.drift(old, records_of(*by)) == pytest.approx(1.6)
+    assert {c.kind for c in statistics.compare_times(old, records_of(*by))} == {"same"}
+    assert {c.kind for c in statistics.compare_times(old, records_of(*slower))} == {"slower"}
+    assert statistics.compute_machine_drift(old, records_of(*by)) == pytest.approx(1.6)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +145,7 @@ def measured():
 
 
 def test_backends_have_the_time_of_their_own_interface_too(measured):
-    (osqp,) = statistics.backends(measured)
+    (osqp,) = statistics.compare_backend_times(measured)
     (r,) = (r for r in measured if r.solver == "osqp")
     assert 0.0 < r.backend_time_min < r.time_min
     assert (osqp.solver, osqp.solved) == ("osqp", 1)

@@ -16,7 +16,7 @@ from random_problems import as_matrix, dragged, random_contact_problem, random_g
 import lavender as lv
 from lavender import suite
 from lavender.lab.motion.modes import enumerate_modes
-from lavender.lab.motion.multiple_solutions import distance, search
+from lavender.lab.motion.multiple_solutions import measure_motion_distance, search_solutions
 
 LAWS = ("linear", "lcp", "cone")
 
@@ -111,7 +111,7 @@ def test_a_good_reference_moves_targets_by_rounding_alone():
         if p.law == "coulomb" or p.m > 1000:
             continue
         e = lv.motion_error(p, p.start())
-        assert e.reference.accepted, name
+        assert e.reference.is_accepted, name
         # The floor adds rounding as it may fall, the bound as it must not exceed: some hundred sums of it.
         assert e.moved <= 300 * e.reference.residual.roundoff_floor * np.abs(p.b).max(), name
         assert e.bound == pytest.approx(e.energy, rel=1e-6), name
@@ -127,7 +127,7 @@ def test_kinetic_is_the_energy_of_the_velocities(form, seed):
     p = random_contact_problem(seed, friction="cone") if form == "rows" else random_general(seed)
     x = np.random.default_rng(seed).normal(size=p.m)
     e = lv.motion_error(p, x)
-    if not e.reference.accepted:
+    if not e.reference.is_accepted:
         return
     delta = x - e.reference.impulse
     if form == "rows":
@@ -179,22 +179,22 @@ def test_what_a_problem_does_not_have_is_none_and_told(problem, none, some, word
     assert [getattr(e, name) for name in none] == [None] * len(none)
     assert all(getattr(e, name) > 0.1 for name in some) and (e.bound is None) == ("bound" in none)
     assert word in e.note and (word in str(e) or e.bound is not None)
-    assert e.reference.accepted == ("moved" not in some)
+    assert e.reference.is_accepted == ("moved" not in some)
 
 
 def test_the_reference_is_solved_once_and_a_given_one_is_used():
     p = problems("cone", 5)
-    first = lv.motion.reference(p)
-    assert lv.motion.reference(p) is first
+    first = lv.motion.get_reference(p)
+    assert lv.motion.get_reference(p) is first
     assert first.solver.startswith("auto: ")
     own = lv.solve(p, "newton", tol=1e-12)
     e = lv.motion_error(p, p.start(), reference=own)
     assert e.reference.solver == "newton"
-    assert lv.motion.reference(p) is first
+    assert lv.motion.get_reference(p) is first
     given = lv.motion_error(p, p.start(), reference=own.impulse)
     assert given.energy == e.energy
     rough = lv.motion_error(p, p.start(), reference=0.5 * own.impulse)
-    assert not rough.reference.accepted
+    assert not rough.reference.is_accepted
     assert rough.energy is None
     assert lv.solve(p, "newton").motion_error().relative < 1e-3
 
@@ -202,8 +202,8 @@ def test_the_reference_is_solved_once_and_a_given_one_is_used():
 def test_a_worse_reference_is_not_adopted():
     p = problems("cone", 6)
     good = lv.solve(p, "newton", tol=1e-12).impulse
-    assert lv.motion.adopt(p, good, "mine").solver == "mine"
-    assert lv.motion.adopt(p, 0.9 * good, "worse").solver == "mine"
+    assert lv.motion.store_if_better(p, good, "mine").solver == "mine"
+    assert lv.motion.store_if_better(p, 0.9 * good, "worse").solver == "mine"
 
 
 def test_a_reference_beside_a_file_is_judged_before_it_is_used(tmp_path, monkeypatch):
@@ -217,9 +217,9 @@ def test_a_reference_beside_a_file_is_judged_before_it_is_used(tmp_path, monkeyp
         import_module("lavender.lab.motion.reference"), "solve", None
     )  # nobody solves any more
     found = lv.motion.load_reference(again, path)
-    assert found.impulse.tobytes() == lv.motion.reference(p).impulse.tobytes()
-    assert found.solver == lv.motion.reference(p).solver
-    assert lv.motion.reference(again) is found
+    assert found.impulse.tobytes() == lv.motion.get_reference(p).impulse.tobytes()
+    assert found.solver == lv.motion.get_reference(p).solver
+    assert lv.motion.get_reference(again) is found
     assert lv.motion_error(again, again.start()).relative == pytest.approx(1.0)
     other = problems("cone", 6)
     assert lv.motion.load_reference(other, path) is None  # the judge finds that it solves another problem
@@ -289,11 +289,12 @@ def test_every_mode_holds_what_a_search_finds_and_beyond_them_there_are_at_least
         found = lv.find_solutions(problem)
         assert found.all
         several += len(found) > 1
-        for label, end in search(problem, found[0].reference, 6, 1):
+        for label, end in search_solutions(problem, found[0].reference, 6, 1):
             if lv.residual(problem, end).relative < 1e-9:
-                assert min(distance(problem, end, one.impulse).relative_distance for one in found) < 1e-6, (
-                    label
-                )
+                assert (
+                    min(measure_motion_distance(problem, end, one.impulse).relative_distance for one in found)
+                    < 1e-6
+                ), label
     assert several > 3  # else the draw asks for nothing
     rods = np.kron(np.eye(9), [[1.0, -2.0], [-2.0, 5.0]])
     nine = lv.find_solutions(lv.Problem.contact(rods, [-1.0, 4.0] * 9, mu=[1.0] * 9))
@@ -354,17 +355,17 @@ def test_uniqueness_names_its_criterion():
     sphere = np.diag([1.0, 3.5, 3.5])
     assert "normals feel no friction" in lv.find_solutions(one_contact(sphere, 5.0)).unique
     coupled = sphere + 0.3 * (np.eye(3)[:, [0]] @ np.eye(3)[[1]] + np.eye(3)[:, [1]] @ np.eye(3)[[0]])
-    small = lv.motion.uniqueness(one_contact(coupled, 0.1))
+    small = lv.motion.prove_uniqueness(one_contact(coupled, 0.1))
     assert small
     assert "friction is small" in small.reason
     assert 0.0 < small.kappa < 1.0
-    large = lv.motion.uniqueness(one_contact(coupled, 5.0, coupled @ [1.0, 6.0, 0.0]))  # it slides
+    large = lv.motion.prove_uniqueness(one_contact(coupled, 5.0, coupled @ [1.0, 6.0, 0.0]))  # it slides
     assert not large
     assert large.kappa > 1.0
-    assert "no contact has friction" in lv.motion.uniqueness(one_contact(coupled, 0.0)).reason
+    assert "no contact has friction" in lv.motion.prove_uniqueness(one_contact(coupled, 0.0)).reason
     asymmetric = coupled.copy()
     asymmetric[0, 1] += 0.1
-    assert "not symmetric" in lv.motion.uniqueness(one_contact(asymmetric, 0.1)).reason
+    assert "not symmetric" in lv.motion.prove_uniqueness(one_contact(asymmetric, 0.1)).reason
 
 
 @given(seed=seeds)
@@ -375,7 +376,7 @@ def test_where_uniqueness_is_proved_every_start_ends_at_one_motion(seed):
     g = rng.normal(size=(6, 6))
     a = np.diag(rng.uniform(1.0, 2.0, 6)) + 0.05 * (g @ g.T)
     p = lv.Problem.contact(a, rng.normal(size=6), rng.uniform(0.05, 0.5, 2))
-    proof = lv.motion.uniqueness(p)
+    proof = lv.motion.prove_uniqueness(p)
     if not proof:
         return
     ends = [
@@ -400,7 +401,7 @@ def test_where_nothing_slides_and_friction_is_left_over_no_search_finds_another(
     tangent = used * mu * normal * np.array([np.cos(angle), np.sin(angle)])
     x = np.column_stack([normal, *tangent]).ravel()
     p = lv.Problem.contact(a, a @ x, mu)
-    proof = lv.motion.uniqueness(p)
+    proof = lv.motion.prove_uniqueness(p)
     if proof:
         assert len(lv.find_solutions(p, 6, always=True)) == 1
 
@@ -410,14 +411,14 @@ def test_nothing_slides_proves_more_than_small_friction():
         np.eye(3)[:, [0]] @ np.eye(3)[[1]] + np.eye(3)[:, [1]] @ np.eye(3)[[0]]
     )
     rest = lv.Problem.contact(coupled, coupled @ [1.0, 0.0, 0.0], [0.6])
-    proof = lv.motion.uniqueness(rest)
+    proof = lv.motion.prove_uniqueness(rest)
     assert proof.kappa > 1.0
     assert "nothing slides" in proof.reason
     assert "nothing slides" in lv.find_solutions(rest).unique
     sliding = lv.Problem.contact(coupled, coupled @ [1.0, 0.0, 0.0] + [0.0, 5.0, 0.0], [0.6])
-    assert not lv.motion.uniqueness(sliding)
+    assert not lv.motion.prove_uniqueness(sliding)
     rim = lv.Problem.contact(coupled, coupled @ [1.0, 0.599, 0.0], [0.6])  # hardly any friction left over
-    assert not lv.motion.uniqueness(rim)
+    assert not lv.motion.prove_uniqueness(rim)
 
 
 # -- numbers at the end of float64 ---------------------------------------------------------------------
@@ -444,7 +445,7 @@ def test_motion_errors_of_impulses_scale_with_them(form, exponent):
     """Powers of two scale every number but rounding of the target: x is far above all else, or it is nothing."""
     problem = forms(1)[form]
     scale = 2.0**exponent
-    reference = lv.motion.reference(problem)
+    reference = lv.motion.get_reference(problem)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         far = lv.motion_error(problem, scale * np.ones(problem.m), reference)
@@ -481,9 +482,9 @@ def test_a_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
 def test_a_reference_of_another_problem_is_judged_anew():
     a = [[2.0, 1.0], [1.0, 2.0]]
     one, two = lv.Problem.lcp(a, [1.0, 0.5]), lv.Problem.lcp(a, [5.0, 5.0])
-    other = lv.motion.reference(one)
+    other = lv.motion.get_reference(one)
     e = lv.motion_error(two, other.impulse, reference=other)
-    assert not e.reference.accepted
+    assert not e.reference.is_accepted
     assert e.relative is None
     assert e.bound >= lv.motion_error(two, other.impulse).energy > 1.0
     assert lv.motion_error(one, other.impulse, reference=other).reference is other

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from worked import python
 
 import lavender as lv
-from lavender.lab.motion.unique import uniqueness
+from lavender.lab.motion.unique import prove_uniqueness
 
 
 def test_several_motions_are_told():
@@ -28,7 +28,7 @@ def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
     assert lv.residual(p, early.impulse).at_floor  # of an answer made in float32
     assert early.status is lv.Status.MAX_ITERATIONS
     assert not early.residual.at_floor
-    assert not lv.motion.adopt(p, early.impulse).accepted
+    assert not lv.motion.store_if_better(p, early.impulse).is_accepted
     for solution in (exact, lv.solve(p, max_iter=1000)):  # by a compiled call, and step by step
         assert solution.residual.precision == "float64"
 
@@ -54,8 +54,8 @@ def test_where_one_motion_is_proven_starts_find_no_other():
     g = rng.normal(size=(10, 12))
     a, b = g @ g.T + 2.0 * np.eye(10), rng.normal(size=10)
     few = lv.Problem(b, lv.Cones.contacts(0.01, rolling=0.01, count=2), a)
-    assert uniqueness(few)
-    assert not uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
+    assert prove_uniqueness(few)
+    assert not prove_uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
     assert len(lv.find_solutions(few)) == 1
     for motion in lv.find_solutions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
         assert motion.reference.residual.relative <= 1e-9

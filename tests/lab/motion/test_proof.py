@@ -207,9 +207,9 @@ def test_a_prime_that_divides_the_numbers_makes_no_rows_dependent(monkeypatch):
     contradicting = sp.csr_array([[0.5, 1.0], [1.0, 2.0], [3.0, 6.0]])
     for prime in (3, dependence.PRIME):
         monkeypatch.setattr(dependence, "PRIME", prime)
-        kept, wrong = dependence.dependencies(flint, independent, np.array([1.0, 0.5, 0.5, 1.0]))
+        kept, wrong = dependence.find_dependent_rows(flint, independent, np.array([1.0, 0.5, 0.5, 1.0]))
         assert kept.tolist() == [0, 1, 3] and wrong.tolist() == []
-        kept, wrong = dependence.dependencies(flint, contradicting, np.array([0.25, 2.0, 1.5]))
+        kept, wrong = dependence.find_dependent_rows(flint, contradicting, np.array([0.25, 2.0, 1.5]))
         assert kept.tolist() == [0] and wrong.tolist() == [1]
 
 
@@ -249,7 +249,11 @@ def sign_of_middle(x):
 
 @pytest.mark.parametrize(
     ("name", "turned"),
-    [("upper_end", lower_end), ("sign_of", sign_of_upper_end), ("sign_of", sign_of_middle)],
+    [
+        ("round_up_magnitude", lower_end),
+        ("get_certain_sign", sign_of_upper_end),
+        ("get_certain_sign", sign_of_middle),
+    ],
 )
 def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, turned):
     monkeypatch.setattr(search, name, turned)
@@ -260,15 +264,15 @@ def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, tur
 def test_balls_of_a_linear_problem_hold_its_rational_solution(monkeypatch, inverse):
     """And their middles are not that solution."""
     monkeypatch.setattr(island, "FloatInverse", getattr(island, inverse))
-    reach = island.FloatInverse.radius
+    reach = island.FloatInverse.bound_radius
     for share, held in ((1.0, True), (0.0, False)):
-        monkeypatch.setattr(island.FloatInverse, "radius", lambda *a, share=share: share * reach(*a))
+        monkeypatch.setattr(island.FloatInverse, "bound_radius", lambda *a, share=share: share * reach(*a))
         inside = []
         for seed in range(8):
             problem = suite.case(f"random_spd(n=6, condition=1e4, seed={seed})").problem
             given = lv.solve(problem, "direct").impulse
             find = search.Search(flint, problem, given, given)
-            balls, exact = find.solve()[0], find.solve(Rationals(flint))[0]
+            balls, exact = find.solve_equations()[0], find.solve_equations(Rationals(flint))[0]
             inside += [ball.contains(x) for ball, x in zip(balls, exact, strict=True)]
         assert all(inside) == held
 
@@ -284,7 +288,7 @@ def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
 def test_a_ball_about_zero_counts():
     """w of a row that another moves by at most 1: [-1, 1] holds it."""
     a = Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
-    w = a.slack(Balls(flint), [flint.arb(0, 1), flint.arb(0)])
+    w = a.compute_slack(Balls(flint), [flint.arb(0, 1), flint.arb(0)])
     assert w[1].contains(0.75) and w[0].contains(-1.5)
 
 

@@ -19,8 +19,8 @@ def simulate(name, scene, seconds, interval):
         program = JsonLines(
             [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(600)"]
         )
-        Path(name.removeprefix("waits ")).write_text(str(program.call(None)))
-        program.call(None)
+        Path(name.removeprefix("waits ")).write_text(str(program.request_answer(None)))
+        program.request_answer(None)
     if name == "babbles":
         return {"samples": 3, "bodies": 1, "setting": ""}, [np.ones(1)]
     os._exit(0)

@@ -25,10 +25,10 @@ from lavender.lab.phenomena import (
     select_variants,
 )
 from lavender.lab.phenomena import table as tables
-from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, make_engine, record_track, versions_of_node
+from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, get_npm_versions, make_engine, record_track
 from lavender.lab.phenomena.engines.node import JsonLines
-from lavender.lab.phenomena.engines.tree import collision_shape
-from lavender.lab.phenomena.parts import crossing, measure_track
+from lavender.lab.phenomena.engines.tree import get_collision_shape
+from lavender.lab.phenomena.parts import find_crossing_time, measure_track
 from lavender.lab.phenomena.running import EngineProcess
 from lavender.sim.scene.steppers import STEPPERS
 
@@ -40,7 +40,7 @@ OTHERS = [w for w in ENGINE_VARIANTS.values() if w.module != "own"]
 
 
 def first(name):
-    return PHENOMENA[name].values(PHENOMENA[name].cases[0])
+    return PHENOMENA[name].complete_parameters(PHENOMENA[name].cases[0])
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def process():
 @pytest.fixture
 def broken(request, monkeypatch):
     """The same for engines that fail."""
-    monkeypatch.setattr("lavender.lab.phenomena.running.simulate", simulate_broken)
+    monkeypatch.setattr("lavender.lab.phenomena.running.record_track_of_engine", simulate_broken)
     return request.getfixturevalue("process")
 
 
@@ -74,12 +74,12 @@ def test_every_phenomenon_is_whole(name):
         assert q.bound >= 0.0
         assert q.text
     for case in p.cases:
-        values = p.values(case)
+        values = p.complete_parameters(case)
         assert math.isfinite(p.seconds(values))
-        assert p.scene(values).n_bodies > 0
+        assert p.build_scene(values).n_bodies > 0
     for low in (True, False):  # the ends of all ranges build too
-        values = p.values({k: x.low if low else x.high for k, x in p.parameters.items()})
-        lv.Simulation(p.scene(values, stepper="impulses"))
+        values = p.complete_parameters({k: x.low if low else x.high for k, x in p.parameters.items()})
+        lv.Simulation(p.build_scene(values, stepper="impulses"))
         assert p.seconds(values) > 0.0
 
 
@@ -89,9 +89,9 @@ def test_parameters_out_of_their_range_are_refused(name):
     for key, x in p.parameters.items():
         for bad in (x.low - 1, x.high + 1, math.nan, "one"):
             with pytest.raises(lv.InputError, match=f"{key} of '{name}'"):
-                p.scene({key: bad})
+                p.build_scene({key: bad})
     with pytest.raises(lv.UnknownName, match="nonsense"):
-        p.scene({"nonsense": 1.0})
+        p.build_scene({"nonsense": 1.0})
 
 
 def cells(text):
@@ -108,7 +108,7 @@ def cells(text):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
     page = cells((Path(__file__).resolve().parents[3] / "docs" / "phenomena.md").read_text(encoding="utf-8"))
-    found = cells(tables.table(run(QUICK, steppers=[stepper])))
+    found = cells(tables.format_markdown_table(run(QUICK, steppers=[stepper])))
     for variant in select_variants([stepper], []):
         for key in ((variant.name, name) for name in QUICK):
             (value, *passed), (told, *counted) = found[key], page[key]
@@ -130,9 +130,9 @@ def test_the_exact_solver_keeps_every_bound_of_the_first_case(name):
     [("slide", "mu"), ("stop", "mu"), ("roll", "mu"), ("roll_to_rest", "rolling"), ("spin_down", "mu")],
 )
 def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
-    p, values = PHENOMENA[name], PHENOMENA[name].values()
+    p, values = PHENOMENA[name], PHENOMENA[name].complete_parameters()
     weak = {of: 0.8 * values[of]} | ({"slope": values["slope"] / 0.8} if name == "slide" else {})  # of mu
-    scene = p.scene(values | weak, stepper="impulses")
+    scene = p.build_scene(values | weak, stepper="impulses")
     track = record_track(
         make_engine(ENGINE_VARIANTS["impulses newton"], scene), p.seconds(values), p.interval
     )
@@ -142,10 +142,10 @@ def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     p = PHENOMENA["pendulum"]
-    case = p.values({"swings": 10})
+    case = p.complete_parameters({"swings": 10})
     left = []
     for substeps in (4, 16):
-        scene = p.scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
+        scene = p.build_scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
         left.append(
             p.measure(
                 case, record_track(make_engine(ENGINE_VARIANTS[stepper], scene), p.seconds(case), p.interval)
@@ -159,7 +159,7 @@ def test_what_stands_and_what_falls_are_told_apart():
     for name, key in (("tipping", "slope"), ("overhang", "reach"), ("arch", "thickness")):
         for value in (0.95, 1.05):
             (record,) = run([name], steppers=["impulses newton"], parameters={key: value})
-            assert record.value("wrong side") == 0.0, tables.format_record(record)
+            assert record.get_value("wrong side") == 0.0, tables.format_record(record)
 
 
 def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
@@ -170,8 +170,8 @@ def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
         ("arch", {"thickness": 0.9}),
     ):
         p = PHENOMENA[name]
-        values = p.values(case)
-        scene = p.scene(values)
+        values = p.complete_parameters(case)
+        scene = p.build_scene(values)
         t = np.arange(0.0, p.seconds(values), p.interval)
         x, q = (np.array([getattr(b, f) for b in scene.bodies]) for f in ("position", "quaternion"))
         still = Track(
@@ -182,23 +182,23 @@ def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
 
 def test_crossings():
     t = np.array([0.0, 1.0, 2.0])
-    assert crossing(t, np.array([2.0, 1.0, 0.0]), 0.5) == pytest.approx(1.5)
-    assert crossing(t, np.ones(3), 0.5) == math.inf
+    assert find_crossing_time(t, np.array([2.0, 1.0, 0.0]), 0.5) == pytest.approx(1.5)
+    assert find_crossing_time(t, np.ones(3), 0.5) == math.inf
 
 
 # -- engines --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.missing()])
+@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.explain_missing()])
 def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(variant):
     one = ENGINE_VARIANTS[variant]
     for name, p in PHENOMENA.items():
         if any(x in one.cannot for x in p.needs):
             continue
-        scene = p.scene(first(name))
+        scene = p.build_scene(first(name))
         engine = make_engine(one, scene)
         try:
-            x, q, v = engine.state()
+            x, q, v = engine.get_state()
             moves = np.array([not b.is_static for b in scene.bodies])
             # lavendersim keeps 32 bits
             for found, key in ((x, "position"), (v[:, :3], "velocity"), (v[:, 3:], "angular_velocity")):
@@ -221,7 +221,7 @@ def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(variant):
     np.testing.assert_allclose(fall, [0, 0, -0.5 * 9.81 * track.time[-1] ** 2], atol=0.06)
 
 
-@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.missing()])
+@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.explain_missing()])
 def test_what_an_engine_cannot_build_is_said(variant):
     soft = lv.Scene()
     body = soft.add_sphere()
@@ -238,10 +238,10 @@ def test_a_static_box_is_refused_where_an_engines_file_makes_none():
     scene.add_box(static=True, name="shelf")
     scene.add_box(position=(0.0, 0.0, 2.0))
     held, moving = scene.bodies
-    assert collision_shape(held, "engine") is held.shape
-    assert collision_shape(moving, "engine", static=False) is moving.shape
+    assert get_collision_shape(held, "engine") is held.shape
+    assert get_collision_shape(moving, "engine", static=False) is moving.shape
     with pytest.raises(lv.CapabilityError, match="shelf has no shape that engine could be given"):
-        collision_shape(held, "engine", static=False)
+        get_collision_shape(held, "engine", static=False)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs mujoco")
@@ -252,10 +252,10 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
         engines=["mujoco elliptic", "mujoco elliptic noslip"],
         parameters={"slope": 0.9},
     )
-    assert 1e-5 < creep[0].value("creep") < 1e-2  # some 1e-4 m/s: its friction is regularised
-    assert creep[1].value("creep") < 1e-2 * creep[0].value("creep")
+    assert 1e-5 < creep[0].get_value("creep") < 1e-2  # some 1e-4 m/s: its friction is regularised
+    assert creep[1].get_value("creep") < 1e-2 * creep[0].get_value("creep")
     (lift,) = run(["lift"], steppers=[], engines=["mujoco pyramidal"], parameters={})
-    assert 1e-3 < lift.value("lift") < 1e-2
+    assert 1e-3 < lift.get_value("lift") < 1e-2
 
 
 @pytest.mark.parametrize(
@@ -269,14 +269,14 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
 )
 def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, broken):
     broken.limit = 2.0 if name == "sleeps" else 600.0
-    scene = PHENOMENA["stick"].scene()
+    scene = PHENOMENA["stick"].build_scene()
     variant = dataclasses.replace(OTHERS[0], name=name)
-    found = broken.track(variant, scene, 1.0, 0.1)
+    found = broken.record_track(variant, scene, 1.0, 0.1)
     assert isinstance(found, str)
     assert words in found
     if name != "babbles":  # it sleeps on
         broken.limit = 600.0
-        again = broken.track(dataclasses.replace(variant, name="leaves"), scene, 1.0, 0.1)
+        again = broken.record_track(dataclasses.replace(variant, name="leaves"), scene, 1.0, 0.1)
         assert again == "its process ended: exit status 0"
 
 
@@ -284,7 +284,7 @@ def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, 
 def test_a_program_that_an_engine_waits_for_ends_with_it(broken, tmp_path):
     broken.limit = 6.0
     variant = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
-    assert broken.track(variant, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 6 s"
+    assert broken.record_track(variant, PHENOMENA["stick"].build_scene(), 1.0, 0.1) == "no answer within 6 s"
     number = int((tmp_path / "number").read_text())
     state = Path(f"/proc/{number}/stat")
     for _ in range(12_000):  # the system takes a moment
@@ -299,16 +299,16 @@ def test_a_system_that_starts_no_process_is_a_note(process, monkeypatch):
         raise OSError(11, "no more processes")
 
     monkeypatch.setattr("lavender.base.subprocesses.subprocess.Popen", refuse)
-    found = process.track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
+    found = process.record_track(OTHERS[0], PHENOMENA["stick"].build_scene(), 1.0, 0.1)
     assert found == "its process does not start: [Errno 11] no more processes"
 
 
 def test_what_an_engine_raises_is_told_and_its_process_stays(process):
-    scene = PHENOMENA["stick"].scene()
+    scene = PHENOMENA["stick"].build_scene()
     for _ in range(2):
-        found = process.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
+        found = process.record_track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
         assert found == 'it failed: KeyError: "nobody\'s"'
-        assert process.alive
+        assert process.is_alive
 
 
 def test_an_engine_that_is_missing_is_a_note(monkeypatch):
@@ -338,7 +338,7 @@ class Answers:
     def __init__(self, command):
         self.command, self.left = command, list(self.said)
 
-    def call(self, message):
+    def request_answer(self, message):
         assert json.loads(json.dumps(message, allow_nan=False)) == message  # a line of JSON
         return self.left.pop(0)
 
@@ -358,7 +358,7 @@ def under_node(monkeypatch, tmp_path):
 
     def made(*said):
         monkeypatch.setattr(Answers, "said", said)
-        return make_engine(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].scene())
+        return make_engine(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].build_scene())
 
     return made
 
@@ -371,7 +371,7 @@ def test_poses_that_an_engine_under_node_loses_are_a_note(under_node):
     track = record_track(engine, 3 / 60, 1 / 60)
     assert len(track.time) == 3  # it ends with what is not finite
     assert track.cpu == pytest.approx(1.0 / (2 / 60))  # of the other process, without what building took
-    assert "not finite from 0.0333 s" in measure_track(p, "rapier", p.values(), track).note
+    assert "not finite from 0.0333 s" in measure_track(p, "rapier", p.complete_parameters(), track).note
 
 
 def test_what_an_engine_under_node_says_is_told(under_node):
@@ -383,29 +383,29 @@ def test_what_an_engine_under_node_says_is_told(under_node):
 
 def test_packages_of_node_are_found_or_what_to_install_is_said(under_node, monkeypatch, tmp_path):
     monkeypatch.setattr("lavender.lab.phenomena.engines.shutil.which", lambda name: name)
-    assert ENGINE_VARIANTS["rapier"].missing() == ""
-    assert versions_of_node() == dict.fromkeys(PACKAGES_OF_NODE.values(), "1.2.3")
+    assert ENGINE_VARIANTS["rapier"].explain_missing() == ""
+    assert get_npm_versions() == dict.fromkeys(PACKAGES_OF_NODE.values(), "1.2.3")
     monkeypatch.delenv("NODE_PATH")
     monkeypatch.chdir(tmp_path)
-    assert "not installed: npm install jolt-physics" in ENGINE_VARIANTS["jolt"].missing()
+    assert "not installed: npm install jolt-physics" in ENGINE_VARIANTS["jolt"].explain_missing()
     with pytest.raises(LavenderError, match="npm install @dimforge/rapier3d-compat"):
         under_node()
     monkeypatch.setattr("lavender.lab.phenomena.engines.shutil.which", lambda name: None)
-    assert "under Node" in ENGINE_VARIANTS["jolt"].missing()
+    assert "under Node" in ENGINE_VARIANTS["jolt"].explain_missing()
 
 
 def test_a_program_is_asked_by_lines_and_its_end_is_told():
     echo = "import sys\nfor line in sys.stdin:\n    if '7' in line: sys.exit(3)\n    print(line, flush=True, end='')"
     program = JsonLines([sys.executable, "-c", echo])
     try:
-        assert program.call({"a": [1.5, "ü"]}) == {"a": [1.5, "ü"]}
+        assert program.request_answer({"a": [1.5, "ü"]}) == {"a": [1.5, "ü"]}
         with pytest.raises(EOFError, match="status 3"):
-            program.call(7)
+            program.request_answer(7)
     finally:
         program.close()
     sleeper = "import os, time; input(); print(os.getpid(), flush=True); time.sleep(60)"
     program = JsonLines([sys.executable, "-c", sleeper])
-    pid = program.call({})
+    pid = program.request_answer({})
     program.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
@@ -445,11 +445,11 @@ def test_the_table_has_worst_values_cases_out_of_bounds_and_reasons():
         Record("stick", "soft_step", case, {"creep": 1e-9}, passed=True),
         Record("stick", "drake", case, note="it has no cause"),
     ]
-    text = tables.table(found)
+    text = tables.format_markdown_table(found)
     assert "| impulses | **0.02 m/s, 0/1** |" in text
     assert "| soft_step | 1.0e-09 m/s, 1/1 |" in text
     assert "| drake | – |" in text
-    assert tables.out_of_bound_cases(found) == [
+    assert tables.list_out_of_bound_cases(found) == [
         "stick, impulses: 1 of 1 cases out, creep 0.02 m/s (bound 1.0e-06 m/s); within it: soft_step"
     ]
-    assert tables.notes(found) == ["drake: stick: it has no cause"]
+    assert tables.list_notes(found) == ["drake: stick: it has no cause"]

@@ -9,8 +9,13 @@ from scipy.optimize import linprog
 
 import lavender as lv
 from lavender.lab.phenomena import PHENOMENA
-from lavender.lab.phenomena.analytic_solutions import tipping_time
-from lavender.lab.phenomena.joints import flip_of, moments_of_inertia, period_of, spin_of
+from lavender.lab.phenomena.analytic_solutions import compute_tipping_time
+from lavender.lab.phenomena.joints import (
+    compute_flip_period,
+    compute_pendulum_period,
+    get_initial_spin,
+    get_moments_of_inertia,
+)
 
 G = 9.81
 
@@ -28,12 +33,12 @@ def test_a_pendulum_integrated_has_the_period(angle):
 
     below.terminal, below.direction = True, -1
     found = solve_ivp(motion, (0, 50), [angle, 0.0], events=below, rtol=1e-10, atol=1e-12, method="DOP853")
-    assert 4 * found.t_events[0][0] == pytest.approx(period_of({"angle": angle}), rel=1e-8)
+    assert 4 * found.t_events[0][0] == pytest.approx(compute_pendulum_period({"angle": angle}), rel=1e-8)
 
 
 @pytest.mark.parametrize("aside", [0.01, 0.05, 0.5])
 def test_eulers_equations_integrated_flip_with_the_period(aside):
-    p, i = {"spin": 5.0, "aside": aside}, moments_of_inertia()
+    p, i = {"spin": 5.0, "aside": aside}, get_moments_of_inertia()
 
     def motion(_, w):
         x, y, z = w
@@ -42,8 +47,10 @@ def test_eulers_equations_integrated_flip_with_the_period(aside):
     def middle(_, w):
         return w[1]
 
-    found = solve_ivp(motion, (0, 40), spin_of(p), events=middle, rtol=1e-10, atol=1e-12, method="DOP853")
-    assert 2 * np.diff(found.t_events[0]).mean() == pytest.approx(flip_of(p), rel=1e-7)
+    found = solve_ivp(
+        motion, (0, 40), get_initial_spin(p), events=middle, rtol=1e-10, atol=1e-12, method="DOP853"
+    )
+    assert 2 * np.diff(found.t_events[0]).mean() == pytest.approx(compute_flip_period(p), rel=1e-7)
 
 
 @pytest.mark.parametrize(("width", "over"), [(0.5, 1.02), (0.5, 1.5), (1.0, 1.1), (0.1, 2.0)])
@@ -62,8 +69,10 @@ def test_a_box_tips_in_the_time_that_an_integrator_needs(width, over):
 
     tipped.terminal = True
     found = solve_ivp(motion, (0, 20), [0.0, 0.0], events=tipped, rtol=1e-10, atol=1e-13, method="DOP853")
-    assert tipping_time(width, 1.0, over * width, 0.5) == pytest.approx(found.t_events[0][0], rel=1e-6)
-    assert tipping_time(width, 1.0, 0.99 * width, 0.5) == math.inf
+    assert compute_tipping_time(width, 1.0, over * width, 0.5) == pytest.approx(
+        found.t_events[0][0], rel=1e-6
+    )
+    assert compute_tipping_time(width, 1.0, 0.99 * width, 0.5) == math.inf
 
 
 def stands(name, **case):
@@ -71,7 +80,7 @@ def stands(name, **case):
 
     Cones stand inside squares of their friction; what falls for want of room falls whatever the square.
     """
-    scene = PHENOMENA[name].scene(case, stepper="impulses")
+    scene = PHENOMENA[name].build_scene(case, stepper="impulses")
     p = lv.Simulation(scene).constraint_problem()
     j = p.rows.jacobian(p.cones).toarray()
     moving = [i for i, b in enumerate(scene.bodies) if not b.is_static]

@@ -101,7 +101,7 @@ def test_the_page_is_well_formed_stands_alone_and_shows_every_part(written):
     assert (page.open, page.wrong, page.loads) == ([], [], [])
     assert page.links <= page.ids
     assert "<script>alert" not in text and "<b>row" not in text and EVIL not in text
-    drawn = build_figures(found.records)
+    drawn = build_figures(found.ranked_records)
     assert text.count("<svg") == len(list(drawn)) - len(
         drawn.moved.over
     )  # the first screen has the residual alone
@@ -130,7 +130,7 @@ def test_files_are_whole_and_a_paper_has_no_clock(written):
         "records.csv", "records.json", "index.html", "summary.md", "figures", "paper"
     }  # fmt: skip
     saved = {p.name for p in (out / "figures").iterdir()}
-    assert len(saved) == 2 * len(list(build_figures(found.records)))
+    assert len(saved) == 2 * len(list(build_figures(found.ranked_records)))
     assert all(p.stat().st_size > 1000 for p in (out / "figures").iterdir())
     pdf = {p.name: p.read_bytes() for p in (out / "paper").glob("*.pdf")}
     captions = (out / "paper" / "figures.tex").read_text(encoding="utf-8")

@@ -32,7 +32,7 @@ def test_styles_tell_solvers_apart():
 
 def test_a_drawing_holds_the_runs_of_its_solvers(tmp_path):
     """Their coordinates, as a page's script reads them with the ranges of the axes, are times and residuals."""
-    records = example(tmp_path).records
+    records = example(tmp_path).ranked_records
 
     def value(axis, place):
         log, low, high, first, last = map(float, axis.split())
@@ -51,7 +51,7 @@ def test_a_drawing_holds_the_runs_of_its_solvers(tmp_path):
                 for r in records
                 if (r.case, r.solver, r.order, r.interleave_group) == (case, c.solver, "given", "")
             ]
-            points = sorted((r.time_min, r.relative) for r in runs if r.usable)
+            points = sorted((r.time_min, r.relative) for r in runs if r.is_usable)
             assert sorted(zip(c.x, c.y, strict=True)) == points and len(c.notes) == len(points)
             (dots,) = (p.get("d") for p in drawn[c.label] if p.get("class") == "d")
             places = np.array([list(map(int, p)) for p in re.findall(r"M(\d+) (\d+)h0", dots)])
@@ -178,7 +178,7 @@ def test_a_paper_draws_every_plug_in_profiles_by_work_and_gives_no_advice(tmp_pa
         latex_export, "plot_figure", lambda f, *more: drawn.update({f.name: f}) or plot(f, *more)
     )
     report = Report(found)
-    assert "measure again" in report.busy and "measure again" not in report.high_load
+    assert "measure again" in report.busy_warning and "measure again" not in report.high_load
     latex_export.write_paper(report, tmp_path)
     for name in ("over all", "profile lcp 1e-6", "work profile lcp 1e-6"):
         assert "my_solver" in {c.solver for c in drawn[name].curves}

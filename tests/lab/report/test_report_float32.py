@@ -7,8 +7,8 @@ import pytest
 from calls import robot
 
 import lavender as lv
-from lavender.lab.bench import resolve
-from lavender.lab.bench.cases import describe
+from lavender.lab.bench import resolve_sources
+from lavender.lab.bench.cases import describe_case
 from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import read_engine_answers
@@ -19,8 +19,8 @@ from lavender.lab.report.table_specs import tabulate_engines
 def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
     problem = dataclasses.replace(robot(2), precision="float32")
     lv.io.save(problem, tmp_path / "early.npz", impulse=0.9 * lv.solve(problem, tol=1e-11).impulse)
-    (item,) = resolve([tmp_path / "early.npz"])
-    info = describe(item, "run")
+    (item,) = resolve_sources([tmp_path / "early.npz"])
+    info = describe_case(item, "run")
     assert info.stored_verdict.startswith("stopped before convergence, ")
     assert from_json(to_json(info)) == info
     of_old = to_json(info) | {
@@ -46,7 +46,7 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     assert early > 0  # at its tolerance, far above the floor
     (engine,) = read_engine_answers([str(tmp_path)], Records())
     assert engine.unconverged == early
-    (row,) = tabulate_engines(Report(Records(), engines=[engine])).texts
+    (row,) = tabulate_engines(Report(Records(), engines=[engine])).cell_texts
     assert str(early) in row
     with pytest.raises(lv.InputError, match="precision is 'half'"):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")

@@ -30,7 +30,7 @@ def records():
 
 
 def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
-    for row in statistics.reaches(motion_tables.convert_to_motion_errors(records)):
+    for row in statistics.compute_reaches(motion_tables.convert_to_motion_errors(records)):
         runs = [r for r in records if (r.case, r.solver, r.start) == (row.case, row.solver, row.start)]
         for tolerance, time in row.times.items():
             assert time == min((r.time_min for r in runs if r.motion_speed <= tolerance), default=math.inf)
@@ -41,16 +41,16 @@ def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
 
 def test_the_first_sentence_is_by_motion_error_if_that_was_asked_for(records):
     found = Report(records)
-    line, *_ = recommendation.recommend_from_single_runs(found.by_speed)
+    line, *_ = recommendation.recommend_from_single_runs(found.records_by_motion_error)
     said = found.verdict.statements[0]
     assert said.text.startswith(f"Use {line.by_tolerance[1e-4].best.solver}: it solves stack(n=16) in ")
     assert "until no body has a velocity error above 1e-4 m/s." in said.text
     # the line to copy does what the sentence says
     problem = lv.suite.case("stack(n=16)").problem
-    assert eval(said.line, {"lv": lv, "problem": problem}).motion_error().speed <= 1e-4
-    (run,) = found.records.runs.values()
-    found.records.add(dataclasses.replace(run, plan={**run.plan, "velocity_tolerances": ()}))
-    first, *_, last = build_verdict(found.records).statements
+    assert eval(said.call_line, {"lv": lv, "problem": problem}).motion_error().speed <= 1e-4
+    (run,) = found.ranked_records.runs.values()
+    found.ranked_records.add(dataclasses.replace(run, plan={**run.plan, "velocity_tolerances": ()}))
+    first, *_, last = build_verdict(found.ranked_records).statements
     assert "down to 1e-3 of the error of the zero impulse" in first.text
     assert last.text.startswith("By motion error ") and "1e-3 m/s" in last.text
 
@@ -60,7 +60,7 @@ def test_without_motion_errors_there_is_nothing_to_show(tmp_path):
         ["stack(n=4)"], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=())
     )
     found = Report(plain)
-    assert len(found.by_speed) == 0 and found.speeds == ()
+    assert len(found.records_by_motion_error) == 0 and found.velocity_tolerances == ()
     assert table_specs.tabulate_motion_errors(found).rows == table_specs.tabulate_speeds(found).rows == []
     assert build_figures(plain).moved is None
     page = write(plain, tmp_path, figures=False).read_text(encoding="utf-8")
@@ -93,8 +93,11 @@ def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
     plan = bench.CampaignPlan(tolerances=(1e-3,), budgets=(1, 64), orders=(), motion=True)
     found = bench.run(["stack(n=4)", "stack(n=32)", str(tmp_path / "idle.npz")], ["pgs"], plan, workers=1)
     made = Report(found)
-    best = [min(r.motion_speed for r in made.records if r.case == case) for case in made.records.cases]
-    rows = statistics.robustness(made.by_speed)
+    best = [
+        min(r.motion_speed for r in made.ranked_records if r.case == case)
+        for case in made.ranked_records.cases
+    ]
+    rows = statistics.compute_robustness(made.records_by_motion_error)
     for row in rows:
         assert row.cases == len(best) == 2
         assert row.reached == {tolerance: sum(v <= tolerance for v in best) for tolerance in row.reached}

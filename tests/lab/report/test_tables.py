@@ -24,9 +24,13 @@ def test_times_of_a_table_have_one_unit_which_the_heads_name():
             ["never", Cell.time(float("inf")), Cell.time(640e-6)]]  # fmt: skip
     table = Table(["solver", "to 1e-3", "to 1e-6"], rows)
     assert table.heads == ["solver", "to 1e-3 [ms]", "to 1e-6 [ms]"]
-    assert table.texts == [["pgs", "0.298", "1.02 (7/8)"], ["jacobi", "33.1", NONE], ["never", NONE, "0.640"]]
-    again = replace(table, rows=table.rows[:1]).without("to 1e-3 [ms]")
-    assert again.heads == ["solver", "to 1e-6 [ms]"] and again.texts == [["pgs", "1.02 (7/8)"]]
+    assert table.cell_texts == [
+        ["pgs", "0.298", "1.02 (7/8)"],
+        ["jacobi", "33.1", NONE],
+        ["never", NONE, "0.640"],
+    ]
+    again = replace(table, rows=table.rows[:1]).without_columns("to 1e-3 [ms]")
+    assert again.heads == ["solver", "to 1e-6 [ms]"] and again.cell_texts == [["pgs", "1.02 (7/8)"]]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +88,9 @@ def titles(svg):
 def test_no_title_of_a_chart_is_cut():
     points = [(1.0, 1.0), (2.0, 0.1)]
     title = "a model with a long name of many words in a folder with a long name, to 1e-6; 4 more solvers not drawn"
-    figure = figures.Figure("x", title, "step", "error [m/s]", (figures.Curve.of("pgs", "pgs", points),))
+    figure = figures.Figure(
+        "x", title, "step", "error [m/s]", (figures.Curve.from_points("pgs", "pgs", points),)
+    )
     svg = plot_for_page(figure, {"pgs": 0})
     lines = titles(svg)
     assert " ".join(text for *_, text in lines) == title and len(lines) == 2
@@ -96,7 +102,7 @@ def test_no_title_of_a_chart_is_cut():
 
 def test_names_of_single_points_stand_to_the_right_of_all_points():
     points = [(x, x) for x in (1.0, 2.0, 9.0)]
-    curves = tuple(replace(figures.Curve.of(name, name, points), points=True) for name in ("a", "b"))
+    curves = tuple(replace(figures.Curve.from_points(name, name, points), points=True) for name in ("a", "b"))
     svg = plot_for_page(
         figures.Figure("x", "", "time [s]", "error [m/s]", curves), {"a": 0, "b": 1}, ("a", "b")
     )
@@ -106,7 +112,9 @@ def test_names_of_single_points_stand_to_the_right_of_all_points():
 
 
 def test_a_summary_page_has_a_drawing_for_a_screen_and_one_for_a_phone():
-    figure = figures.Figure("x", "t", "step", "error [m/s]", (figures.Curve.of("a", "a", [(1.0, 1.0)]),))
+    figure = figures.Figure(
+        "x", "t", "step", "error [m/s]", (figures.Curve.from_points("a", "a", [(1.0, 1.0)]),)
+    )
     html = SummaryPage(
         "title", "in 3.0 s", [PageSection("part", figures=[figure])], {}, warning="busy"
     ).render_html()
@@ -137,16 +145,16 @@ def sequence():
 
 
 def test_a_sequence_is_a_row_of_each_solver(sequence):
-    passes = statistics.passes(sequence)
+    passes = statistics.group_runs_by_pass(sequence)
     table = table_specs.tabulate_sequence(passes)
     assert table.heads == ["solver", "to 1e-6 [ms]", "to 1e-9 [ms]", "8 iterations"]
-    assert table.texts[0] == ["anderson", "4.00", "36.0", "1.0e-7"]
-    assert [row[0] for row in table.texts][:3] == ["anderson", "jacobi", "newton"]  # as fast as recorded
+    assert table.cell_texts[0] == ["anderson", "4.00", "36.0", "1.0e-7"]
+    assert [row[0] for row in table.cell_texts][:3] == ["anderson", "jacobi", "newton"]  # as fast as recorded
     assert len(table.rows) == 7 < len(table_specs.tabulate_passes(passes).rows)
 
 
 def test_a_figure_of_a_sequence_has_one_tolerance_and_few_solvers(sequence):
-    passes = statistics.passes(sequence)
+    passes = statistics.group_runs_by_pass(sequence)
     timed = [w for w in passes if w.mode == "tol" and w.tol == 1e-6]
     figure = figures.build_pass_figure("s", timed)
     assert {c.solver for c in figure.curves} == {"anderson", "jacobi", "newton", "nncg", "pgs"}

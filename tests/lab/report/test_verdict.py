@@ -7,7 +7,7 @@ import math
 import pytest
 
 from lavender import bench
-from lavender.base.deadline import seconds
+from lavender.base.deadline import format_seconds
 from lavender.lab.bench import statistics
 from lavender.lab.report import table_specs
 from lavender.lab.report.engine import read_engine_answers
@@ -19,7 +19,7 @@ from tests.lab.report.synthetic import BUDGET, example, interleaved, record, rec
 
 
 def test_numbers_are_written_with_what_they_know():
-    assert [seconds(t) for t in (1.0, 0.0123, 1e-3, 4.5e-5, 9e-8, 123.4, math.inf)] == [
+    assert [format_seconds(t) for t in (1.0, 0.0123, 1e-3, 4.5e-5, 9e-8, 123.4, math.inf)] == [
         "1.00 s", "12.3 ms", "1.00 ms", "45.0 µs", "0.09 µs", "123 s", "–",
     ]  # fmt: skip
     percents = [format_percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)]
@@ -41,9 +41,9 @@ def test_the_sentence_has_the_worst_case_and_the_line_its_command_in_c():
     assert said.in_c == "lavender export c liblavender --solver auto --records 'my report/records.jsonl'"
     # Of two runs put together: x never ran on b, which is no miss of its own.
     parts = build_verdict(records_of(record("a", "x", 0.004, 1e-9), record("b", "y", 9.0, 0.5)))
-    assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.text
+    assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.joined_text
     nobody = build_verdict(records_of(record("a", "x", 1.0, 0.5)))
-    assert nobody.text == "No solver brings your stack down to 1e-6 of the error of the zero impulse."
+    assert nobody.joined_text == "No solver brings your stack down to 1e-6 of the error of the zero impulse."
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_a_machine_is_busy_by_the_mean_over_the_runs():
     """A few runs may meet something else: load 6 on two cores is void, 2.3 is not."""
     for busy, told in ((20, "The machine was busy: load 6.0 on 2 cores"), (5, ""), (0, "")):
         made = [record(f"c{i}", "pgs", 1e-3, 1e-7, load=6.0 if i < busy else 1.1) for i in range(20)]
-        assert Report(records_of(*made)).busy[:41] == told
+        assert Report(records_of(*made)).busy_warning[:41] == told
 
 
 # -- the engine that recorded the steps -----------------------------------------------------------------------
@@ -122,20 +122,23 @@ def test_the_first_sentence_the_structures_and_the_engine_have_one_set_of_number
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
     charged = [t if x <= 1e-6 else 2.0 for t, x in answers]  # the limit is 2 s
-    score = statistics.geometric_mean(charged, statistics.MEAN_TIME_SHIFT)
-    ours = seconds(statistics.geometric_mean([40e-6, 80e-6], statistics.MEAN_TIME_SHIFT))
+    score = statistics.compute_geometric_mean(charged, statistics.MEAN_TIME_SHIFT)
+    ours = format_seconds(statistics.compute_geometric_mean([40e-6, 80e-6], statistics.MEAN_TIME_SHIFT))
     if solved:
-        assert f"in {seconds(score)} on average" in text or f"takes {seconds(score)} on average" in text
+        assert (
+            f"in {format_seconds(score)} on average" in text
+            or f"takes {format_seconds(score)} on average" in text
+        )
     else:
         assert "engine's own Newton solves none of them" in text
     assert "se auto: " in text and f"in {ours} on average" in text
     (structure,) = table_specs.tabulate_advice(made).rows
     assert structure[2].lead == "auto" and structure[2].text == ours
-    assert (seconds(score) in str(structure[-1])) == (solved > 0)
+    assert (format_seconds(score) in str(structure[-1])) == (solved > 0)
     table = table_specs.tabulate_engines(made)
     own = dict(zip(table.heads, table.rows[0], strict=True))
     assert (own["first here"], own["to 1e-6, here"]) == ("auto", ours)
-    assert own["to 1e-6"].startswith(seconds(score) if solved else "–")
+    assert own["to 1e-6"].startswith(format_seconds(score) if solved else "–")
     ends = ("interleaved", "inside the engine", "alone")
     rows = [line.split()[0] for line in shown(made).splitlines() if line.endswith(ends)]
     wanted = ["auto", "newton", "pgs"]
@@ -169,7 +172,7 @@ def test_tables_stay_within_the_terminal_and_nothing_is_cut(tmp_path, width):
     out = shown(found, width, complete=True)
     assert max(map(len, out.splitlines())) <= width
     assert "…" not in out
-    for line in found.lines:
+    for line in found.rankings:
         assert line.name in out
         for best in (a.best for a in (*line.by_tolerance.values(), *line.by_time.values())):
             assert best is None or best.solver in out

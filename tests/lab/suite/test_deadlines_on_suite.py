@@ -13,7 +13,7 @@ from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.lazy_import import import_numerics
 from lavender.judge import residuals
-from lavender.judge.residuals import judging_time
+from lavender.judge.residuals import estimate_judging_time
 from lavender.solvers.auto import Tree
 from lavender.solvers.costs import sweep_cost
 from lavender.solvers.newton_systems import augmented
@@ -108,14 +108,14 @@ def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
     """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
     problem = drawn(seed=95402, part="rolling").problem
     monkeypatch.setattr(augmented, "loading_time", lambda *of: 0.0)
-    made, factor, each = [], augmented.sparse_lu, 0.01
+    made, factor, each = [], augmented.factor_sparse_lu, 0.01
 
     def played(*of):
         made.append(clock.now)
         clock.now += each
         return factor(*of)
 
-    monkeypatch.setattr(augmented, "sparse_lu", played)
+    monkeypatch.setattr(augmented, "factor_sparse_lu", played)
     assert lv.solve(fresh(problem), "newton").success and len(made) > 20
     for name in ("newton", "auto"):
         made.clear()
@@ -150,7 +150,7 @@ def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
             asked += 1
             with monkeypatch.context() as patch:
                 patch.setattr(spec.load(), "prepare", None)
-                limit = 2.0 * judging_time(problem) + 0.9 * counted
+                limit = 2.0 * estimate_judging_time(problem) + 0.9 * counted
                 solution = lv.solve(problem, name, impulse=start, time_limit=limit)
             assert solution.status is lv.Status.TIME_LIMIT and "set up" in solution.message
             assert solution.solver.name == name and not solution.work
@@ -187,7 +187,7 @@ def test_an_answer_is_no_worse_than_its_start(name, limit):
 def test_the_judge_begins_only_what_he_can_end(name, clock):
     """What he sets up fits, his pass behind it does not."""
     problem = fresh(PROBLEMS[name]())
-    limit = residuals.setup_time(problem) + 0.9 * judging_time(problem)
+    limit = residuals.estimate_judge_setup_time(problem) + 0.9 * estimate_judging_time(problem)
     solution = lv.solve(problem, "newton", time_limit=limit)
     assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
     assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
@@ -199,4 +199,6 @@ def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
     problem = PROBLEMS["J and M, dense"]()
     residuals.get_reference(problem)
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
-    assert lv.solve(problem, name, time_limit=2.0 * judging_time(problem), max_iter=3).iterations == 3
+    assert (
+        lv.solve(problem, name, time_limit=2.0 * estimate_judging_time(problem), max_iter=3).iterations == 3
+    )

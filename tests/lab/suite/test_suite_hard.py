@@ -12,7 +12,7 @@ from lavender.lab.suite.friction import painleve, ramp, threshold
 def test_the_set_is_listed_and_every_family_is_used():
     assert suite.SETS["hard"] == hard.SET
     assert len(set(hard.SET)) == len(hard.SET)
-    names = {suite.parse(name)[0] for name in hard.SET}
+    names = {suite.parse_case_name(name)[0] for name in hard.SET}
     for family in hard.__all__:
         if callable(getattr(hard, family)) and family in suite.FAMILIES:
             assert family in names, family

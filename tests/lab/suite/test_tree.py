@@ -353,7 +353,7 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
-    monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
+    monkeypatch.setattr("lavender.solvers.certify.find_certificate_by_linear_program", lambda *asked: 1 / 0)
     certify_infeasibility(log)
     assert not log.stages
 

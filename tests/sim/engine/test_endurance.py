@@ -7,7 +7,7 @@ import pytest
 
 import lavender as lv
 from lavender.sim.scene import SCENES
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 STANDING = {"stack", "card_house", "heavy_on_light", "table", "ramp", "pyramid"}
 SMALLER = {"pyramid": {"base": 5}, "pile": {"n": 30, "kind": "mixed"}}  # the same with less to compute
@@ -21,7 +21,7 @@ def energy(scene, observation):
         if body.is_static:
             continue
         x, v = observation["positions"][i], observation["velocities"][i]
-        omega = rotation(observation["quaternions"][i]).T @ v[3:]
+        omega = convert_to_rotation_matrix(observation["quaternions"][i]).T @ v[3:]
         total += 0.5 * body.mass * v[:3] @ v[:3] + 0.5 * omega @ body.inertia @ omega - body.mass * g @ x
     return float(total)
 

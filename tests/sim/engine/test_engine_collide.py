@@ -10,7 +10,7 @@ from worked import after
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 MARGIN = 0.05
 
@@ -58,7 +58,10 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
     q = [y / np.linalg.norm(y) for y in q]
     half = [x[10:13] / 2, x[13:16] / 2]
     place = np.array([x[6], x[7], 1.2 * x[8]])
-    a, b = (half[0], np.zeros(3), rotation(q[0])), (half[1], place, rotation(q[1]))
+    a, b = (
+        (half[0], np.zeros(3), convert_to_rotation_matrix(q[0])),
+        (half[1], place, convert_to_rotation_matrix(q[1])),
+    )
     found = manifold(
         ("box", 2 * half[0], {"quaternion": q[0]}),
         ("box", 2 * half[1], {"quaternion": q[1], "position": place}),

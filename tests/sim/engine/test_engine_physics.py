@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.sim.engine.layout import SETTING
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 from lavender.sim.scene.steppers import STEPPERS
 
 G = 9.81
@@ -79,7 +79,7 @@ def test_a_closed_system_keeps_its_momentum(kind, stepper):
     def momentum(o):
         linear, angular = np.zeros(3), np.zeros(3)
         for b, x, q, v in zip(scene.bodies, o["positions"], o["quaternions"], o["velocities"], strict=True):
-            r = rotation(q)
+            r = convert_to_rotation_matrix(q)
             linear += b.mass * v[:3]
             angular += np.cross(x, b.mass * v[:3]) + r @ b.inertia @ r.T @ v[3:]
         return np.concatenate([linear, angular])
@@ -109,7 +109,7 @@ def test_a_tumbling_body_keeps_its_energy_to_second_order():
         energies = []
         for _ in range(round(5 / dt)):
             o = run(sim, 1)
-            local = rotation(o["quaternions"][0]).T @ o["velocities"][0, 3:]
+            local = convert_to_rotation_matrix(o["quaternions"][0]).T @ o["velocities"][0, 3:]
             energies.append(0.5 * local @ body.inertia @ local)
         drift.append(
             np.abs(

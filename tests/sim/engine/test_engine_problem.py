@@ -237,7 +237,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
 
 
 def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
-    monkeypatch.setattr(stepping, "motion_summary", None)
+    monkeypatch.setattr(stepping, "summarise_motion", None)
     *_, info = lv.Simulation("stack").step()
     assert "motion" not in info
 

@@ -12,7 +12,7 @@ from lavender_ext.engine.arrays import SHAPES, offsets
 
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
 def test_arrays_lie_where_the_engine_has_them(name):
-    state = State.of_scene(lv.Scene(name))
+    state = State.from_scene(lv.Scene(name))
     first = offsets(state.size)
     total = {"real": state.real, "index": state.index, "keys": state.keys}
     for buffer, names in SHAPES.items():

@@ -8,7 +8,7 @@ import pytest
 import lavender as lv
 from lavender.sim.engine.layout import SIZE
 from lavender.sim.scene import Box, Plane, Sphere
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 
 def test_the_readme_of_a_scene_by_hand():
@@ -259,7 +259,7 @@ def test_anchors_lie_where_they_were_given():
     j = scene.joints[0]
     for i, anchor, axis in ((a, j.anchor_a, j.axis_a), (b, j.anchor_b, j.axis_b)):
         body = scene.bodies[i]
-        r = rotation(body.quaternion)
+        r = convert_to_rotation_matrix(body.quaternion)
         np.testing.assert_allclose(body.position + r @ anchor, [0.5, 0.5, 0.5], atol=1e-15)
         np.testing.assert_allclose(r @ axis, np.array([1, 2, 3]) / np.sqrt(14), atol=1e-15)
     sim = lv.Simulation(scene)

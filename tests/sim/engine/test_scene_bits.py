@@ -12,7 +12,7 @@ from worked import python
 
 from lavender.base.errors import InputError
 from lavender.sim.scene import arithmetic
-from lavender.sim.scene.parts import quaternion, rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix, make_quaternion
 
 STARTS = """
 import hashlib, json, lavender as lv
@@ -50,7 +50,7 @@ def exact_sine(x, bits=400):
 
 @given(st.floats(-30.0, 30.0))
 def test_sine_and_cosine_are_the_nearest_numbers(angle):
-    sine, cosine = arithmetic.sine_cosine(angle)
+    sine, cosine = arithmetic.compute_sine_and_cosine(angle)
     assert sine == float(exact_sine(angle))
     assert abs(sine * sine + cosine * cosine - 1.0) <= 3 * 2.0**-53  # three roundings
     # cos x = 1 - 2 sin(x/2)^2; halving is exact but for the least numbers, whose cosine is 1
@@ -60,7 +60,7 @@ def test_sine_and_cosine_are_the_nearest_numbers(angle):
 @given(st.floats(-1e18, 1e18), st.sampled_from([1.0, 1e-9, 1e-100, 1e-300]))
 def test_sine_and_cosine_of_any_size_are_those_of_the_library_to_its_own_error(x, scale):
     angle = x * scale
-    sine, cosine = arithmetic.sine_cosine(angle)
+    sine, cosine = arithmetic.compute_sine_and_cosine(angle)
     # 2 ulp: what vectorised libraries promise
     assert sine == pytest.approx(np.sin(angle), rel=2**-51, abs=0.0)
     assert cosine == pytest.approx(np.cos(angle), rel=2**-51, abs=0.0)
@@ -69,7 +69,7 @@ def test_sine_and_cosine_of_any_size_are_those_of_the_library_to_its_own_error(x
 @pytest.mark.parametrize("angle", [np.inf, -np.inf, np.nan, 2.0**64])
 def test_an_angle_that_tells_nothing_is_refused(angle):
     with pytest.raises(InputError, match="an angle is"):
-        arithmetic.sine_cosine(angle)
+        arithmetic.compute_sine_and_cosine(angle)
 
 
 def test_inverse_and_rotations_are_those_of_linear_algebra():
@@ -77,21 +77,24 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     for _ in range(300):
         g = rng.normal(size=(3, 3))
         x = g @ g.T + 10.0 ** rng.uniform(-6, 0) * np.eye(3)
-        found = arithmetic.inverse(x)
+        found = arithmetic.invert_definite_matrix(x)
         assert np.array_equal(found, found.T)
         # an elimination without pivots is backward stable on definite matrices: some ulp times the condition
         assert np.abs(found @ x - np.eye(3)).max() <= 1e-14 * np.linalg.cond(x)
         r = np.linalg.qr(g)[0]
         r *= np.sign(np.linalg.det(r))
-        q = arithmetic.frame_quaternion(r)
+        q = arithmetic.convert_frame_to_quaternion(r)
         assert q[0] >= 0.0
-        np.testing.assert_allclose(rotation(q), r, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(convert_to_rotation_matrix(q), r, rtol=0.0, atol=1e-14)
         p = rng.normal(size=3)
-        np.testing.assert_allclose(arithmetic.rotate(r, p), r @ p, rtol=0.0, atol=1e-14)
-        np.testing.assert_allclose(arithmetic.rotate_back(r, p), r.T @ p, rtol=0.0, atol=1e-14)
-        assert arithmetic.norm(p) == pytest.approx(np.linalg.norm(p), rel=1e-15)
+        np.testing.assert_allclose(arithmetic.rotate_vector(r, p), r @ p, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(arithmetic.rotate_vector_back(r, p), r.T @ p, rtol=0.0, atol=1e-14)
+        assert arithmetic.compute_norm(p) == pytest.approx(np.linalg.norm(p), rel=1e-15)
     np.testing.assert_allclose(
-        rotation(quaternion((0, 0, 2), np.pi / 2)), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], rtol=0.0, atol=1e-15
+        convert_to_rotation_matrix(make_quaternion((0, 0, 2), np.pi / 2)),
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        rtol=0.0,
+        atol=1e-15,
     )
 
 
@@ -99,10 +102,10 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     "x", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3)), np.diag([np.nan, 1, 1])]
 )
 def test_what_has_no_inverse_says_so(x):
-    assert arithmetic.inverse(x) is None
+    assert arithmetic.invert_definite_matrix(x) is None
 
 
 def test_half_turns_have_quaternions():
     for axis in np.eye(3):
         r = 2.0 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_array_equal(arithmetic.frame_quaternion(r), [0.0, *axis])
+        np.testing.assert_array_equal(arithmetic.convert_frame_to_quaternion(r), [0.0, *axis])

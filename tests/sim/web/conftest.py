@@ -8,7 +8,7 @@ from worked import chromium
 from lavender.base.errors import LavenderError
 from lavender.sim.engine import SOLVER_FIELDS
 from lavender.sim.web import pages
-from lavender.sim.web.compile import missing_requirement
+from lavender.sim.web.compile import explain_missing_requirement
 
 PATIENCE = 600_000  # ms, for what hangs: on a loaded machine a page takes its time
 
@@ -19,10 +19,10 @@ def address(tmp_path_factory):
     try:
         pages.write_page(folder)
     except LavenderError as error:
-        if not missing_requirement():  # what it is made with is there: it must be made
+        if not explain_missing_requirement():  # what it is made with is there: it must be made
             raise
         pytest.skip(str(error))
-    server = pages.server(folder)
+    server = pages.create_file_server(folder)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield f"http://127.0.0.1:{server.server_address[1]}/"

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from newton_steps import NewtonSteps
 
 import lavender as lv
-from lavender.sim.web.scenes import describe, layout
+from lavender.sim.web.scenes import describe_layout, describe_snapshot
 
 STEPS = 300
 BLOW = [
@@ -113,7 +113,7 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
         "substeps": scene.parameters.substeps,
         "steps": steps,
         "changes": {str(step): change for step, change in changes.items()},
-        **describe(start),
+        **describe_snapshot(start),
         "states": writer.put(states, "<f8"),
         "values": writer.put(values, "<f8"),
         "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
@@ -141,7 +141,7 @@ def record_newton(writer, name, parameters, changes):
         "newton_substeps": run.substeps,
         "steps": NEWTON_STEPS,
         "changes": {str(step): change for step, change in changes.items()},
-        **describe(start),
+        **describe_snapshot(start),
         "met": sum(how > 0 for how in run.ended),
         "solved": len(run.ended),
         "states": writer.put(states, "<f8"),
@@ -157,7 +157,7 @@ def record(folder, steps=STEPS):
     writer = Writer()
     scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
     newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
-    contents = {"layout": layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "newton": newton}
+    contents = {"layout": describe_layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "newton": newton}
     path = Path(folder) / "recording.json"
     path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
     path.with_suffix(".bin").write_bytes(b"".join(writer.parts))

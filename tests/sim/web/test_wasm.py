@@ -15,7 +15,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
 from lavender.sim.web import extract_c, pages
-from lavender.sim.web.scenes import describe, page_scenes
+from lavender.sim.web.scenes import collect_page_data, describe_snapshot
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -23,7 +23,9 @@ CHECK = HERE / "check_wasm_exports.mjs"
 # Left out where the kernels run with every check on: the module is compiled without them either way.
 pytestmark = pytest.mark.slow
 
-needs_compiler = pytest.mark.skipif(bool(wasm.missing_requirement()), reason=wasm.missing_requirement())
+needs_compiler = pytest.mark.skipif(
+    bool(wasm.explain_missing_requirement()), reason=wasm.explain_missing_requirement()
+)
 
 
 @pytest.fixture(scope="session")
@@ -137,25 +139,27 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 
 def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(wasm, "missing_requirement", lambda: "no compiler")
+    monkeypatch.setattr(wasm, "explain_missing_requirement", lambda: "no compiler")
     monkeypatch.setattr(pages, "SHIPPED", tmp_path)
     with pytest.raises(
         LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
     ):
-        pages.module()
-    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, b"0" * 64)
+        pages.get_module()
+    other = b"\0asm\1\0\0\0" + wasm.make_custom_section(wasm.SOURCES_SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
     with pytest.raises(LavenderError, match="is of other kernels"):
-        pages.module()
-    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, wasm.source_hash(ROOT).encode())
+        pages.get_module()
+    fresh = b"\0asm\1\0\0\0" + wasm.make_custom_section(
+        wasm.SOURCES_SECTION, wasm.hash_sources(ROOT).encode()
+    )
     (tmp_path / "lavender.wasm").write_bytes(fresh)
-    assert pages.module() == fresh
+    assert pages.get_module() == fresh
 
 
 def test_hash_covers_what_is_cimported():
     # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
-    with_rows = wasm.source_hash(ROOT, ["judge.measure"])
-    assert with_rows != wasm.source_hash(ROOT, ["sweep.serial"]) != wasm.source_hash(ROOT)
+    with_rows = wasm.hash_sources(ROOT, ["judge.measure"])
+    assert with_rows != wasm.hash_sources(ROOT, ["sweep.serial"]) != wasm.hash_sources(ROOT)
     assert extract_c.CIMPORT.findall(
         "from lavender_ext.core.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
     ) == ["core.rows"]
@@ -208,10 +212,10 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
 
 
 def test_page_scenes_are_the_start_of_native_ones():
-    contents = json.loads(json.dumps(page_scenes()))
+    contents = json.loads(json.dumps(collect_page_data()))
     gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
     assert sorted(scene["name"] for scene in contents["scenes"]) == sorted(gallery)
     for scene in contents["scenes"]:
         start = lv.Simulation(scene["name"]).snapshot()
-        assert scene == scene | describe(start)
+        assert scene == scene | describe_snapshot(start)
         assert len(scene["bodies"]) == scene["size"][0]

@@ -15,7 +15,7 @@ from typing import Any
 
 from lavender.base.errors import reject_former_names
 from lavender.batch.solve import solve_many
-from lavender.lab.bench.cases import Item, Source, resolve
+from lavender.lab.bench.cases import Item, Source, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
@@ -35,7 +35,7 @@ EXTRA_REPETITION_TIME = 3.0
 # All repetitions together may take this multiple of the plan's time limit; MIN_REPETITIONS are always made.
 TIME_LIMIT_MULTIPLE = 20.0
 CASES_IN_MEMORY = 32  # Number of cases that are loaded at the same time.
-# Problems are timed as one batch if the largest has at most this multiple of the smallest's rows.
+# Problems are timed as one batch if the largest has up to this multiple of the smallest's rows.
 MAX_SIZE_RATIO = 10
 
 RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement, one of each repetition
@@ -76,7 +76,7 @@ def time_alternately(
     names = list(dict.fromkeys(call.solver for call in call_specs))
     with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
-        described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
+        described = [(i, known.cases[i.name]) for i in resolve_sources(cases) if i.name in known.cases]
         identity = repr([call_specs, [info.sha for _, info in described]])
         alternation = _Alternation(runner, call_specs, hashlib.sha256(identity.encode()).hexdigest()[:12])
         single = [(i, info) for i, info in described if not i.sequence]
@@ -87,13 +87,13 @@ def time_alternately(
                 sequences.setdefault(item.sequence, []).append((item, info))
         for part in (*parts, *sequences.values()):
             fraction = len(part) / len(described)
-            alternation.measure_part(
+            alternation.repeat_calls_on(
                 part,
                 fraction * TIME_LIMIT_MULTIPLE * plan.time_limit,
                 fraction * EXTRA_REPETITION_TIME,
             )
             for item, _ in part:
-                item.forget()
+                item.release_problem()
     return known
 
 
@@ -108,7 +108,7 @@ class _Alternation:
                 runner.out.add(record)
                 runner.report_progress(record.case, record.solver, record, True)
 
-    def measure_part(self, part: Cases, limit: float, extra: float) -> None:
+    def repeat_calls_on(self, part: Cases, limit: float, extra: float) -> None:
         """Repeat all calls on some cases or one sequence: at most `limit` [s], above the default number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
         call_specs = [
@@ -116,7 +116,7 @@ class _Alternation:
             for a in self.call_specs
             if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence
         ]
-        accepted = {call: [(i, info) for i, info in part if self.accepts(call, i)] for call in call_specs}
+        accepted = {call: [(i, info) for i, info in part if self.can_time(call, i)] for call in call_specs}
         records: RecordsByKey = {}
         start_time = perf_counter()
         for repetition in range(MAX_REPETITIONS):
@@ -133,14 +133,14 @@ class _Alternation:
                 for item, info in part:
                     for call in order:
                         if call.timing_mode != "batch" and any(info is other for _, other in accepted[call]):
-                            self.add(records, self.time_case(call, item, info, None)[0])
+                            self.add_record(records, self.time_case(call, item, info, None)[0])
             for call in order:
                 if call.timing_mode == "batch" and _is_batch(accepted[call], is_sequence):
                     self.time_batch(call, accepted[call], records)
         for repeated in records.values():
-            self.runner.keep(_merge(repeated))
+            self.runner.add_entry(_merge_repetitions(repeated))
 
-    def accepts(self, call: CallSpec, item: Item) -> bool:
+    def can_time(self, call: CallSpec, item: Item) -> bool:
         """Whether the solver of a call can be timed on a case."""
         spec = self.runner.specs[call.solver]
         if is_foreign(spec) and (call.timing_mode == "batch" or call.mode == "time"):
@@ -155,9 +155,9 @@ class _Alternation:
             "interleave_group": self.interleave_group,
             "guarded": False,
         }
-        return Task.of(info, call, **more)
+        return Task.from_call_spec(info, call, **more)
 
-    def add(self, records: RecordsByKey, record: Record | None) -> None:
+    def add_record(self, records: RecordsByKey, record: Record | None) -> None:
         """Collect a record unless it was stored before."""
         if record is not None and record.key not in self.known:
             records.setdefault(record.key, []).append(record)
@@ -180,7 +180,7 @@ class _Alternation:
         before = None
         for item, info in steps:
             record, before = self.time_case(call, item, info, before)
-            self.add(records, record)
+            self.add_record(records, record)
 
     def time_batch(self, call: CallSpec, cases: Cases, records: RecordsByKey) -> None:
         """Time one call of `solve_many`; each problem's record has an equal part of the time."""
@@ -194,13 +194,14 @@ class _Alternation:
             solutions = solve_many(problems, call.solver, tol=call.tol, max_iter=call.max_iter or None)
         except Exception as error:  # Only the records of this call are lost.
             for task in tasks:
-                self.add(
-                    records, task.record(status="ERROR", message=f"{type(error).__name__}: {error}"[:500])
+                self.add_record(
+                    records,
+                    task.make_record(status="ERROR", message=f"{type(error).__name__}: {error}"[:500]),
                 )
             return
         time_per_problem = (perf_counter() - start_time) / len(cases)
         for task, s in zip(tasks, solutions, strict=True):
-            self.add(
+            self.add_record(
                 records, make_record(task, s, make_outcome(s, [s], [time_per_problem], calibration_time))
             )
 
@@ -211,7 +212,7 @@ def _is_batch(cases: Cases, is_sequence: bool) -> bool:
     return len(rows) > 1 and (is_sequence or max(rows) <= MAX_SIZE_RATIO * min(rows))
 
 
-def _merge(records: Sequence[Record]) -> Record:
+def _merge_repetitions(records: Sequence[Record]) -> Record:
     """Return the last record, with the times of all repetitions."""
     times = [t for r in records for t in r.times]
     calibration_times = [r.calibration_time for r in records if r.calibration_time is not None]

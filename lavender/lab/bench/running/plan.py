@@ -59,7 +59,7 @@ class Plan:
         contradicted if its distance from the solution is larger than its residual allows.
     velocity_tolerances : sequence of float, m/s
         Motion errors to reach; implies `motion`. Each solver is run to the residual that is estimated to reach them,
-        with tighter residuals if it does not, at most `MAX_SPEED_TRIES` times per tolerance.
+        with tighter residuals if it does not, up to `MAX_SPEED_TRIES` times per tolerance.
     times : sequence of float, s
         Time budgets for which the report recommends a solver.
     sweeps : sequence of int
@@ -125,7 +125,7 @@ class Plan:
 
     timing_mode = "call"  # value of `Record.timing_mode` for single problems
 
-    def iteration_limit(self) -> int:
+    def get_max_iterations(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""
         return UNLIMITED_ITERATIONS
 
@@ -133,7 +133,7 @@ class Plan:
         """Return the fields, for the description of a run."""
         return asdict(self)
 
-    def measure(
+    def measure_solver(
         self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
     ) -> None:
         """Measure one solver on one case; each record decides the next measurement.
@@ -149,12 +149,12 @@ class Plan:
                 spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
             )
             more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
-            return make(Task.of(info, call_spec, **more))
+            return make(Task.from_call_spec(info, call_spec, **more))
 
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
-        max_iterations = self.iteration_limit() if spec.resumable else 0
+        max_iterations = self.get_max_iterations() if spec.resumable else 0
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
                 record = measure_one("tol", tolerance, max_iterations, start)
@@ -163,7 +163,9 @@ class Plan:
                 ):
                     break
             if not spec.exact:
-                self._to_speeds(partial(measure_one, "tol", max_iter=max_iterations, start=start))
+                self._solve_to_velocity_tolerances(
+                    partial(measure_one, "tol", max_iter=max_iterations, start=start)
+                )
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
                     measure_one("budget", 0.0, n, start)
@@ -177,7 +179,7 @@ class Plan:
                     "budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {})
                 )
 
-    def _to_speeds(self, solve_to: Callable[[float], Record]) -> None:
+    def _solve_to_velocity_tolerances(self, solve_to: Callable[[float], Record]) -> None:
         """Solve to each velocity tolerance. The ratio of motion error to residual is taken from the previous solve."""
         tol = FIRST_TOL
         last: Record | None = None
@@ -215,7 +217,7 @@ class CampaignPlan(Plan):
     campaign: bool = True
     timing_mode = ""  # No times are measured.
 
-    def iteration_limit(self) -> int:
+    def get_max_iterations(self) -> int:
         """Return `cap`."""
         return self.cap
 

@@ -21,18 +21,18 @@ from typing import Any
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, reject_former_names
 from lavender.judge.solution import CONTRADICTED
-from lavender.judge.states import states_of
+from lavender.judge.states import compute_states
 from lavender.lab import motion
 from lavender.lab.bench import machine
-from lavender.lab.bench.cases import Item, Source, describe, fingerprint, resolve, resolve_again
+from lavender.lab.bench.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
 from lavender.lab.bench.running.plan import CampaignPlan, Plan, list_passes
-from lavender.lab.bench.running.timing import CallSpec, Task, measure, one_thread
+from lavender.lab.bench.running.timing import CallSpec, Task, limit_to_one_thread, measure_task
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
-from lavender.lab.bench.store import Records, Store, opened
+from lavender.lab.bench.store import Records, Store, open_store
 from lavender.lab.motion import load_reference
-from lavender.lab.motion.bound import separation
+from lavender.lab.motion.bound import compute_separation
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclose_reference
 from lavender.problem import Problem, check_problem
@@ -71,7 +71,7 @@ class Event:
     remaining: float | None = None
 
 
-def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
+def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
     """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
     check_problem(problem)
     return problem.carry((before, impulse))
@@ -87,7 +87,9 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
     problem, impulse = problem.disk, problem.on_disk(impulse)
     found = motion.get_solutions(problem, MOTION_SEARCH_RUNS) if problem.law == "coulomb" else None
     error = (
-        motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
+        motion.motion_error(problem, impulse)
+        if found is None
+        else motion.measure_distance_to_nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
     with_motion = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
@@ -95,10 +97,10 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
     if (
         record.claims
         and record.status != "INFEASIBLE"
-        and reference.enclosed
+        and reference.is_enclosed
         and reference.witness is not None
     ):
-        apart, allowed = separation(problem, as_reference(problem, impulse), reference)
+        apart, allowed = compute_separation(problem, as_reference(problem, impulse), reference)
         if apart > allowed:
             words = (
                 f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"
@@ -110,12 +112,12 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
 
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
     """Return the record with the hash of its impulses (m,) [N s] and the fraction of blocks at a boundary."""
-    fraction = states_of(problem, impulse).boundary_fraction
+    fraction = compute_states(problem, impulse).boundary_fraction
     solution_hash = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
     return replace(record, solution_hash=solution_hash, boundary_fraction=fraction)
 
 
-def without_times(record: Record, time_limit: float) -> Record:
+def remove_times(record: Record, time_limit: float) -> Record:
     """Return the record of a campaign: equal on all machines, with the time limit [s] of the plan."""
     nan = math.nan
     return replace(
@@ -129,7 +131,7 @@ def is_foreign(spec: SolverSpec) -> bool:
     return spec.from_entry_point or (spec.builtin and (spec.external or bool(spec.requires)))
 
 
-def solver_names(names: str | Sequence[str] | None) -> list[str]:
+def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
     """Return the names of the solvers to run: the named ones, each of them installed, or every installed solver.
 
     Raises
@@ -207,17 +209,17 @@ def run(
     plan = plan or (CampaignPlan() if spread else Plan())
     if spread and not plan.campaign:
         raise InputError("workers disturb each other's times: give a CampaignPlan, or workers=1")
-    items = resolve(cases)
+    items = resolve_sources(cases)
     if plan.campaign:
         items = [replace(item, sequence="", step=-1) for item in items]
-    names = solver_names(solvers)
+    names = select_solver_names(solvers)
     packages = {module for name in names for module in registry.specs()[name].requires}
-    this = machine.describe(plan.as_dict(), packages)
+    this = machine.describe_run(plan.as_dict(), packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         if into is not None:
             into.append(runner.out)
-        return runner.run(items, workers, backend, memory)
+        return runner.measure_items(items, workers, backend, memory)
 
 
 @contextlib.contextmanager
@@ -232,7 +234,11 @@ def open_runner(
     reuse: bool = True,
 ) -> Iterator[Runner]:
     """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
-    with opened(store) as kept, Worker(memory) as worker, one_thread():  # Describing a case uses BLAS, too.
+    with (
+        open_store(store) as kept,
+        Worker(memory) as worker,
+        limit_to_one_thread(),
+    ):  # Describing a case uses BLAS, too.
         yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
@@ -260,7 +266,7 @@ class Runner:
         # Descriptions of a campaign are reused: many cases take longer to describe than to load.
         self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
 
-    def keep(self, entry: Entry) -> None:
+    def add_entry(self, entry: Entry) -> None:
         """Add an entry to the returned records and to the store."""
         self.out.add(entry)
         if self.store is not None:
@@ -277,14 +283,14 @@ class Runner:
                 )
             )
 
-    def run(
+    def measure_items(
         self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
     ) -> Records:
         """Measure every case and sequence; by the workers of a joblib backend if one is named."""
         self.total = len(items) * len(self.names)
-        self.keep(replace(self.this, whole=False))
+        self.add_entry(replace(self.this, whole=False))
         if backend:
-            self.distribute(items, workers, backend, memory)
+            self.distribute_pairs(items, workers, backend, memory)
         else:
             for name, group in _group_sequences(items):
                 if name:
@@ -292,12 +298,12 @@ class Runner:
                 else:
                     self.measure_case(group[0])
                 for item in group:
-                    item.forget()
-        self.keep(self.this)
+                    item.release_problem()
+        self.add_entry(self.this)
         self.report_progress("", "")
         return self.out
 
-    def distribute(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
+    def distribute_pairs(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
         """Measure the pairs of a campaign with workers, and store the entries of each pair when a worker returns them.
 
         Raises
@@ -308,7 +314,7 @@ class Runner:
         import joblib
 
         if backend == "loky" and memory is None:
-            memory = machine.memory_share(joblib.effective_n_jobs(workers))
+            memory = machine.get_memory_share(joblib.effective_n_jobs(workers))
         local = tuple(
             spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.from_entry_point)
         )
@@ -368,8 +374,8 @@ class Runner:
         """Load and describe a case. Return None, with a note in the records, if it does not load."""
         try:
             info = self.described.get(item.name)
-            if info is None or info.sha != fingerprint(item.problem):
-                info = describe(item, self.this.run)
+            if info is None or info.sha != hash_problem(item.problem):
+                info = describe_case(item, self.this.run)
             if self.plan.motion:
                 load_reference(item.problem, item.source)
             if self.plan.prove:
@@ -381,19 +387,19 @@ class Runner:
                 )
                 info = replace(info, proof=proof)
         except Exception as error:  # A reader may raise any exception; only its own case is lost.
-            self.keep(
+            self.add_entry(
                 Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
             )
             self.report_progress(item.name, "")
             return None
         if not item.sequence:
-            self.keep(info)
+            self.add_entry(info)
         return info
 
     def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
         """Measure every solver on a case outside sequences; `info` is its description, if it is known."""
         if info is not None:
-            self.keep(info)
+            self.add_entry(info)
         else:
             info = self.load_case(item)
         for name in self.names:
@@ -412,7 +418,7 @@ class Runner:
             if info is not None
         ]
         for _, info in steps:
-            self.keep(info)
+            self.add_entry(info)
         for name in self.names:
             spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
@@ -424,14 +430,17 @@ class Runner:
     def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: CallSpec) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
-        tasks = [Task.of(info, call, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
+        tasks = [
+            Task.from_call_spec(info, call, repeats=repeats, time_limit=self.plan.time_limit)
+            for _, info in steps
+        ]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
             record = self.known.get(task.key)
             if record is None or spent > limit:
                 break
-            spent, made = spent + _elapsed_time(record), made + 1
+            spent, made = spent + _get_elapsed_time(record), made + 1
             self.out.add(record)
             self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
@@ -449,16 +458,16 @@ class Runner:
             ):
                 task = replace(task, guarded=False)
             record, before = self.measure_step(problems[made].problem, task, spec, before)
-            self.keep(record)
+            self.add_entry(record)
             self.report_progress(record.case, spec.name, record)
-            spent, made = spent + _elapsed_time(record), made + 1
+            spent, made = spent + _get_elapsed_time(record), made + 1
         if made < len(tasks):
             target = describe_target(call.mode, call.tol, call.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--sequence-time-limit)"
             )
-            self.keep(
+            self.add_entry(
                 Skip(self.this.run, f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
             )
 
@@ -469,7 +478,7 @@ class Runner:
         start = None
         if task.start == "carried":
             begun = perf_counter()
-            start = problem.start() if before is None else carry(*before, problem)
+            start = problem.start() if before is None else carry_impulses(*before, problem)
             task = replace(task, lead=perf_counter() - begun)
         record, impulse = self.make_record(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
@@ -487,7 +496,9 @@ class Runner:
         other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
             other = None  # It is run under its own name.
-        self.keep(Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason))
+        self.add_entry(
+            Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason)
+        )
         return other
 
     def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
@@ -505,11 +516,11 @@ class Runner:
                 self.out.add(record)
             else:
                 record = self.make_record(problem, task, spec, None)[0]
-                self.keep(record)
+                self.add_entry(record)
             self.report_progress(info.case, name, record, reused)
             return record
 
-        self.plan.measure(info, problem, spec, measure_task)
+        self.plan.measure_solver(info, problem, spec, measure_task)
 
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
@@ -517,17 +528,17 @@ class Runner:
             # The clock ends only processes of other packages' solvers.
             task = replace(task, time_limit=math.inf)
         if self.worker is not None and is_foreign(spec):
-            record, found = self.worker.measure(replace(problem, copy=False), task, impulse)
+            record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
         else:
-            record, found = measure(problem, task, impulse)
+            record, found = measure_task(problem, task, impulse)
         if found is not None:
             record = add_solution_hash(record, problem, found)
         if self.plan.motion:
             record = add_motion_error(record, problem, found)
-        return without_times(record, self.plan.time_limit) if self.plan.campaign else record, found
+        return remove_times(record, self.plan.time_limit) if self.plan.campaign else record, found
 
 
-def _elapsed_time(record: Record) -> float:
+def _get_elapsed_time(record: Record) -> float:
     """Return the time [s] that a record took, from its fields, so that a resumed pass ends at the same step."""
     spent = record.time_median * record.repeats
     return spent if math.isfinite(spent) else record.time_limit
@@ -579,13 +590,13 @@ class Order:
 
 
 @cache
-def _isolated_worker(memory: int) -> Worker:
+def _get_isolated_worker(memory: int) -> Worker:
     """Return the process for third-party solvers, one in each worker, which all pairs use."""
     return Worker(memory)
 
 
 @contextlib.contextmanager
-def _register(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
+def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
     """Register solvers of the parent for one pair: the worker may serve another run later."""
     before = registry.specs() if specs else {}
     try:
@@ -605,9 +616,9 @@ _last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
 def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
     """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its entries."""
     global _last_case
-    shared = machine.memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
-    with _register(order.local), one_thread(pair.solver):
-        runner = Runner(order.run, order.plan, [pair.solver], worker=_isolated_worker(shared))
+    shared = machine.get_memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
+    with _register_solvers(order.local), limit_to_one_thread(pair.solver):
+        runner = Runner(order.run, order.plan, [pair.solver], worker=_get_isolated_worker(shared))
         runner.known = {record.key: record for record in pair.known}
         runner.described = {} if pair.info is None else {pair.case: pair.info}
         key, item, info = None, None, None
@@ -616,7 +627,7 @@ def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
             key = order.run.run, pair.case, pair.source, changed
             if _last_case[0] == key:
                 _, item, info = _last_case
-        item = item or resolve_again(pair.source, pair.case, pair.reason)
+        item = item or resolve_item(pair.source, pair.case, pair.reason)
         runner.measure_case(item, info)
     out = runner.out
     _last_case = key, item, out.cases.get(pair.case)

@@ -23,9 +23,9 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import import_numerics
 from lavender.judge.residuals import get_reference
-from lavender.judge.solution import Claim, Solution, Status, uninterrupted
+from lavender.judge.solution import Claim, Solution, Status, raise_if_interrupted
 from lavender.lab.bench import machine
-from lavender.lab.bench.record import ERROR, CaseInfo, Record, measurement_key
+from lavender.lab.bench.record import ERROR, CaseInfo, Record, make_measurement_key
 from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.lab.bench.timed_call import make_call_arguments
 from lavender.problem import Problem
@@ -92,14 +92,14 @@ class Task:
     @property
     def key(self) -> tuple[Any, ...]:
         """The `Record.key` of the measurement."""
-        return measurement_key(self)
+        return make_measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, call: CallSpec, **arguments: Any) -> Task:
+    def from_call_spec(cls, info: CaseInfo, call: CallSpec, **arguments: Any) -> Task:
         """Create the task of a `CallSpec` on a case."""
         return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(call), **arguments})
 
-    def record(self, **results: Any) -> Record:
+    def make_record(self, **results: Any) -> Record:
         """Create a record of this task with `results`."""
         order, seed = str(self.options.get("order", "given")), int(self.options.get("seed", 0))
         shared = {name: getattr(self, name) for name in _SHARED}
@@ -127,7 +127,7 @@ def _warm_up(solver: str) -> None:
 
 
 @cache
-def _thread_pools(solver: str) -> Any:
+def _get_thread_pools(solver: str) -> Any:
     """Return the controller of the BLAS and OpenMP libraries that are loaded with a solver."""
     # The search takes some milliseconds: do it once per solver, after its own libraries and SciPy's are loaded.
     from threadpoolctl import ThreadpoolController
@@ -137,19 +137,19 @@ def _thread_pools(solver: str) -> Any:
 
 
 @contextmanager
-def one_thread(solver: str = "") -> Iterator[None]:
+def limit_to_one_thread(solver: str = "") -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread, also the libraries that `solver` brings once it is imported."""
-    with _thread_pools(solver).limit(limits=1):
+    with _get_thread_pools(solver).limit(limits=1):
         yield
 
 
 @contextmanager
-def _stable_timing(solver: str) -> Iterator[None]:
+def _stabilise_timing(solver: str) -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread and turn the garbage collector off."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
-        with one_thread(solver):
+        with limit_to_one_thread(solver):
             yield
     finally:
         if was_enabled:
@@ -200,7 +200,7 @@ class Outcome:
     status_conflict: str = ""
 
 
-def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
+def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
     """Make one measurement. An exception of the solver becomes a record of status ERROR.
 
     Parameters
@@ -219,10 +219,10 @@ def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, 
     KeyboardInterrupt
         Ctrl-C was pressed; nothing is recorded.
     """
-    return judge_outcome(problem, task, attempt(problem, task, impulse))
+    return judge_outcome(problem, task, attempt_task(problem, task, impulse))
 
 
-def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
+def attempt_task(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
     runs: list[tuple[Solution, float]] = []  # (solution, time of the call)
     calibration_times: list[float] = []
@@ -230,22 +230,22 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     guard: Solution | None = None
     try:
         _warm_up(task.solver)
-        with _stable_timing(task.solver):
+        with _stabilise_timing(task.solver):
             start_time = perf_counter()
             if task.timing_mode and task.guarded:
                 # A plug-in may not test convergence: run it with its own iteration limit first, as a larger one might
                 # never be reached.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
-                guard = uninterrupted(
+                guard = raise_if_interrupted(
                     _prepare_and_solve(problem, task if tests else replace(task, max_iter=0), impulse)
                 )
                 if not tests and _ended_by_budget(guard, task):
-                    guard = uninterrupted(_prepare_and_solve(problem, task, impulse))
+                    guard = raise_if_interrupted(_prepare_and_solve(problem, task, impulse))
             remaining = max(1, task.repeats - (guard is not None))
             while remaining and (guard is None or guard.status is not Status.TIME_LIMIT):
                 calibration_times.append(measure_calibration_time())
                 if not task.timing_mode:
-                    parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
+                    parts = raise_if_interrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
                     with measure_backend_time(task.solver) as time_in_backend:
@@ -263,7 +263,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
             solution = runs[-1][0] if runs else guard
             if guard is None and task.timing_mode and _ended_by_budget(solution, task):
                 # The solve needs more iterations than the solver's default limit: repeat it with a guarded solve.
-                return attempt(problem, replace(task, guarded=True), impulse)
+                return attempt_task(problem, replace(task, guarded=True), impulse)
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
@@ -342,13 +342,13 @@ def _time_call(problem: Problem, task: Task, impulse: Any, guard: Solution | Non
         arguments["impulse"] = problem.start() if impulse is None else impulse
     start_time = perf_counter()
     solution = solve(fresh, task.solver, **arguments)
-    return uninterrupted(solution), perf_counter() - start_time + task.lead
+    return raise_if_interrupted(solution), perf_counter() - start_time + task.lead
 
 
 def judge_outcome(problem: Problem, task: Task, outcome: Outcome | str) -> tuple[Record, FloatArray | None]:
     """Judge an outcome on `problem`; return its record, and its impulses (m,) [N s] if they are finite."""
     if isinstance(outcome, str):
-        return task.record(status=ERROR, message=outcome[:500]), None
+        return task.make_record(status=ERROR, message=outcome[:500]), None
     solution = make_solution(problem, task, outcome)
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
     return make_record(task, solution, outcome), impulse
@@ -402,7 +402,7 @@ def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
     setups, solves = outcome.setups, outcome.solves
     times = outcome.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual
-    return task.record(
+    return task.make_record(
         status=s.status.name,
         relative=float(r.relative),
         energy=float(r.energy),
@@ -428,6 +428,6 @@ def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
         times=outcome.times if task.timing_mode else (),
         residual_per_repeat=outcome.residual_per_repeat,
         calibration_time=outcome.calibration_time,
-        load=machine.running(),
+        load=machine.count_runnable_processes(),
         backend_time_min=outcome.backend_time,
     )

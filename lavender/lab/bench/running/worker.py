@@ -17,10 +17,10 @@ from lavender.base.errors import LavenderError
 from lavender.base.lazy_import import import_numerics
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
-from lavender.lab.bench.cases import fingerprint
-from lavender.lab.bench.machine import memory_share
+from lavender.lab.bench.cases import hash_problem
+from lavender.lab.bench.machine import get_memory_share
 from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
-from lavender.lab.bench.running.timing import Outcome, Task, attempt, judge_outcome, make_solution
+from lavender.lab.bench.running.timing import Outcome, Task, attempt_task, judge_outcome, make_solution
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.solve import Prepared, check_time_limit, solve
@@ -46,20 +46,22 @@ class Worker:
     Parameters
     ----------
     memory : int, optional, bytes
-        Limit of the worker's address space if the system has one; `machine.memory_share()` if None.
+        Limit of the worker's address space if the system has one; `machine.get_memory_share()` if None.
     """
 
     def __init__(self, memory: int | None = None) -> None:
-        self.memory = memory_share() if memory is None else memory
+        self.memory = get_memory_share() if memory is None else memory
         self._process = ProcessBackend(run_task, memory=self.memory or 0, environment=ONE_THREAD)
         self._problem_hash = ""  # of the problem that the process holds
 
-    def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
-        """Equivalent to `lavender.lab.bench.running.timing.measure`, in the worker."""
+    def measure_task(
+        self, problem: Problem, task: Task, impulse: Any = None
+    ) -> tuple[Record, FloatArray | None]:
+        """Equivalent to `lavender.lab.bench.running.timing.measure_task`, in the worker."""
         try:
-            return judge_outcome(problem, task, self._run(problem, task, impulse))
+            return judge_outcome(problem, task, self._run_task(problem, task, impulse))
         except TaskFailed as failure:
-            return task.record(status=failure.status, message=failure.text), None
+            return task.make_record(status=failure.status, message=failure.text), None
 
     def solve(self, problem: Problem, task: Task) -> Solution:
         """Return the solution of a task, judged in this process.
@@ -69,15 +71,15 @@ class Worker:
         TaskFailed
             The solver raised an exception, did not end, or ended the worker.
         """
-        outcome = self._run(problem, task, None)
+        outcome = self._run_task(problem, task, None)
         if isinstance(outcome, str):
             raise TaskFailed(ERROR, outcome)
         return make_solution(problem, task, outcome)
 
-    def _run(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
+    def _run_task(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
         """Return the outcome of a task, or the text of the exception that the solver raised."""
         process = self._process
-        if not process.alive:
+        if not process.is_alive:
             self._problem_hash = ""
             try:
                 process.start()
@@ -91,7 +93,9 @@ class Worker:
         new_problem = None if self._problem_hash == task.sha else problem
         self._problem_hash = ""
         try:
-            answer, arrays = process.call(new_problem, task, impulse, timeout=limit, max_bytes=16 * problem.m)
+            answer, arrays = process.call_function(
+                new_problem, task, impulse, timeout=limit, max_bytes=16 * problem.m
+            )
             elapsed = time.monotonic() - start_time
             self._problem_hash = task.sha
             return parse_outcome(answer, arrays, problem.m, elapsed, task.lead)
@@ -142,7 +146,7 @@ def solve_isolated(
     task = Task(
         run="",
         case=problem.name,
-        sha=fingerprint(problem),
+        sha=hash_problem(problem),
         solver=name,
         mode="tol",
         tol=tol,
@@ -163,7 +167,7 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
     _problem = _problem if problem is None else problem
     assert _problem is not None
     subprocesses.limit_cpu_time(3.0 * task.time_limit + ORPHAN_CPU_TIME)
-    outcome = attempt(_problem, task, impulse)
+    outcome = attempt_task(_problem, task, impulse)
     if isinstance(outcome, str):
         return {"error": outcome[: subprocesses.MAX_ERROR_LENGTH]}, ()
     message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))

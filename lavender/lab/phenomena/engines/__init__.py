@@ -42,11 +42,11 @@ class Stepping:
         for _ in range(steps):
             self.step()
 
-    def clock(self) -> float:
+    def get_cpu_time(self) -> float:
         """Return the CPU time [s] of the steps so far, from an arbitrary zero."""
         return process_time()
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return positions (n, 3) [m], quaternions (n, 4) w x y z, world velocities (n, 6) [m/s, rad/s]."""
         raise NotImplementedError
 
@@ -57,11 +57,11 @@ class Stepping:
         )
         return x, q, np.zeros((len(x), 6))
 
-    def force(self) -> float:
+    def get_joint_force(self) -> float:
         """Return the force of the first joint [N]; nan if the engine does not provide it."""
         return float("nan")
 
-    def last_step_quality(self) -> tuple[int, float, float]:
+    def measure_last_step(self) -> tuple[int, float, float]:
         """Return the number of contacts, the largest penetration or joint gap [m], and the relative residual.
 
         They belong to the last step. The residual is the judge's; it is nan if the engine's problem is not known.
@@ -101,49 +101,53 @@ class EngineVariant:
     scene: Mapping[str, Any] = field(default_factory=dict)
     cannot: Mapping[str, str] = field(default_factory=dict)
 
-    def missing(self) -> str:
+    def explain_missing(self) -> str:
         """Return the reason why it cannot run here; empty if it can."""
-        hint = missing_installation_command(self.package)
+        hint = get_missing_installation_command(self.package)
         return f"not installed: {hint}" if hint else ""
 
 
-def missing_installation_command(package: str) -> str:
+def get_missing_installation_command(package: str) -> str:
     """Return the command that installs a Python or npm package; empty if it is installed, or no package is needed."""
     if package in PACKAGES_OF_NODE.values():
-        return missing_in_node(package)
+        return explain_missing_npm_package(package)
     if not package or importlib.util.find_spec(package):
         return ""
     return f"pip install {package.replace('pydrake', 'drake')}"
 
 
-def node_folder(package: str) -> Path | None:
+def find_node_folder(package: str) -> Path | None:
     """Return the folder of an npm package, in ./node_modules or a folder of NODE_PATH; None if there is none."""
     search_path = filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep))
     candidates = (Path(folder) / package for folder in ("node_modules", *search_path))
     return next((p.resolve() for p in candidates if (p / "package.json").is_file()), None)
 
 
-def versions_of_node() -> dict[str, str]:
+def get_npm_versions() -> dict[str, str]:
     """Return the version of each npm package that is installed."""
-    folders = {name: folder for name in PACKAGES_OF_NODE.values() if (folder := node_folder(name))}
+    folders = {name: folder for name in PACKAGES_OF_NODE.values() if (folder := find_node_folder(name))}
     return {
         name: str(json.loads((folder / "package.json").read_text(encoding="utf-8"))["version"])
         for name, folder in folders.items()
     }
 
 
-def missing_in_node(package: str) -> str:
+def explain_missing_npm_package(package: str) -> str:
     """Return the reason why an npm package cannot run here; empty if it can."""
     if shutil.which("node") is None:
         return "it runs under Node, https://nodejs.org"
-    return "" if node_folder(package) else f"npm install {package} in this folder, or its folder in NODE_PATH"
+    return (
+        ""
+        if find_node_folder(package)
+        else f"npm install {package} in this folder, or its folder in NODE_PATH"
+    )
 
 
 # Options of the finer setting of lavender's steppers.
 FINE_STEPS = {"substeps": 16, "solver_iterations": 4}
 
 
-def _own_variants() -> list[EngineVariant]:
+def _make_own_variants() -> list[EngineVariant]:
     """Build the variants of lavender's own steppers."""
     variants = []
     for name, spec in STEPPERS.items():
@@ -203,7 +207,7 @@ _THIRD_PARTY_VARIANTS = (
 )  # fmt: skip
 #: Name -> engine variant; lavender's own come first.
 ENGINE_VARIANTS: dict[str, EngineVariant] = {
-    variant.name: variant for variant in (*_own_variants(), *_THIRD_PARTY_VARIANTS)
+    variant.name: variant for variant in (*_make_own_variants(), *_THIRD_PARTY_VARIANTS)
 }
 
 
@@ -224,13 +228,13 @@ def record_track(engine: Stepping, seconds: float, interval: float) -> Track:
     """Step an engine for `seconds` and record a state every `interval` [s], in whole steps, up to one not finite."""
     steps_per_sample = max(1, round(interval / engine.dt))
     samples = max(2, int(np.ceil(seconds / (steps_per_sample * engine.dt) - 1e-9)))
-    states, cpu_time, n_steps = [engine.state()], 0.0, 0
+    states, cpu_time, n_steps = [engine.get_state()], 0.0, 0
     for _ in range(samples):
-        begin = engine.clock()
+        begin = engine.get_cpu_time()
         engine.advance(steps_per_sample)
-        cpu_time += engine.clock() - begin
+        cpu_time += engine.get_cpu_time() - begin
         n_steps += steps_per_sample
-        states.append(engine.state())
+        states.append(engine.get_state())
         if not all(np.isfinite(x).all() for x in states[-1]):
             break
     x, q, v = (np.array(part, float) for part in zip(*states, strict=True))
@@ -239,7 +243,7 @@ def record_track(engine: Stepping, seconds: float, interval: float) -> Track:
         positions=x,
         quaternions=q,
         velocities=v,
-        force=engine.force(),
+        force=engine.get_joint_force(),
         cpu=cpu_time / (n_steps * engine.dt),
         setting=engine.setting,
     )

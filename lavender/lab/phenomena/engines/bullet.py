@@ -8,9 +8,14 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.external.running import capture_output
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative, xyzw
+from lavender.lab.phenomena.engines.tree import (
+    compute_relative_pose,
+    get_collision_shape,
+    map_bodies_to_parent_joints,
+    reorder_to_xyzw,
+)
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 with capture_output(noisy=True):  # PyBullet prints a line at import.
     import pybullet
@@ -31,7 +36,7 @@ class Engine(Stepping):
     def __init__(
         self, scene: Scene, sweeps: int, substeps: int = 1, dt: float = 1.0 / 240.0, bodies: bool = False
     ) -> None:
-        self.scene, self.up = scene, {} if bodies else parents(scene, "pybullet")
+        self.scene, self.up = scene, {} if bodies else map_bodies_to_parent_joints(scene, "pybullet")
         self.dt = dt
         self.client = pybullet.connect(pybullet.DIRECT)
         self.client_arguments = {"physicsClientId": self.client}
@@ -58,7 +63,7 @@ class Engine(Stepping):
 
     def _create_shape(self, body: Body) -> int:
         """Create the collision shape of a body and return its index."""
-        shape = collision_shape(body, "pybullet")
+        shape = get_collision_shape(body, "pybullet")
         if isinstance(shape, Plane):
             created = pybullet.createCollisionShape(
                 pybullet.GEOM_PLANE, planeNormal=list(shape.normal), **self.client_arguments
@@ -79,7 +84,7 @@ class Engine(Stepping):
         body = self.scene.bodies[i]
         created = pybullet.createMultiBody(
             body.mass, self._create_shape(body), basePosition=body.position.tolist(),
-            baseOrientation=xyzw(body.quaternion), **self.maximal, **self.client_arguments,
+            baseOrientation=reorder_to_xyzw(body.quaternion), **self.maximal, **self.client_arguments,
         )  # fmt: skip
         if body.mass:
             pybullet.resetBaseVelocity(
@@ -110,11 +115,11 @@ class Engine(Stepping):
             parent = None if joint.a < 0 else self.scene.bodies[joint.a]
             # From the parent's centre.
             anchor_in_parent = np.zeros(3) if joint.a < 0 else self.up[joint.a].anchor_b
-            _, q = relative(parent, self.scene.bodies[i])
+            _, q = compute_relative_pose(parent, self.scene.bodies[i])
             if abs(abs(q[0]) - 1.0) > 1e-12 and joint.a >= 0:
                 raise CapabilityError("pybullet accepts trees whose bodies have the same orientation")
             link_positions.append((joint.anchor_a - anchor_in_parent).tolist())
-            orientation.append(xyzw(q))
+            orientation.append(reorder_to_xyzw(q))
             inertial_positions.append((-joint.anchor_b).tolist())
             axis.append(joint.axis_b.tolist())
         kinds = {"hinge": pybullet.JOINT_REVOLUTE, "ball": pybullet.JOINT_SPHERICAL}
@@ -163,7 +168,7 @@ class Engine(Stepping):
         """See `Stepping.step`."""
         pybullet.stepSimulation(**self.client_arguments)
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
         x, q, v = self.initial_state()
         for i, (body, link) in self.ids.items():
@@ -178,14 +183,14 @@ class Engine(Stepping):
             q[i] = np.roll(orientation, 1)
         return x, q, v
 
-    def last_step_quality(self) -> tuple[int, float, float]:
-        """See `Stepping.last_step_quality`; Bullet does not publish its problem."""
+    def measure_last_step(self) -> tuple[int, float, float]:
+        """See `Stepping.measure_last_step`; Bullet does not publish its problem."""
         points = pybullet.getContactPoints(**self.client_arguments) or ()
-        x, q, _ = self.state()
+        x, q, _ = self.get_state()
 
         def point(i: int, anchor: FloatArray) -> FloatArray:
             """Return the world position of an anchor."""
-            return anchor if i < 0 else x[i] + rotation(q[i]) @ anchor
+            return anchor if i < 0 else x[i] + convert_to_rotation_matrix(q[i]) @ anchor
 
         gaps = [np.linalg.norm(point(j.b, j.anchor_b) - point(j.a, j.anchor_a)) for j in self.scene.joints]
         depth = max(gaps) if gaps else max((-p[8] for p in points), default=0.0)

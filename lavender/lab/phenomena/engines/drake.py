@@ -34,7 +34,11 @@ from pydrake.systems.framework import DiagramBuilder
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative
+from lavender.lab.phenomena.engines.tree import (
+    compute_relative_pose,
+    get_collision_shape,
+    map_bodies_to_parent_joints,
+)
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 MODULUS = 1e8  # [Pa] Hydroelastic modulus of compliant bodies.
@@ -46,7 +50,7 @@ class Engine(Stepping):
 
     def __init__(self, scene: Scene, approximation: str, hydroelastic: bool) -> None:
         self.scene, self.hydroelastic, self.dt = scene, hydroelastic, 1e-3
-        self.up = parents(scene, "drake")
+        self.up = map_bodies_to_parent_joints(scene, "drake")
         kind = "hydroelastic" if hydroelastic else "point contacts"
         self.setting = f"1 ms, {approximation}, {kind}"
         builder = DiagramBuilder()
@@ -65,7 +69,9 @@ class Engine(Stepping):
         self.context = plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
         for i, body in enumerate(scene.bodies):
             if self.bodies[i] is not None and i not in self.up:
-                plant.SetFreeBodyPose(self.context, self.bodies[i], _pose(body.position, body.quaternion))
+                plant.SetFreeBodyPose(
+                    self.context, self.bodies[i], _make_pose(body.position, body.quaternion)
+                )
                 plant.SetFreeBodySpatialVelocity(
                     self.context, self.bodies[i],
                     SpatialVelocity(w=_as_drake_array(body.angular_velocity), v=_as_drake_array(body.velocity)),
@@ -73,7 +79,7 @@ class Engine(Stepping):
         self.simulator.Initialize()
         self.steps = 0
 
-    def _material(self, rigid: bool) -> ProximityProperties:
+    def _make_contact_properties(self, rigid: bool) -> ProximityProperties:
         """Build the contact properties of a body."""
         mu, created = self.scene.parameters.friction, ProximityProperties()
         AddContactMaterial(
@@ -90,12 +96,14 @@ class Engine(Stepping):
     def _add_body(self, i: int) -> Any:
         """Add a body to the plant and return it; a plane belongs to the world: return None."""
         body = self.scene.bodies[i]
-        shape = collision_shape(body, "drake", static=False)
+        shape = get_collision_shape(body, "drake", static=False)
         if isinstance(shape, Plane):
             normal = _as_drake_array(shape.normal)
             pose = HalfSpace.MakePose(normal, _as_drake_array(shape.offset * normal))
             ground = self.plant.world_body()
-            self.plant.RegisterCollisionGeometry(ground, pose, HalfSpace(), f"b{i}", self._material(True))
+            self.plant.RegisterCollisionGeometry(
+                ground, pose, HalfSpace(), f"b{i}", self._make_contact_properties(True)
+            )
             return None
         unit = UnitInertia(*(np.diag(body.inertia) / body.mass))
         created = self.plant.AddRigidBody(
@@ -104,7 +112,7 @@ class Engine(Stepping):
         if not self.up:
             solid = DrakeSphere(shape.radius) if isinstance(shape, Sphere) else DrakeBox(*shape.size)
             self.plant.RegisterCollisionGeometry(
-                created, RigidTransform(), solid, f"b{i}", self._material(False)
+                created, RigidTransform(), solid, f"b{i}", self._make_contact_properties(False)
             )
         return created
 
@@ -112,10 +120,10 @@ class Engine(Stepping):
         """Add the joint of body i to its parent."""
         joint, plant = self.up[i], self.plant
         parent: Body | None = None if joint.a < 0 else self.scene.bodies[joint.a]
-        _, quaternion = relative(parent, self.scene.bodies[i])
+        _, quaternion = compute_relative_pose(parent, self.scene.bodies[i])
         base = plant.world_frame() if parent is None else self.bodies[joint.a].body_frame()
         child_frame = self.bodies[i].body_frame()
-        first = plant.AddFrame(FixedOffsetFrame(f"f{i}", base, _pose(joint.anchor_a, quaternion)))
+        first = plant.AddFrame(FixedOffsetFrame(f"f{i}", base, _make_pose(joint.anchor_a, quaternion)))
         second = plant.AddFrame(
             FixedOffsetFrame(f"m{i}", child_frame, RigidTransform(_as_drake_array(joint.anchor_b)))
         )
@@ -129,7 +137,7 @@ class Engine(Stepping):
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * self.dt)
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
         x, q, v = self.initial_state()
         for i, body in enumerate(self.bodies):
@@ -147,7 +155,7 @@ def _as_drake_array(x: Any) -> Any:
     return np.asarray(x, float)
 
 
-def _pose(position: FloatArray, quaternion: FloatArray) -> RigidTransform:
+def _make_pose(position: FloatArray, quaternion: FloatArray) -> RigidTransform:
     """Build a pose of a position (3,) [m] and a quaternion (4,)."""
     return RigidTransform(
         RotationMatrix(Quaternion(_as_drake_array(quaternion / np.linalg.norm(quaternion)))),

@@ -7,15 +7,19 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import collision_shape, parents, xyzw
+from lavender.lab.phenomena.engines.tree import (
+    get_collision_shape,
+    map_bodies_to_parent_joints,
+    reorder_to_xyzw,
+)
 from lavender.sim.scene import Plane, Scene, Sphere
-from lavender.sim.scene.arithmetic import frame_quaternion
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.arithmetic import convert_frame_to_quaternion
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 GROUND_BOX_SIZE = (200.0, 20.0, 200.0)  # [m] Size of the box that replaces a plane; its second axis is up.
 
 
-def _frame(up: FloatArray) -> FloatArray:
+def _make_engine_axes(up: FloatArray) -> FloatArray:
     """Return the engine's axes in the scene's world as rows; the second axis is up."""
     side = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 0.0, -1.0])
     x = side - up * (side @ up)
@@ -30,10 +34,10 @@ class Engine(Stepping):
         self.scene, self.dt = scene, dt
         self.substeps = max(1, int(np.ceil(240.0 * dt - 1e-9)))
         self.setting = f"{1e3 * dt:.3g} ms in {self.substeps} of {sweeps} sweeps"
-        up, p = parents(scene, "lavendersim"), scene.parameters
+        up, p = map_bodies_to_parent_joints(scene, "lavendersim"), scene.parameters
         g = np.asarray(p.gravity, float)
         size = float(np.linalg.norm(g))
-        self.frame = _frame(-g / size if size else np.array([0.0, 0.0, 1.0]))
+        self.frame = _make_engine_axes(-g / size if size else np.array([0.0, 0.0, 1.0]))
         self.material = {
             "static_friction": p.friction, "dynamic_friction": p.friction, "restitution": 0.0,
             "torsional_friction": p.friction if p.patch_radius else 0.0, "contact_radius": p.patch_radius or 0.02,
@@ -44,7 +48,7 @@ class Engine(Stepping):
         refs = [self._add_body(engine_scene, i, jointed=i in up or bool(up)) for i in range(scene.n_bodies)]
         for i, joint in up.items():
             body = scene.bodies[i]
-            orientation = rotation(body.quaternion)
+            orientation = convert_to_rotation_matrix(body.quaternion)
             parent = lavendersim.WORLD if joint.a < 0 else refs[joint.a]
             anchor = self.frame @ (body.position + orientation @ joint.anchor_b)
             if joint.kind == "hinge":
@@ -63,22 +67,22 @@ class Engine(Stepping):
     def _add_body(self, engine_scene: lavendersim.Scene, i: int, jointed: bool) -> lavendersim.BodyRef:
         """Add body i to the engine's scene."""
         body = self.scene.bodies[i]
-        shape = collision_shape(body, "lavendersim")
+        shape = get_collision_shape(body, "lavendersim")
         if isinstance(shape, Plane):
             normal = self.frame @ np.asarray(shape.normal)
-            orientation = _frame(normal).T
+            orientation = _make_engine_axes(normal).T
             position = (shape.offset - 0.5 * GROUND_BOX_SIZE[1]) * normal
             return engine_scene.box(
                 f"b{i}",
                 size=GROUND_BOX_SIZE,
                 mass=0.0,
                 position=position,
-                rotation=xyzw(frame_quaternion(orientation)),
+                rotation=reorder_to_xyzw(convert_frame_to_quaternion(orientation)),
                 **self.material,
             )
-        orientation = frame_quaternion(self.frame @ rotation(body.quaternion))
+        orientation = convert_frame_to_quaternion(self.frame @ convert_to_rotation_matrix(body.quaternion))
         body_options = {
-            "mass": body.mass, "position": self.frame @ body.position, "rotation": xyzw(orientation),
+            "mass": body.mass, "position": self.frame @ body.position, "rotation": reorder_to_xyzw(orientation),
             "linear_velocity": self.frame @ body.velocity, "collision": not jointed,
             "angular_velocity": self.frame @ body.angular_velocity, **self.material,
         }  # fmt: skip
@@ -86,11 +90,16 @@ class Engine(Stepping):
             return engine_scene.sphere(f"b{i}", radius=shape.radius, **body_options)
         return engine_scene.box(f"b{i}", size=shape.size, **body_options)
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
         s = np.asarray(self.env.body_state()[self.first :], float)
         inverse_frame = self.frame.T
-        q = np.array([frame_quaternion(inverse_frame @ rotation(np.roll(row[3:7], 1))) for row in s])
+        q = np.array(
+            [
+                convert_frame_to_quaternion(inverse_frame @ convert_to_rotation_matrix(np.roll(row[3:7], 1)))
+                for row in s
+            ]
+        )
         return s[:, :3] @ self.frame, q, np.hstack([s[:, 7:10] @ self.frame, s[:, 10:13] @ self.frame])
 
     def close(self) -> None:

@@ -11,24 +11,28 @@ from lavender.base.arrays import FloatArray
 from lavender.io.mujoco import from_mujoco, impulse
 from lavender.judge.residuals import residual
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative
+from lavender.lab.phenomena.engines.tree import (
+    compute_relative_pose,
+    get_collision_shape,
+    map_bodies_to_parent_joints,
+)
 from lavender.problem import Problem
 from lavender.sim.scene import Joint, Plane, Scene, Sphere
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 
-def _text(x: Any) -> str:
+def _format_numbers(x: Any) -> str:
     """Format numbers for an MJCF attribute."""
     return " ".join(repr(float(v)) for v in x)
 
 
-def _equality(joint: Joint) -> str:
+def _make_equality_constraint(joint: Joint) -> str:
     """Build the equality constraint of a joint: the first body must not be the world, the anchor is in its frame."""
     first, second, anchor = (
         (joint.b, joint.a, joint.anchor_b) if joint.a < 0 else (joint.a, joint.b, joint.anchor_a)
     )
     other = "" if second < 0 else f'body2="b{second}"'
-    return f'<connect body1="b{first}" {other} anchor="{_text(anchor)}"/>'
+    return f'<connect body1="b{first}" {other} anchor="{_format_numbers(anchor)}"/>'
 
 
 class Engine(Stepping):
@@ -55,22 +59,24 @@ class Engine(Stepping):
         sweeps: int = 0,
         tree: bool = True,
     ) -> None:
-        self.scene, self.up = scene, parents(scene, "mujoco") if tree else {}
+        self.scene, self.up = scene, map_bodies_to_parent_joints(scene, "mujoco") if tree else {}
         ties = [] if tree else scene.joints
         p = scene.parameters
         spin = ' condim="6"' if p.rolling_radius else ' condim="4"' if p.patch_radius else ""
         friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} {p.rolling_radius!r}"'
         step = f' timestep="{dt!r}"' if dt else ""
         solver = f' solver="PGS" iterations="{sweeps}" tolerance="0"' if sweeps else ""
-        option = (
-            f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"{step}{solver}/>'
-        )
+        gravity = _format_numbers(p.gravity)
+        option = f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{gravity}"{step}{solver}/>'
         memory = "64M" if tree else "1G"  # for contacts and constraint rows
         self.no_collision = ' contype="0" conaffinity="0"' if scene.joints else ""
-        trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
+        trees = "".join(
+            self._make_body_element(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0
+        )
         self.model = mujoco.MjModel.from_xml_string(
             f"<mujoco>{option}<size memory='{memory}'/><default><geom {friction}{spin}/></default>"
-            f"<worldbody>{trees}</worldbody><equality>{''.join(map(_equality, ties))}</equality></mujoco>"
+            f"<worldbody>{trees}</worldbody>"
+            f"<equality>{''.join(map(_make_equality_constraint, ties))}</equality></mujoco>"
         )
         self.data = mujoco.MjData(self.model)
         self.dt = float(self.model.opt.timestep)
@@ -83,50 +89,55 @@ class Engine(Stepping):
             if i not in self.up and not body.is_static:
                 at = self.model.jnt_dofadr[self.model.body_jntadr[self.ids[i]]]
                 # The angular velocity of a free joint is in the body's frame.
-                angular_velocity = rotation(body.quaternion).T @ body.angular_velocity
+                angular_velocity = convert_to_rotation_matrix(body.quaternion).T @ body.angular_velocity
                 self.data.qvel[at : at + 6] = np.concatenate([body.velocity, angular_velocity])
         mujoco.mj_forward(self.model, self.data)
 
-    def _body(self, i: int) -> str:
+    def _make_body_element(self, i: int) -> str:
         """Build the MJCF element of a body with its children."""
         body, joint = self.scene.bodies[i], self.up.get(i)
-        shape = collision_shape(body, "mujoco")
+        shape = get_collision_shape(body, "mujoco")
         if isinstance(shape, Plane):
-            at = f'pos="{_text(shape.offset * np.asarray(shape.normal))}" zaxis="{_text(shape.normal)}"'
+            point = _format_numbers(shape.offset * np.asarray(shape.normal))
+            at = f'pos="{point}" zaxis="{_format_numbers(shape.normal)}"'
             return f'<body name="b{i}"><geom type="plane" size="0 0 1" {at}/></body>'
         if isinstance(shape, Sphere):
             geom = f'type="sphere" size="{shape.radius!r}"'
         else:
-            geom = f'type="box" size="{_text(0.5 * np.asarray(shape.size))}"'
+            geom = f'type="box" size="{_format_numbers(0.5 * np.asarray(shape.size))}"'
         parent = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
-        position, quaternion = relative(parent, body)
+        position, quaternion = compute_relative_pose(parent, body)
         tie = "" if body.is_static else "<freejoint/>"
         geom += self.no_collision if not body.is_static else ""
         if joint is not None:
-            kind = f'type="hinge" axis="{_text(joint.axis_b)}"' if joint.kind == "hinge" else 'type="ball"'
-            tie = f'<joint {kind} pos="{_text(joint.anchor_b)}"/>'
-        children = "".join(self._body(j) for j, other in self.up.items() if other.a == i)
+            kind = (
+                f'type="hinge" axis="{_format_numbers(joint.axis_b)}"'
+                if joint.kind == "hinge"
+                else 'type="ball"'
+            )
+            tie = f'<joint {kind} pos="{_format_numbers(joint.anchor_b)}"/>'
+        children = "".join(self._make_body_element(j) for j, other in self.up.items() if other.a == i)
         weight = f' mass="{body.mass!r}"' if body.mass else ""
-        pose = f'pos="{_text(position)}" quat="{_text(quaternion)}"'
+        pose = f'pos="{_format_numbers(position)}" quat="{_format_numbers(quaternion)}"'
         return f'<body name="b{i}" {pose}>{tie}<geom {geom}{weight}/>{children}</body>'
 
     def step(self) -> None:
         """See `Stepping.step`."""
         mujoco.mj_step(self.model, self.data)
 
-    def problem(self) -> Problem:
+    def read_last_problem(self) -> Problem:
         """Return the constraint problem of the last step."""
         return from_mujoco(self.model, self.data, name=f"mujoco {self.scene.name}")
 
-    def last_step_quality(self) -> tuple[int, float, float]:
-        """See `Stepping.last_step_quality`."""
+    def measure_last_step(self) -> tuple[int, float, float]:
+        """See `Stepping.measure_last_step`."""
         d = self.data
         depth = max(0.0, -float(d.contact.dist[: d.ncon].min())) if d.ncon else 0.0
         if self.scene.joints:
             depth = float(np.abs(d.efc_pos[: d.nefc]).max(initial=0.0))
-        return int(d.ncon), depth, residual(self.problem(), impulse(self.model, d)).relative
+        return int(d.ncon), depth, residual(self.read_last_problem(), impulse(self.model, d)).relative
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; velocities are computed for the time of the poses."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)

@@ -8,7 +8,12 @@ import warp as wp
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative, xyzw
+from lavender.lab.phenomena.engines.tree import (
+    compute_relative_pose,
+    get_collision_shape,
+    map_bodies_to_parent_joints,
+    reorder_to_xyzw,
+)
 from lavender.sim.scene import Plane, Scene, Sphere
 
 SUBSTEPS = 4
@@ -18,7 +23,7 @@ class Engine(Stepping):
     """`collide` and `step`, SUBSTEPS times in 1/60 s."""
 
     def __init__(self, scene: Scene, solver: str, **options: float) -> None:
-        self.scene, self.up, self.dt = scene, parents(scene, "newton"), 1.0 / 60.0
+        self.scene, self.up, self.dt = scene, map_bodies_to_parent_joints(scene, "newton"), 1.0 / 60.0
         wp.config.quiet = True
         wp.set_device("cpu")
         p = scene.parameters
@@ -45,7 +50,7 @@ class Engine(Stepping):
     ) -> int:
         """Add body i to the model and return its index; a plane belongs to the world: return -1."""
         body = self.scene.bodies[i]
-        shape = collision_shape(body, "newton", static=False)
+        shape = get_collision_shape(body, "newton", static=False)
         if isinstance(shape, Plane):
             builder.add_shape_plane(
                 (*map(float, shape.normal), -float(shape.offset)), width=0.0, length=0.0, cfg=material
@@ -53,7 +58,9 @@ class Engine(Stepping):
             return -1
         add = builder.add_link if i in self.up else builder.add_body
         created = add(
-            xform=_transform(body.position, body.quaternion), mass=body.mass, inertia=wp.mat33(body.inertia)
+            xform=_make_transform(body.position, body.quaternion),
+            mass=body.mass,
+            inertia=wp.mat33(body.inertia),
         )
         if isinstance(shape, Sphere):
             builder.add_shape_sphere(created, radius=shape.radius, cfg=material)
@@ -68,10 +75,12 @@ class Engine(Stepping):
         """Add the joint of body i to its parent and return its index."""
         joint = self.up[i]
         parent = -1 if joint.a < 0 else self.bodies[joint.a]
-        _, quaternion = relative(None if joint.a < 0 else self.scene.bodies[joint.a], self.scene.bodies[i])
+        _, quaternion = compute_relative_pose(
+            None if joint.a < 0 else self.scene.bodies[joint.a], self.scene.bodies[i]
+        )
         transforms = {
-            "parent_xform": _transform(joint.anchor_a, quaternion),
-            "child_xform": _transform(joint.anchor_b, np.array([1.0, 0, 0, 0])),
+            "parent_xform": _make_transform(joint.anchor_a, quaternion),
+            "child_xform": _make_transform(joint.anchor_b, np.array([1.0, 0, 0, 0])),
         }
         if joint.kind == "hinge":
             return int(
@@ -87,7 +96,7 @@ class Engine(Stepping):
             self.solver.step(self.now, self.next, self.control, self.contacts, self.dt / SUBSTEPS)
             self.now, self.next = self.next, self.now
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; the engine computes in float32."""
         poses, velocities = self.now.body_q.numpy().astype(float), self.now.body_qd.numpy().astype(float)
         x, q, v = self.initial_state()
@@ -97,6 +106,6 @@ class Engine(Stepping):
         return x, q, v
 
 
-def _transform(x: FloatArray, q: FloatArray) -> wp.transform:
+def _make_transform(x: FloatArray, q: FloatArray) -> wp.transform:
     """Build a transform of a position (3,) [m] and a quaternion (4,)."""
-    return wp.transform(tuple(map(float, x)), tuple(xyzw(q)))
+    return wp.transform(tuple(map(float, x)), tuple(reorder_to_xyzw(q)))

@@ -13,8 +13,13 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, LavenderError
-from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, missing_in_node, node_folder
-from lavender.lab.phenomena.engines.tree import collision_shape, parents
+from lavender.lab.phenomena.engines import (
+    PACKAGES_OF_NODE,
+    Stepping,
+    explain_missing_npm_package,
+    find_node_folder,
+)
+from lavender.lab.phenomena.engines.tree import get_collision_shape, map_bodies_to_parent_joints
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 SCRIPT = Path(__file__).with_name("served.mjs")
@@ -32,7 +37,7 @@ class JsonLines:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
         )
 
-    def call(self, message: Any) -> Any:
+    def request_answer(self, message: Any) -> Any:
         """Return the answer to a message; EOFError if the program ended, ValueError if the answer is not JSON."""
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
@@ -55,14 +60,14 @@ class Engine(Stepping):
     """An engine under Node, which returns its state with each answer."""
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
-        parents(scene, engine)  # raises if the scene is not a tree
+        map_bodies_to_parent_joints(scene, engine)  # raises if the scene is not a tree
         self.dt, self.cpu_time = dt, 0.0
         self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
         request = {
             "gravity": list(p.gravity),
             "friction": p.friction,
-            "bodies": [_body(body, engine) for body in scene.bodies],
+            "bodies": [_describe_body(body, engine) for body in scene.bodies],
             "joints": [
                 {
                     "kind": j.kind, "a": j.a, "b": j.b,
@@ -71,16 +76,16 @@ class Engine(Stepping):
                 for j in scene.joints
             ],
         }  # fmt: skip
-        folder = node_folder(PACKAGES_OF_NODE[engine])
+        folder = find_node_folder(PACKAGES_OF_NODE[engine])
         if folder is None:
-            raise LavenderError(f"{engine}: {missing_in_node(PACKAGES_OF_NODE[engine])}")
+            raise LavenderError(f"{engine}: {explain_missing_npm_package(PACKAGES_OF_NODE[engine])}")
         self.program = JsonLines(["node", str(SCRIPT), engine, str(folder)])
-        self._call({"scene": request, "options": {"dt": self.dt, **options}})
+        self._request_answer({"scene": request, "options": {"dt": self.dt, **options}})
         self.cpu_time = 0.0
 
-    def _call(self, message: Any) -> None:
+    def _request_answer(self, message: Any) -> None:
         """Send a message, raise errors of its answer, and store the time and state that it returns."""
-        answer = self.program.call(message)
+        answer = self.program.request_answer(message)
         if "cannot" in answer:
             raise CapabilityError(str(answer["cannot"]))
         if "error" in answer:
@@ -95,13 +100,13 @@ class Engine(Stepping):
 
     def advance(self, steps: int) -> None:
         """See `Stepping.advance`."""
-        self._call({"steps": steps})
+        self._request_answer({"steps": steps})
 
-    def clock(self) -> float:
+    def get_cpu_time(self) -> float:
         """See `Stepping.clock`; it is the time of the other process."""
         return self.cpu_time
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; the engines compute in float32."""
         return self.states[:, :3], self.states[:, 3:7], self.states[:, 7:]
 
@@ -110,9 +115,9 @@ class Engine(Stepping):
         self.program.close()
 
 
-def _body(body: Body, engine: str) -> dict[str, Any]:
+def _describe_body(body: Body, engine: str) -> dict[str, Any]:
     """Build the JSON description of a body."""
-    shape = collision_shape(body, engine, static=False)
+    shape = get_collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
         shape_data: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
     elif isinstance(shape, Sphere):

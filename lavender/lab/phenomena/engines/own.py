@@ -27,17 +27,17 @@ class Engine(Stepping):
         if not self.has_ended:
             self.observation, _, self.has_ended, _, _ = self.sim.step()
 
-    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
         return self.observation["positions"], self.observation["quaternions"], self.observation["velocities"]
 
-    def last_step_quality(self) -> tuple[int, float, float]:
-        """See `Stepping.last_step_quality`."""
+    def measure_last_step(self) -> tuple[int, float, float]:
+        """See `Stepping.measure_last_step`."""
         gap = np.abs(self.sim.state.a["joint_error"]).max(initial=0.0)
         depth = max(self.observation["contacts"]["depth"].max(initial=0.0), gap)
         return int(self.observation["solver"][2]), float(depth), float(self.sim.residual()["relative"])
 
-    def force(self) -> float:
+    def get_joint_force(self) -> float:
         """See `Stepping.force`; the first joint must be a ball joint with three rows."""
         rows = self.observation["joint_impulses"][:3]
         return float(np.linalg.norm(rows)) / self.substep if len(rows) == 3 else float("nan")

@@ -7,10 +7,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.sim.scene import Body, Box, Joint, Plane, Scene, Sphere
-from lavender.sim.scene.parts import rotation
+from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 
-def parents(scene: Scene, engine: str) -> dict[int, Joint]:
+def map_bodies_to_parent_joints(scene: Scene, engine: str) -> dict[int, Joint]:
     """Return {body: joint to its parent}; a parent has a smaller index than its children.
 
     Raises
@@ -30,7 +30,7 @@ def parents(scene: Scene, engine: str) -> dict[int, Joint]:
     return joint_of
 
 
-def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
+def get_collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
     """Return the collision shape of a body.
 
     Raises CapabilityError if it has none, or if a static body has another shape than a plane, unless `static`.
@@ -41,16 +41,18 @@ def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sph
     return shape
 
 
-def relative(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
+def compute_relative_pose(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
     """Compute position (3,) [m] and quaternion (4,) of a child in its parent's frame; None is the world."""
     if parent is None:
         return child.position, child.quaternion
-    position: FloatArray = rotation(parent.quaternion).T @ (child.position - parent.position)
+    position: FloatArray = convert_to_rotation_matrix(parent.quaternion).T @ (
+        child.position - parent.position
+    )
     w, v = parent.quaternion[0], -parent.quaternion[1:]
     s, u = child.quaternion[0], child.quaternion[1:]
     return position, np.concatenate([[w * s - v @ u], w * u + s * v + np.cross(v, u)])
 
 
-def xyzw(q: FloatArray) -> list[float]:
+def reorder_to_xyzw(q: FloatArray) -> list[float]:
     """Reorder a quaternion (4,) w x y z to x y z w."""
     return [*map(float, q[1:]), float(q[0])]
