@@ -406,7 +406,7 @@ class Batch(Sequence[Problem]):
         first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
         return slice(first, first + m)
 
-    def make_zero_impulse(self, i: int) -> FloatArray:
+    def start(self, i: int) -> FloatArray:
         """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
         if self._arrays is None:
             return self[i].start()

@@ -180,7 +180,7 @@ class Solutions(Many, Sequence[Solution]):
     def mark_as_late(self, i: int) -> None:
         """Store the start of a late world of a batch. Its problem is built when its numbers are read."""
         if self._cold:
-            self._impulse[self._rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
+            self._impulse[self._get_rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
         self._worlds.code[i] = CODE["late"]
         self._late_worlds.append(i)
 

@@ -14,7 +14,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.ordering import Order, rank_bodies
-from lavender_ext.core.blocks import Blocks
+from lavender_ext.core.blocks import view_blocks
 from lavender_ext.core.problem import Data
 
 # From this many contacts, the copy is faster, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
@@ -87,7 +87,9 @@ def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = No
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],
     )  # fmt: skip
-    data = Data(Blocks(*arrays[:7]), arrays[7], FRICTION_LAWS.index(problem.friction), rows=tuple(arrays[8:]))
+    data = Data(
+        view_blocks(*arrays[:7]), arrays[7], FRICTION_LAWS.index(problem.friction), rows=tuple(arrays[8:])
+    )
     return Layout(data, rows, position, ranks)
 
 

@@ -20,7 +20,10 @@ cdef object new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
-    """Pointers to the arrays of a problem's blocks, which are kept alive."""
+    """Pointers to the arrays of a problem's blocks, which are kept alive: see `copy_to_blocks` and `view_blocks`."""
+
+    def __init__(self):
+        raise TypeError("blocks are made by copy_to_blocks or view_blocks")
 
     @property
     def arrays(self):
@@ -176,6 +179,15 @@ def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
     copy_blocks(blocks, 0, 0, &source.at)
     if blocks.check():
         spell_bounds(&blocks.at)
+    return blocks
+
+
+def view_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
+    """Return blocks that read these arrays in place; raise ValueError if they do not fit each other or have a fault."""
+    cdef Blocks blocks = Blocks.__new__(Blocks)
+    if not blocks.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not blocks.check():
+        raise ValueError("the arrays do not fit each other, or have a fault")
+    blocks._arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
     return blocks
 
 

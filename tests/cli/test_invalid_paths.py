@@ -752,7 +752,7 @@ def show_all(records):
     from lavender.lab.report.markdown import summarise_report
     from lavender.lab.report.page import render_page
 
-    shown = records.latest()
+    shown = records.select_latest_run()
     report = Report(shown, shown)
     print_report(report, Console(file=streams.StringIO(), width=140))
     for record in shown.records:  # The fastest, which is shown, differs from run to run.

@@ -311,7 +311,7 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(
         ("Batch.make_kernel_worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
-         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.make_zero_impulse", "Solutions.mark_as_late",
+         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_as_late",
          "Problem.on_disk", "Residuals.store_residual", "Solution.late", "Solution.of", "Solution.unstretched",
          "Solutions.store_solution", "Solutions.store_late_solution", "Solutions.get_start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",

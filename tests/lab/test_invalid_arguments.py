@@ -27,6 +27,10 @@ CONTACT = random_contact_problem(3)
 MOTIONS = lv.find_solutions(LCP, n=1)
 ANY_SEED = {"seed": ("very large",)}
 
+SLIDING = lv.Problem.from_jacobian(
+    np.eye(3)[[2, 0, 1]], np.eye(3), [0.5, 0.0, -1.0], cones=lv.Cones.contacts(0.2)
+)
+
 CALLS = {
     "SolutionSet.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "motions?"}),
     "SolutionSet.nearest": Call(MOTIONS.nearest, {"impulse": B}, {"impulse": "x"}),
@@ -82,13 +86,22 @@ CALLS = {
     "motion.follow_to_solution": Call(motion.follow_to_solution, {"problem": LCP, "impulse": B}),
     "motion.measure_motion_distance": Call(motion.measure_motion_distance, {"problem": LCP, "x": B, "y": B}),
     "motion.get_reference": Call(motion.get_reference, {"problem": LCP}),
+    "explain_slip": Call(lv.explain_slip, {"problem": SLIDING, "impulse": np.zeros(3), "tol": 1e-9}),
     "motion.prove_uniqueness": Call(motion.prove_uniqueness, {"problem": LCP}),
 }  # fmt: skip
 
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("CrossCheck", "Enclosure", "MotionError", "SolutionSet", "Redundancy", "Diagnostic"),
+        (
+            "CrossCheck",
+            "Enclosure",
+            "MotionError",
+            "SlipExplanation",
+            "SolutionSet",
+            "Redundancy",
+            "Diagnostic",
+        ),
         "a result: the package makes it",
     ),
     "CrossCheck.__getitem__": "a mapping by the names of solvers",

@@ -23,7 +23,7 @@ class Frozen(Stepping):
         self.scene = scene
     def step(self):
         pass
-    def state(self):
+    def get_state(self):
         return self.initial_state()
 """
 

@@ -560,7 +560,8 @@ def _select_solvers_with_all_times(
 def compute_profiles(records: Records, measure: str = "time") -> list[Profile]:
     """Compute the share of cases that a solver solves within `ratio` times the best; a miss is infinite.
 
-    The cases have one law and are of one run (`Records.latest`); a case that no solver solves is a miss of all.
+    The cases have one law and are of one run (`Records.select_latest_run`); a case that no solver solves is a miss of
+    all.
 
     Parameters
     ----------

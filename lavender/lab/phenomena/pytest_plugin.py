@@ -4,7 +4,7 @@
     pytest --phenomena my_engine:Adapter --phenomena-names stick,slide,lift
 
 `Adapter(scene)` steps a `lavender.sim.scene.Scene`; it has the attributes and methods of
-`lavender.lab.phenomena.engines.Stepping`: `dt`, `step()`, and `state()` -> positions (n, 3) [m], quaternions (n, 4)
+`lavender.lab.phenomena.engines.Stepping`: `dt`, `step()`, and `get_state()` -> positions (n, 3) [m], quaternions (n, 4)
 w x y z, velocities (n, 6) [m/s, rad/s]. It raises `lavender.CapabilityError` for a scene that it cannot build; the test
 is then skipped with this reason. Each case of each phenomenon is a test. It fails if a quantity exceeds its bound, with
 the quantity, its value, its bound and the reason of the bound.

@@ -386,7 +386,7 @@ def test_auto_says_what_it_went_without():
 import numpy as np
 import lavender as lv
 
-half = np.random.default_rng(0).normal(size=(200, 100)) * 0.9 ** np.arange(100)  # no sweeps solve it in 0.2 s
+half = np.random.default_rng(0).normal(size=(800, 400)) * 0.9 ** np.arange(400)  # no sweeps solve it in 0.2 s
 problem = lv.Problem.lcp(half @ half.T, half[:, 0])
 print(lv.solve(problem, tol=1e-13, time_limit=0.2))
 import scipy.linalg.lapack, scipy.sparse

@@ -188,7 +188,7 @@ def test_plug_ins_are_in_colour_on_the_page():
     names = ("anderson", "direct", "jacobi", "newton", "nncg", "pgs", "my_solver")
     made = [record(case, name, 1e-3 * (1 + i), 1e-7) for case in "ab" for i, name in enumerate(names)]
     report = Report(records_of(*made))
-    page = render_page(report, figures.build_figures(report.records))
+    page = render_page(report, figures.build_figures(report.all_records))
     number = sorted(names).index("my_solver")
     assert re.search(rf'value="{number}" checked', page) and f".s{number} {{ --c:" in page
     assert len(re.findall(r'type="checkbox" value="\d+" checked', page)) < len(names)

@@ -31,7 +31,7 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     prepared = lv.prepare(problem, "admm")
     solver, state = prepared.solver, prepared.state
     impulse, made = problem.start(), state.factorisations
-    state.worst_to_best_ratio = None  # as of a problem whose first factor is large
+    state.factor = None  # as of a problem whose first factor is large
     solver.set_deadline(state, Deadline(-1.0))
     claim = solver.run(state, impulse, 50, 1e-6)
     assert claim.status is lv.Status.TIME_LIMIT

@@ -177,7 +177,7 @@ def test_a_body_is_painted_where_it_is():
         stage.paint(axes, frame)
         (ball,) = axes.patches
         assert ball.center == pytest.approx((frame / 60, 0.0), abs=1e-5)
-        assert ball.bound_radius == 0.5
+        assert ball.radius == 0.5
     assert stage.bounds == pytest.approx((-0.87, 1.87, -0.87, 0.87), abs=0.01)
 
 
