@@ -1,6 +1,6 @@
 """One world of a batch that is stored in a few arrays, float32 or float64, converted to the structs that kernels read.
 
-The results are the same numbers as those of `Generalized` from the same arrays: J and the lower triangle of M in compressed
+The results are the numbers of `Generalized` from the same arrays: J and the lower triangle of M in compressed
 rows without zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generalized` would reorder is deferred
 to the caller.
 """
@@ -13,7 +13,7 @@ from lavender_ext.core.generalized cimport jac_row
 from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_rows, factor_mass, is_worth_ordering
 from lavender_ext.core.tree cimport tree_pattern
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.block_types cimport blocks_t, from_block
+from lavender_ext.core.block_types cimport blocks_t, point_to_block
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.workspace cimport has_workspace_size
@@ -362,7 +362,7 @@ cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p
     for k in range(p.n_blocks + 1):
         ptr[k] = all.ptr[block + k] - first
     p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
-    from_block(p, all, block)
+    point_to_block(p, all, block)
     if has_mu:
         p.mu = mu
     elif w.array[5] != NULL:

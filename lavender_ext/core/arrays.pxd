@@ -34,7 +34,7 @@ cdef enum:                          # NumPy's constants
 
 
 cdef inline object zeros(Py_ssize_t n):
-    """Return n + 1 zeros (float64) from `calloc`, whose pages are mapped on first use.
+    """Return n + 1 zeros (float64) from `calloc`: its pages are mapped on first use.
 
     NumPy requests huge pages, and mapping a huge page may take long.
     """

@@ -266,7 +266,7 @@ def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const doub
 
 
 def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
-    """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, whose rows end with the diagonal."""
+    """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, with the diagonal entry last in each row."""
     cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
     cdef Py_ssize_t i, q, k = 0
     upper = transposed(indptr, indices, data, n)

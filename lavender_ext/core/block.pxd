@@ -18,7 +18,7 @@ the engine and the WebAssembly build all use these functions.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport (CONE, MAX_FRICTION_COMPONENTS, blocks_t, disk_of, is_disk, is_round, is_rows,
+from lavender_ext.core.block_types cimport (CONE, MAX_FRICTION_COMPONENTS, blocks_t, get_disk_component, is_disk, is_round, is_rows,
                                             get_friction_components, friction_components_t)
 
 
@@ -284,7 +284,7 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
             e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
             j += 1
     elif is_disk(p, i):                                 # the common case, compiled with constant sizes
-        disk_of(p, i, &q)
+        get_disk_component(p, i, &q)
         contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
     elif is_round(p, i):
         round_error(lam + j, w + j, p.d + j, p.mu[i], end - j - 1, e + j)

@@ -53,7 +53,7 @@ cdef struct blocks_t:
     const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
     const double* step          # (m) kg: 1/d; on a component of two rows 1/lambda_max of these rows
     const double* rolling       # (k) m, >= 0: mu_r, read only on CONTACT_ROLLING
-    const islands_t* islands    # NULL: one island, whose reference the caller passes
+    const islands_t* islands    # NULL: one island; the caller passes its reference
 
 
 cdef struct friction_components_t:      # friction components of one contact
@@ -77,12 +77,12 @@ cdef inline void get_friction_arrays(const blocks_t* p, const double** x) noexce
     x[0], x[1], x[2] = p.mu, p.patch_radius, p.rolling
 
 
-cdef inline void from_block(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
+cdef inline void point_to_block(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
     """Point the arrays of `p` with one entry per block at block i of `all`."""
     p.kind, p.mu, p.patch_radius, p.rolling = all.kind + i, all.mu + i, all.patch_radius + i, all.rolling + i
 
 
-cdef inline bint fits(int32_t kind, int32_t n) noexcept nogil:
+cdef inline bint allows_rows(int32_t kind, int32_t n) noexcept nogil:
     """Return whether a block of this kind may have n rows."""
     if kind == ROW:
         return n > 0
@@ -93,7 +93,7 @@ cdef inline bint fits(int32_t kind, int32_t n) noexcept nogil:
     return n == 3 if kind == CONTACT_BOX else kind == CONTACT_ROLLING and 5 <= n <= 6
 
 
-cdef inline void spell_bounds(const blocks_t* p) noexcept nogil:
+cdef inline void write_contact_bounds(const blocks_t* p) noexcept nogil:
     """Write canonical bounds on the rows of contacts. Kernels do not read them, but equal problems must compare equal."""
     cdef int32_t i, j
     for i in range(p.n_blocks):
@@ -156,7 +156,7 @@ cdef inline void get_friction_components(const blocks_t* p, int32_t i, friction_
     add_component(q, 1, p.mu[i] * p.patch_radius[i])
 
 
-cdef inline void disk_of(const blocks_t* p, int32_t i, friction_components_t* q) noexcept nogil:
+cdef inline void get_disk_component(const blocks_t* p, int32_t i, friction_components_t* q) noexcept nogil:
     """Write the friction component of block i, which `is_disk`, into q."""
     q.n, q.first[0], q.size[0], q.friction_coefficient[0] = 1, 1, 2, p.mu[i]
 

@@ -10,7 +10,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport DOUBLE, INT, freeze, is_of, ndarray
 from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault
 from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, bind_friction_arrays,
-                                            blocks_t, contact_kind, spell_bounds)
+                                            blocks_t, contact_kind, write_contact_bounds)
 
 #: Kernel numbers of the kinds of blocks.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
@@ -178,7 +178,7 @@ def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
     blocks = allocate_blocks(source.at.n_blocks, source.at.n_rows)
     copy_blocks(blocks, 0, 0, &source.at)
     if blocks.check():
-        spell_bounds(&blocks.at)
+        write_contact_bounds(&blocks.at)
     return blocks
 
 
@@ -264,5 +264,5 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
         (<double*>blocks.at.mu)[i] = one if each is None else each[i]
         (<double*>blocks.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         (<double*>blocks.at.rolling)[i] = moment[i] if has_rolling else 0.0
-    spell_bounds(&blocks.at)
+    write_contact_bounds(&blocks.at)
     return blocks if blocks.check() else None

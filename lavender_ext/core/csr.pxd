@@ -108,7 +108,7 @@ cdef inline void transpose_csr(int32_t m, int32_t n, const int32_t* indptr, cons
 
 
 cdef inline double scaled_gap(double gap, double d_i, double d_j) noexcept nogil:
-    """Return gap / sqrt(d_i d_j) for gap = |A_ij - A_ji|: also meaningful for rows of heavy bodies, whose entries are small."""
+    """Return gap / sqrt(d_i d_j) for gap = |A_ij - A_ji|: also meaningful for heavy bodies with small entries."""
     return gap / sqrt(d_i) / sqrt(d_j) if gap > 0.0 else 0.0
 
 

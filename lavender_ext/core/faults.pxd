@@ -6,7 +6,7 @@ messages. core/validate.pxd defines the ranges. All checks compare so that NaN i
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block_types cimport CONTACT_BOX, ROW, blocks_t, fits
+from lavender_ext.core.block_types cimport CONTACT_BOX, ROW, blocks_t, allows_rows
 from lavender_ext.core.validate cimport (first_invalid_magnitude, has_invalid, is_definite, is_frame, is_number,
                                          is_valid_magnitude, min_magnitude, norm_inf)
 from lavender_ext.core.view cimport rows_t
@@ -87,7 +87,7 @@ cdef inline int32_t find_block_fault(const blocks_t* p, int64_t* index) noexcept
         first, end = p.ptr[i] if p.ptr != NULL else i, p.ptr[i + 1] if p.ptr != NULL else i + 1
         kind = p.kind[i] if p.kind != NULL else ROW
         index[0] = i
-        if not fits(CONTACT_BOX if kind == CONTACT_ELLIPSE else kind, end - first):
+        if not allows_rows(CONTACT_BOX if kind == CONTACT_ELLIPSE else kind, end - first):
             return FAULT_KIND
         if kind == CONTACT_ELLIPSE and not 1.0 / max_ratio <= p.patch_radius[i] <= max_ratio:
             return FAULT_RATIO

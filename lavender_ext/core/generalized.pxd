@@ -447,7 +447,7 @@ cdef inline double bound_condition(const generalized_t* g) noexcept nogil:
 
 cdef class Operator:
     cdef generalized_t g                # without panels and compliance
-    cdef readonly int failed            # the row of M whose pivot is not positive, or -1
+    cdef readonly int failed            # the row of M with a pivot that is not positive, or -1
     cdef readonly object jac            # (indptr, indices, data) of J
     cdef readonly object mass           # the same of the lower triangle of M
     cdef list keep

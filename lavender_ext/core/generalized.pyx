@@ -47,13 +47,13 @@ cdef class Operator:
     mptr_, midx_, mval_ : ndarray
         Lower triangle of M (nv, nv) in the same form.
     like : Operator, optional
-        Operator whose pattern of L is shared if its M has the same pattern.
+        Operator that shares its pattern of L if its M has the same pattern.
     max_entries : int
         MemoryError is raised if L has more entries.
 
     Notes
     -----
-    L has no values before `factor` is called, which sets `failed` to the row of M whose pivot is not positive, or to -1 if M
+    L has no values before `factor` is called, which sets `failed` to the row of M without a positive pivot, or to -1 if M
     is positive definite.
     """
 

@@ -75,7 +75,7 @@ cdef inline int32_t connect_entries(const blocks_t* p, const csr_t* a, int32_t* 
 
 
 cdef inline int32_t connect_trees(const blocks_t* p, const generalized_t* g, int32_t* parent, int32_t* first) noexcept nogil:
-    """Connect blocks whose rows of J touch a common tree of M; return the number of components. first (2 n) is scratch."""
+    """Connect blocks with rows of J that touch a common tree of M; return the number of components. first (2 n) is scratch."""
     cdef int32_t i, q, t, last, count = p.n_blocks
     cdef int32_t* tree = first + g.n
     for i in range(g.n):

@@ -464,7 +464,7 @@ cdef class Data:
 
     @property
     def outside(self):
-        """First row whose d exceeds the range of core/validate.pxd, or -1."""
+        """First row with a d above the range of core/validate.pxd, or -1."""
         return first_invalid(self.blocks.d, self.blocks.n_rows)
 
     @property

@@ -1,4 +1,4 @@
-"""Factorisation of a symmetric matrix M (n, n), whose elimination graph is a tree or nearly one.
+"""Factorisation of a symmetric matrix M (n, n) with an elimination graph that is a tree or nearly one.
 
     M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = n - 1 ... 0: each leaf of a
     kinematic tree is eliminated before its ancestors, and there is no fill-in (Featherstone 2008, section 6.5)     (1)
@@ -22,7 +22,7 @@ cdef inline double min_pivot_of_mass() noexcept nogil:
 
 
 cdef inline void sort_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
-    """Sort the columns of row k, the columns below k whose mark is k, in ascending order.
+    """Sort the columns of row k, the columns below k with the mark k, in ascending order.
 
     They are sorted by insertion, or collected by scanning the marks if that is cheaper.
     """
@@ -56,7 +56,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
                                  int32_t* first_child) noexcept nogil:
     """Compute the pattern of L from the lower triangle of M; return the number of entries, -1 if `workspace` is too small.
 
-    The last row comes first. Row k has the entries of M and the fill-in of the rows whose last column is k. Rows are written
+    The last row comes first. Row k has the entries of M and the fill-in of the rows with last column k. Rows are written
     from the end of `lidx` backwards; at the end they are moved to the front, and `lptr` is adjusted.
     """
     cdef int32_t k, q, c, j, at = workspace, start, end
@@ -106,7 +106,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """Compute L and 1 / D of (1) of a mass matrix; return -1, or the row whose pivot is too small."""
+    """Compute L and 1 / D of (1) of a mass matrix; return -1, or the row with too small a pivot."""
     cdef int32_t k, q, j, first, count, at
     # copy M into the pattern of L
     for k in range(n):
@@ -133,7 +133,7 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
 
 cdef inline int32_t eliminate_rows(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                    double* inv_pivot, double min_pivot) noexcept nogil:
-    """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row whose pivot is too small.
+    """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row with too small a pivot.
 
     lptr indexes both lidx and lval. `pivot` and `inv_pivot` contain the diagonal of M. A pivot is too small if it is at most
     `min_pivot` M_kk, or below `min_magnitude`. Consecutive rows of a chain, which have the same columns except themselves,

@@ -4,7 +4,7 @@
     x = 0 or x >= 1e-60     masses, inertias, pivots of M, friction coefficients, compliances, the largest |b|         (2)
 
 Other units bring any practical problem into this range without changing its solution. Sums of products of four such
-numbers, and their squares, do not overflow float64. A row of A whose largest entry is below 1e-60 counts as empty.
+numbers, and their squares, do not overflow float64. A row of A counts as empty if its largest entry is below 1e-60.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
@@ -99,20 +99,6 @@ cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
         s += 0.0 * x[i]
         i += 1
     return (s + t) + (u + v) == 0.0
-
-
-cdef inline bint are_pairs(const int32_t* pair, int64_t k, int32_t n, bint moves) noexcept nogil:
-    """Return whether all pairs (k, 2) name two different bodies, -1 (static) to n - 1.
-
-    If `moves` is true, at least one body of each pair must not be static.
-    """
-    cdef int64_t i
-    cdef int32_t a, b
-    for i in range(k):
-        a, b = pair[2 * i], pair[2 * i + 1]
-        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
-            return False
-    return True
 
 
 cdef inline bint is_frame(const double* n, const double* t, double tolerance) noexcept nogil:

@@ -159,7 +159,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
                                        double* said) noexcept nogil:
     """Compute impulses, dv and statistics of the prepared substep; return the result code, UNDECIDED if above tol.
 
-    With the first phase only (all_stages = 0), UNDECIDED leaves the arrays unchanged. scratch and workspace are those of
+    With the first phase only (all_stages = 0), UNDECIDED leaves the arrays unchanged. scratch and workspace belong to
     `lav_newton_plan`. trace (MOST_TRACED, 3) or NULL receives work, E [sqrt J] and max |e_n| [N s] of each evaluation;
     said (4) receives sweeps, factorisations, relative residual and the number of traced evaluations.
     """

@@ -54,7 +54,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
     bind(size, real, index, keys, &a, used)
     bind(to_size, to_real, to_index, to_keys, &b, used)
-    # Consecutive arrays whose sizes do not depend on the capacities are copied together.
+    # Consecutive arrays of sizes that do not depend on the capacities are copied together.
     memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
     memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
     memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
@@ -64,7 +64,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
     memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
     memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
-    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # joint stiffness; that of contacts is in the cache
+    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # joint stiffness; the cache has the stiffness of contacts
     memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 

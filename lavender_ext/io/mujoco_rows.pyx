@@ -14,7 +14,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, freeze, ints, ndarray, array_data
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_number, is_valid_magnitude, max_abs
-from lavender_ext.core.block_types cimport ROW, blocks_t, contact_kind, spell_bounds
+from lavender_ext.core.block_types cimport ROW, blocks_t, contact_kind, write_contact_bounds
 from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
@@ -153,7 +153,7 @@ def blocks(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double
         return -1 - k
     p.n_blocks = k
     fits = made.check()
-    spell_bounds(&made.at)
+    write_contact_bounds(&made.at)
     return made if fits else None, made.numbers[5 * m:6 * m], freeze(keys if k == m else keys[:k])
 
 
@@ -321,7 +321,7 @@ cdef bint has_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, 
 
 
 def motion_gap(parent, body, axis, spatial, v_):
-    """Return the largest difference of the spatial velocities c (n, 6) of bodies from those of v (nv), and the largest term.
+    """Return the largest difference of the spatial velocities c (n, 6) from the ones that v (nv) gives, and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
 

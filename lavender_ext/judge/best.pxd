@@ -3,7 +3,7 @@
 The impulse of an island is replaced by a later one if either
 
     the later one solves the island (relative residual r <= tol) and the present one does not; or          (1)
-    its energy error E of the island is lower, and its r is not above that of the start                    (2)
+    its energy error E of the island is lower, and its r is not above the r of the start                    (2)
 
 (E and r: score.pxd.) A row that no impulse satisfies, which keeps r at 1, therefore does not affect the results of other
 islands, and no island ends with a larger residual than it started with.
@@ -69,7 +69,7 @@ cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept
     return relative <= tol or (relative <= s.start[island] and s.now[2 * island + 1] < s.energy[island])
 
 
-cdef inline void see_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+cdef inline void store_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
     """Store the start lam (m), scored in `now`, in the islands in which no earlier start has a lower relative residual."""
     cdef int32_t i
     for i in range(s.n):
@@ -80,7 +80,7 @@ cdef inline void see_start(best_t* s, const blocks_t* p, const double* lam) noex
     s.seen += 1
 
 
-cdef inline bint see_impulse(best_t* s, const blocks_t* p, const double* lam, double tol) noexcept nogil:
+cdef inline bint store_better_islands(best_t* s, const blocks_t* p, const double* lam, double tol) noexcept nogil:
     """Store lam (m), scored in `now`, in the islands in which it is better; return whether there is such an island.
 
     The first impulse is a start.
@@ -88,7 +88,7 @@ cdef inline bint see_impulse(best_t* s, const blocks_t* p, const double* lam, do
     cdef int32_t i
     cdef bint changed = False
     if s.seen == 0:
-        see_start(s, p, lam)
+        store_start(s, p, lam)
         return True
     for i in range(s.n):
         if not is_better(s, i, tol):

@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.score cimport above_floor, are_numbers, hides, relative, score_t
+from lavender_ext.judge.score cimport above_floor, are_numbers, hides_residual, relative, score_t
 
 
 cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
@@ -58,11 +58,11 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
         return relative(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)
     now = relative(s.energy, s.velocity, reference_energy, reference_velocity)
     floor = relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
-    return floor if hides(floor) and floor < 1.0 / 0.0 and floor > now else now
+    return floor if hides_residual(floor) and floor < 1.0 / 0.0 and floor > now else now
 
 
 cdef inline double floor_of(const score_t* s, double reference_energy, double reference_velocity) noexcept nogil:
-    """Return the floor of a pass as a relative residual; with islands, that of the island with the largest residual."""
+    """Return the floor of a pass as a relative residual; with islands, the floor of the island with the largest residual."""
     return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
 
 

@@ -13,7 +13,7 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, count_islands, note_score, see_impulse, see_start
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, count_islands, note_score, store_better_islands, store_start
 from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
 from lavender_ext.judge.measure cimport above_floor_of, set_zero_impulse, floor_of, relative_of, scratch_of
 from lavender_ext.judge.reference cimport needs_rows, reference_of
@@ -352,9 +352,9 @@ def best_of_islands(Data p, list starts, list impulses, double tol):
         now = relative_of(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
         note_score(&best, &p.blocks, &s, now)
         if best.seen < len(starts):
-            see_start(&best, &p.blocks, lam)
+            store_start(&best, &p.blocks, lam)
         else:
-            see_impulse(&best, &p.blocks, lam, tol)
+            store_better_islands(&best, &p.blocks, lam, tol)
     return np.array(x[:m])
 
 
@@ -415,12 +415,12 @@ cdef inline double ratio(double x, double scale) noexcept nogil:
 
 
 # Rows that are zero at the solution, such as x >= 0, have no terms of their own. Their scale is the size of their variables in
-# acting rows, at least MIN_VARIABLE_FRACTION of the largest variable. An equation whose target is above TARGET_ROUNDING times
+# acting rows, at least MIN_VARIABLE_FRACTION of the largest variable. An equation with a target above TARGET_ROUNDING times
 # that scale has a size of its own, so the scale is multiplied by EQUATION_SCALE_FACTOR. Larger values accept larger residuals.
 cdef double MIN_VARIABLE_FRACTION = 1e-3
 cdef double EQUATION_SCALE_FACTOR = 1e-3
 cdef double TARGET_ROUNDING = 1e-12
-# The scale of the gap is at least this fraction of the sum of |terms|, because an objective whose terms cancel is not a
+# The scale of the gap is at least this fraction of the sum of |terms|, because an objective of cancelling terms is not a
 # meaningful scale. The largest ratio of that sum to the objective in 81 public programs is 1000.
 cdef double MIN_TERMS_FRACTION = 1e-3
 
@@ -437,7 +437,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     gap    |x.(P x + q) - target.lambda|;                      over |1/2 x.P x + q.x|, or 1e-3 of the sum of its terms,
                                                                sum_j |x_j| forces_j + sum_i |lambda_i| scale_i
 
-    The relative gap is that of |x.(P x + q - J^T lambda)| + sum_i |lambda_i (J x - target)_i|, whose parts do not cancel.
+    The relative gap is computed from |x.(P x + q - J^T lambda)| + sum_i |lambda_i (J x - target)_i|: these do not cancel.
 
     scale_i = max(terms_i, c max_j |J_ij| max(size_j, 1e-3 max |x|)),  terms_i = max(|target_i|, max_j |J_ij x_j|),
     c = 1e-3 for equations with a target above rounding, else 1

@@ -3,9 +3,9 @@
 A run of t sweeps has stalled unless its residual has risen sharply (f > 3/2) or one of two events is predicted within 64 t
 further sweeps:
 
-    The residual halves. With the lower envelope f = min r in (t/2, t] / min r in (t/4, t/2], whose minima are k sweeps
+    The residual halves. With the lower envelope f = min r in (t/2, t] / min r in (t/4, t/2], with minima that are k sweeps
     apart, r f^(n/k) <= best / 2 after n sweeps                                                 (1)
-    A plateau ends. A row whose impulse moved in one direction over the last three checks reaches a bound or the boundary
+    A plateau ends. A row with an impulse that moved in one direction over the last three checks reaches a bound or the boundary
     of its cone at the slower of its two speeds                                                 (2)
 
 A residual that oscillates while it falls has a falling envelope. On a plateau the residual is constant while an impulse

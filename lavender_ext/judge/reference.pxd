@@ -12,7 +12,7 @@ An island with (1) is at rest. Its references are the norms of s over the rows t
     strictly inactive   row       x_k at a bound, w_k pushes it there by more than 2^-48 s_k, or both bounds are equal
                         contact   w_n > 2^-48 s_n; under the cone law w_n - sum a_g |w_g| > 2^-48 (s_n + sum a_g |s_g|)
 
-If (2) is zero, no row acts: each row is compared with its own terms, a contact with those of its normal (E0 = V0 = -1):
+If (2) is zero, no row acts: each row is compared with its own terms, a contact with its normal's terms (E0 = V0 = -1):
 
     relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_by_rows`
 

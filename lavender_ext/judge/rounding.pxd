@@ -135,7 +135,7 @@ cdef inline bint rounds_in_float32(double residual, double floor) noexcept nogil
 
 cdef inline double floor_in_float32(const blocks_t* p, const double* square, const score_t* s, double now, double e0, double v0,
                                     double* above) noexcept nogil:
-    """Return the float32 floor of a pass; with islands, that of the island with the largest residual.
+    """Return the float32 floor of a pass; with islands, the floor of the island with the largest residual.
 
     `above` receives the counterpart of `above_floor_of`. With islands, s.by_island must hold the relative residuals.
     """

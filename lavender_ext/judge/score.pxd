@@ -37,7 +37,7 @@ cdef inline double unit_roundoff() noexcept nogil:
 
 
 cdef inline int32_t are_numbers(const double* x, int32_t n) noexcept nogil:
-    """Return whether x holds neither NaN nor infinity. A bound can hide an overflowed slack, whose sign is meaningless."""
+    """Return whether x holds neither NaN nor infinity. A bound can hide an overflowed slack, which has no meaningful sign."""
     cdef int32_t i
     cdef double s = 0.0                                 # This stays 0, or becomes NaN.
     for i in range(n):
@@ -58,7 +58,7 @@ cdef inline double relative(double energy, double velocity, double reference_ene
     return x if x > y else y
 
 
-cdef inline bint hides(double floor) noexcept nogil:
+cdef inline bint hides_residual(double floor) noexcept nogil:
     """Return whether the floor is at least a thousandth of the zero impulse's error; it then replaces the residual."""
     return floor >= 1e-3
 
@@ -70,7 +70,7 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     explain any residual. At a residual of 1e-5 the terms of A lambda are 1e11 times as large as their sum, or M^-1 J^T lambda
     in float64 has an equally large relative error, as with an M of condition 1e12 (judge/refine.pxd).
     """
-    return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
+    return relative <= 2.0 * floor and relative <= 1e-5 and not hides_residual(floor)
 
 
 cdef inline double above_floor(double relative, double floor) noexcept nogil:

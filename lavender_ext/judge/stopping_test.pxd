@@ -88,7 +88,7 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
 cdef inline bint begins_again(stopping_test_t* s, int32_t patience) noexcept nogil:
     """Return whether a STALLED run may restart from its best impulse without memory, once for each best impulse.
 
-    This is for accelerated sweeps, whose memory may be the reason of the stall. They get `patience` sweeps to find a better
+    This is for accelerated sweeps: their memory may be the reason of the stall. They get `patience` sweeps to find a better
     impulse.
     """
     if s.best_at <= s.again_at:

@@ -8,7 +8,7 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, see_impulse
+from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, store_better_islands
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, refine_view, relative_of, scratch_of
 from lavender_ext.judge.progress cimport envelope, keep, has_stalled, see
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
@@ -55,7 +55,7 @@ cdef inline bint rounds_much(const stopping_test_t* s, const blocks_t* p, const 
 
 
 cdef inline int32_t end_refined(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
-    """Return the status of an impulse whose first pass is within tol, from its refined residual."""
+    """Return the status of an impulse with a first pass within tol, from its refined residual."""
     if now <= tol:
         return CONVERGED
     if is_rounding(s, x, now, tol):
@@ -81,7 +81,7 @@ cdef inline int32_t until_next(const stopping_test_t* s, double now, double tol)
 
 
 cdef inline bint is_progress(stopping_test_t* s, double now, double tol) noexcept nogil:
-    """Return whether a check is better (see the header of stopping_test.pxd), after `see_impulse`."""
+    """Return whether a check is better (see the header of stopping_test.pxd), after `store_better_islands`."""
     cdef bint better = now < s.lowest
     cdef int32_t i
     if better:
@@ -122,7 +122,7 @@ cdef inline int32_t check(stopping_test_t* s, const view_t* v, double* lam, doub
         if end != RUNNING:
             return end
     if not lost or s.best.seen > 0:
-        see_impulse(&s.best, p, lam, tol)
+        store_better_islands(&s.best, p, lam, tol)
         s.best_relative = relative_of_best(&s.best)
     if s.best_relative <= tol:                          # islands were solved at different checks
         x = new_score()
@@ -261,7 +261,7 @@ cdef class StoppingTest:
                 now = judge_with_floor(s, &self.view, &lam[0], &x)
             note_score(&s.best, &self.view.p, &x, now)
             if not now <= tol:
-                see_impulse(&s.best, &self.view.p, &lam[0], tol)
+                store_better_islands(&s.best, &self.view.p, &lam[0], tol)
                 s.best_relative = relative_of_best(&s.best)
                 memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
 

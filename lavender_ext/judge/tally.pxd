@@ -3,9 +3,9 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error, length
-from lavender_ext.core.block_types cimport (CONE, blocks_t, disk_of, get_row_groups, is_disk, is_rows,
+from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk, is_rows,
                                             get_friction_components, friction_components_t)
-from lavender_ext.judge.score cimport above_floor, hides, is_at_floor, ratio, relative, score_t, unit_roundoff
+from lavender_ext.judge.score cimport above_floor, hides_residual, is_at_floor, ratio, relative, score_t, unit_roundoff
 
 
 cdef struct tally_t:
@@ -103,7 +103,7 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
 
 
 cdef inline int32_t first_nonfinite_row(const double* e, int32_t m) noexcept nogil:
-    """Return the first row whose error is not finite, or -1."""
+    """Return the first row with a non-finite error, or -1."""
     cdef int32_t i
     for i in range(m):
         if not fabs(e[i]) < 1.0 / 0.0:
@@ -200,7 +200,7 @@ cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, 
 
 cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
                                  const double* size, floor_t* s) noexcept nogil:
-    """Add the rounding of the rows of block i to the floor, for the rows whose error it changes.
+    """Add the rounding of the rows of block i to the floor, for the rows with an error that it changes.
 
     size begins at the first row of the block and is at least |A_kk| |lam_k|. If the norm of two rows is projected to its
     bound, e = lam - Pi also has the rounding of lam, (2^-53 |lam_k|) d_k as a velocity; the common d_k of both rows may be
@@ -223,7 +223,7 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
         return
     add_floor(p, j, j, row_rounding(p, j, size[0]), s)
     if is_disk(p, i):                                   # the common case, compiled with constant sizes
-        disk_of(p, i, &q)
+        get_disk_component(p, i, &q)
     else:
         get_row_groups(p, i, &q)
     for g in range(q.n):
@@ -301,7 +301,7 @@ cdef inline void close_island(const blocks_t* p, int32_t island, const double* w
         now = 1.0 / 0.0
     if f != NULL:
         floor = island_floor(p, island, f)
-        if hides(floor) and now < floor < 1.0 / 0.0:
+        if hides_residual(floor) and now < floor < 1.0 / 0.0:
             now = floor
         if not is_at_floor(now, floor) and now > out.above_floor:
             out.above_floor = now

@@ -10,7 +10,7 @@ from libc.string cimport memcpy, memset
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport block_matrix_t
-from lavender_ext.judge.best cimport best_t, best_workspace_size, bind_best, note_score, relative_of_best, see_impulse
+from lavender_ext.judge.best cimport best_t, best_workspace_size, bind_best, note_score, relative_of_best, store_better_islands
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
 from lavender_ext.newton.interior cimport interior_t
@@ -392,7 +392,7 @@ cdef inline double score_point(newton_t* n, const double* z) noexcept nogil:
     if residual < n.best:
         n.best = residual
         copy_vector(n, n.best_z, z)
-    if see_impulse(&n.island_best, &n.problem.p, n.lam, n.tol) and n.island_best.n > 1 and not n.best <= n.tol:
+    if store_better_islands(&n.island_best, &n.problem.p, n.lam, n.tol) and n.island_best.n > 1 and not n.best <= n.tol:
         combined = relative_of_best(&n.island_best)
         if combined <= n.tol:
             n.best = combined
