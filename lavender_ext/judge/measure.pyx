@@ -13,7 +13,8 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, count_islands, note_score, store_better_islands, store_start
+from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
+                                      count_islands, note_score, store_better_islands, store_start)
 from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
 from lavender_ext.judge.measure cimport above_floor_of, set_zero_impulse, floor_of, relative_of, scratch_of
 from lavender_ext.judge.reference cimport needs_rows, reference_of
