@@ -41,7 +41,7 @@ from lavender import bench, registry, suite
 from lavender.base.deadline import format_seconds
 from lavender.lab.bench import format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
-from lavender.lab.report import compute_geometric_means, compute_reaches, table_specs
+from lavender.lab.report import compute_mean_times_by_law, summarize_runs_by_case, table_specs
 from lavender.lab.report.figures import build_figures, build_work_precision
 from lavender.lab.report.findings import Report
 from lavender.lab.report.page import render_page
@@ -259,7 +259,7 @@ def _times(ratio):
 def standing(records, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
     by_case = {}
-    for reach in compute_reaches(records, TOLERANCES):
+    for reach in summarize_runs_by_case(records, TOLERANCES):
         by_case.setdefault(reach.case, []).append(reach)
     rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
     for case, all_reaches in by_case.items():
@@ -421,7 +421,7 @@ def measured_page(site, records, figures):
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     drawn = []
-    for law in compute_geometric_means(records):
+    for law in compute_mean_times_by_law(records):
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
             shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
@@ -445,7 +445,7 @@ def measured_page(site, records, figures):
 def by_law(records):
     """Return the table of the three fastest solvers for each law, to each tolerance."""
     rows = []
-    for law, by_tolerance in compute_geometric_means(records).items():
+    for law, by_tolerance in compute_mean_times_by_law(records).items():
         cells = []
         for tolerance in TOLERANCES:
             most = max(solved for _, solved, _ in by_tolerance[tolerance].values())

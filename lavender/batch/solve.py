@@ -29,7 +29,7 @@ from lavender.solving.solve import (
     check_accepted,
     check_budget,
     check_time_limit,
-    compute_late_fields,
+    compute_postponed_fields,
     create_unjudged,
     solve,
     solve_prepared,
@@ -279,7 +279,7 @@ class Solutions(Many, Sequence[Solution]):
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if is_start else self._get_counts(problem, i)
-        fields = compute_late_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
+        fields = compute_postponed_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
         # Equal data have bit-identical residuals.
         if status is Status.CONVERGED and judgement.relative != solved_relative:

@@ -32,11 +32,13 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
     from lavender.base.arrays import check_int
     from lavender.io.recording import load_model
     from lavender.lab.report.terminal import print_table
-    from lavender.lab.slip import explain_mujoco_slip, summarize_slip
+    from lavender.lab.slip import explain_slip_of_states, summarize_slip
 
     steps = check_int("--steps", steps, 1)
     limit_to_one_thread()
-    explanations = explain_mujoco_slip(load_model(model)[1], states, contacts=contacts or None, steps=steps)
+    explanations = explain_slip_of_states(
+        load_model(model)[1], states, contacts=contacts or None, steps=steps
+    )
     if not explanations:
         print_escaped(
             f"{model}: no contact with friction in these states; give other --states, or more --steps"

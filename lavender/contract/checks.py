@@ -337,7 +337,9 @@ def require_unknown_options_are_rejected(spec: SolverSpec) -> None:
         except kind as error:
             _require(word in str(error), f"the error for {word} does not name it: {error}")
         else:
-            raise ContractError(f"the spec does not list {word}, but {word}= raised no error")
+            raise ContractError(
+                f"{spec.name}: {word}= was accepted, but the spec does not list it: add it there, or raise an error"
+            )
 
 
 @_register("all solvers")

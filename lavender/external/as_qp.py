@@ -57,9 +57,8 @@ MAX_BACKEND_NUMBER = 1e20  # Backends treat numbers from here on as infinite, or
 # A row with a larger scaled |b| is assumed to stay at its bound: backends lose as many digits as the largest b has,
 # and active rows have b near 1. If the assumption fails, the backend is called once more with all rows.
 MAX_SCALED_RHS = 1e2
-MAX_SCALED_PROGRAM_RHS = (
-    1e6  # The same for the program form, in which x is often larger than the active bounds.
-)
+# [-] As MAX_SCALED_RHS, for the program form. It is larger, because |x| often exceeds the active bounds.
+MAX_SCALED_PROGRAM_RHS = 1e6
 VELOCITY_FORM_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is more accurate at all sizes.
 
 

@@ -392,7 +392,7 @@ class Solution:
 
     @property
     def _time_text(self) -> str:
-        """Time that the solve took, in words."""
+        """Time of set-up and iterations together, with a unit: "1.3 ms"."""
         t = self.setup_time + self.solve_time
         return f"{1e3 * t:.3g} ms" if t < 0.9995 else f"{t:.3g} s"
 

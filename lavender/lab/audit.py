@@ -390,7 +390,7 @@ class Audit:
 
     @property
     def summary_page(self) -> SummaryPage:
-        """The summary page."""
+        """Page with the result in a sentence, figures and tables, as `lavender audit` writes it."""
         return SummaryPage(
             "lavender audit", self.summary_text,
             [

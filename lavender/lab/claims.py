@@ -244,7 +244,10 @@ def compare_claims(
     try:
         for step in steps:
             if outcomes and len(step.batch) != len(outcomes[0]):
-                raise InputError(f"a step has {len(step.batch)} worlds, the first one {len(outcomes[0])}")
+                raise InputError(
+                    f"step {len(outcomes)} has {len(step.batch)} worlds, the first one {len(outcomes[0])}; all steps "
+                    "need the same number"
+                )
             outcome, velocity = _judge(step, result)
             outcomes.append(outcome)
             velocities.append(velocity)

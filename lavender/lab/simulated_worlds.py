@@ -257,7 +257,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
             return states, Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
         if has_diverged(mj, data):
             states[step + 1 :] = np.nan
-            return states, _find_divergence(mj, model, data, states[step], world, step)
+            return states, _find_cause_of_reset(mj, model, data, states[step], world, step)
     return states, None
 
 
@@ -270,7 +270,9 @@ def has_diverged(mj: Any, data: Any) -> bool:
     )
 
 
-def _find_divergence(mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int) -> Divergence:
+def _find_cause_of_reset(
+    mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int
+) -> Divergence:
     """Determine which quantity was too large in a step in which MuJoCo reset the simulation."""
     kinds = mj.mjtWarning
     for kind, name in ((kinds.mjWARN_BADQPOS, "position"), (kinds.mjWARN_BADQVEL, "velocity")):

@@ -310,7 +310,7 @@ def _format_speed(variant: SlipVariant, i: int) -> str:
     return format_size(float(variant.speeds[i]))
 
 
-def explain_mujoco_slip(
+def explain_slip_of_states(
     model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1
 ) -> list[SlipExplanation]:
     """Explain the slip of contacts of a MuJoCo model at given states.

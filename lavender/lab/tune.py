@@ -510,7 +510,7 @@ class Tuning:
 
     @property
     def summary_page(self) -> SummaryPage:
-        """The summary page."""
+        """Page with the result in a sentence, figures and tables, as `lavender tune` writes it."""
         now = self.present_result
         head = (
             f"{Path(self.runs.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "

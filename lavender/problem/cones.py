@@ -315,7 +315,7 @@ class Cones:
                 check_nonnegative_magnitudes(
                     SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m"
                 )
-            raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
+            raise InputError(f"{k} contacts have more than 2^31 - 1 rows: split the problem")
         return cls._from_blocks(blocks)
 
     @property

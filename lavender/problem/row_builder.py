@@ -810,7 +810,7 @@ class RowBuilder:
         return self._make_rigid_row(pair, ZERO + _scale(-1.0, axis_a), ZERO + axis_b, error)
 
     def _make_point_rows(self, pair: tuple[int, int], point_a: Vector, point_b: Vector) -> list[Row]:
-        """Return the rows that hold a point of b at a point of a."""
+        """Return the rows of a ball joint (two in 2-D), which hold a point of body b at a point of body a."""
         offset = _subtract(point_b, point_a)
         return [
             self._make_linear_row(pair, axis, point_a, point_b, offset[i])

@@ -220,7 +220,7 @@ class ThroughRows(Solver):
         tol: float,
         time_limit: float | None,
     ) -> Claim:
-        """Run the inner solver on the bounded rows, and its fallback if that stalls."""
+        """Run the solver of bounded rows on the converted problem, and its fallback if that solver stalls."""
         form = converted.form
         z, deadline = form.start(impulse), Deadline(time_limit)
         claim = self.solver.run(converted.state, z, max_iter, tol, time_limit)

@@ -277,7 +277,7 @@ class SmallCall:
         )
 
 
-SolverWork = list[tuple[str, dict[str, int]]]  # Names of solvers with their work.
+SolverWork = list[tuple[str, dict[str, int]]]  # (name of the solver, {kind of work: count}) of each stage.
 
 
 def _pivot_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:

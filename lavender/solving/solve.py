@@ -689,12 +689,12 @@ def solve_small(
         status,
         tol,
         perf_counter() - start,
-        (compute_late_fields, (problem, spec, judged, counts, start_point, status)),
+        (compute_postponed_fields, (problem, spec, judged, counts, start_point, status)),
     )
     return solution, None
 
 
-def compute_late_fields(
+def compute_postponed_fields(
     problem: Problem,
     spec: SolverSpec,
     judged: Any,

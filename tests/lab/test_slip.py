@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.lab.slip import explain_mujoco_slip, explain_slip, summarize_slip
+from lavender.lab.slip import explain_slip, explain_slip_of_states, summarize_slip
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -29,7 +29,7 @@ def dominant(explanation):
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
     angle = 0.3  # tan 0.309 < 0.5
-    explanation = explain_mujoco_slip(block(angle, option=f'cone="{cone}"'), steps=600)[0]
+    explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600)[0]
     assert set(explanation.causes) == {"softness of friction"}
     hard = explanation.variants[3]
     assert hard.name == "hard" and hard.speeds.max() < 1e-6
@@ -45,7 +45,7 @@ def test_creep_has_the_speed_of_the_softened_row():
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     tangent = int(data.contact.efc_address[0]) + 1
-    explanation = explain_mujoco_slip(model, steps=1501)[0]
+    explanation = explain_slip_of_states(model, steps=1501)[0]
     force = GRAVITY * np.sin(angle) / data.ncon
     damping = (
         -data.efc_aref[tangent : tangent + 2]
@@ -59,7 +59,7 @@ def test_creep_has_the_speed_of_the_softened_row():
 def test_above_the_friction_angle_the_load_is_too_large():
     angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
     steps = 150
-    explanation = explain_mujoco_slip(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
+    explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
     assert set(explanation.causes) == {"load above the friction limit"}
     expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
     assert explanation.variants[-1].speeds == pytest.approx(
@@ -70,14 +70,14 @@ def test_above_the_friction_angle_the_load_is_too_large():
 def test_iterations_that_are_missing_are_the_cause():
     model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
     exact = block(0.3, option='cone="elliptic" impratio="1000"')
-    assert dominant(explain_mujoco_slip(exact, steps=40)[0]) != "unfinished solving"
+    assert dominant(explain_slip_of_states(exact, steps=40)[0]) != "unfinished solving"
     data = mujoco.MjData(exact)
     for _ in range(40):
         mujoco.mj_step(exact, data)
     state = np.empty(mujoco.mj_stateSize(exact, mujoco.mjtState.mjSTATE_INTEGRATION))
     data.qacc_warmstart[:] = 0.0
     mujoco.mj_getState(exact, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-    assert dominant(explain_mujoco_slip(model, state[None])[0]) == "unfinished solving"
+    assert dominant(explain_slip_of_states(model, state[None])[0]) == "unfinished solving"
 
 
 def slide(velocity, cones, friction="coulomb", compliance=None):
@@ -131,7 +131,7 @@ def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
       <body pos="0 0 1"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
       <actuator><motor joint="left" ctrllimited="false"/><motor joint="right" ctrllimited="false"/></actuator>
       <keyframe><key ctrl="{grip} {grip}"/></keyframe></mujoco>""")
-    explanation = explain_mujoco_slip(model, "keyframes", contacts="box", steps=20)[0]
+    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20)[0]
     assert dominant(explanation) == cause
 
 
@@ -165,12 +165,12 @@ def test_several_solutions_give_a_range():
 
 
 def test_chosen_contacts_and_summary():
-    explanations = explain_mujoco_slip(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
+    explanations = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
     table = summarize_slip(explanations)
     assert [str(row[0]) for row in table.rows] == ["slope, box"]
     assert table.rows[0][-1] == "load above the friction limit"
     with pytest.raises(lv.InputError, match="no contact's name contains 'hand'"):
-        explain_mujoco_slip(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
+        explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
 
 
 def test_problems_without_contacts_or_velocities_are_rejected():

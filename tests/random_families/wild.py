@@ -30,7 +30,7 @@ from lavender.lab.suite.build import (
     add_horizontal_velocity,
     guess_static_loads,
     map_scalar,
-    place_four_corners,
+    place_corner_contacts,
 )
 from lavender.lab.suite.case import Draft
 from lavender.lab.suite.families import BOX, ROD, SPHERE, check_min_sizes, compute_ball_joint_jacobian
@@ -114,7 +114,7 @@ def towers(rng: np.random.Generator, rows: int) -> World:
     pairs = np.stack([np.where(level == 0, -1, k - 1), k], 1)
     foot = position - np.array([0.0, 0.0, 0.5])
     if boxes:
-        return World(position, BOX).add(place_four_corners(pairs, foot, 0.5))
+        return World(position, BOX).add(place_corner_contacts(pairs, foot, 0.5))
     return World(position, SPHERE).add(Contacts(pairs, foot, [0.0, 0.0, 1.0]))
 
 
@@ -142,7 +142,7 @@ def wall(rng: np.random.Generator, rows: int) -> World:
         half.append(0.5 * (1.0 - gap))
     pair, where = np.unique(np.concatenate(pairs), axis=0, return_index=True)
     return World(position, BOX).add(
-        place_four_corners(pair, np.concatenate(centre)[where], np.concatenate(half)[where])
+        place_corner_contacts(pair, np.concatenate(centre)[where], np.concatenate(half)[where])
     )
 
 

@@ -198,7 +198,7 @@ class Spread:
         return max(values) / min(values) if values else 1.0
 
 
-def compute_reaches(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
+def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
     """Return one row for each case, solver and start, in the order of the records."""
     tolerances = get_tolerances(records) if tolerances is None else tuple(tolerances)
     out = []
@@ -360,7 +360,7 @@ def compare_times(old: Records, new: Records) -> list[Change]:
     """
     tolerances = get_tolerances(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
-    before = {(r.case, r.solver, r.start): r for r in compute_reaches(old, tolerances)}
+    before = {(r.case, r.solver, r.start): r for r in summarize_runs_by_case(old, tolerances)}
     jitter: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
     for records in (old, new):
         for key, group in group_runs_by_pair(records).items():
@@ -368,7 +368,7 @@ def compare_times(old: Records, new: Records) -> list[Change]:
                 if r.is_usable and r.time_min > 0.0:
                     jitter[key] = max(jitter[key], r.time_median / r.time_min)
     out = []
-    for row in compute_reaches(new, tolerances):
+    for row in summarize_runs_by_case(new, tolerances):
         key = (row.case, row.solver, row.start)
         if row.case not in same or key not in before:
             continue
@@ -414,7 +414,7 @@ def compute_quantile(values: Sequence[float], q: float) -> float:
 def collect_times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the time [s] to a tolerance from a cold start by case and solver, inf if missed, without refused cases."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
-    for reach in compute_reaches(records, [tolerance]):
+    for reach in summarize_runs_by_case(records, [tolerance]):
         if reach.start == "cold":
             out[reach.case][reach.solver] = reach.times[tolerance]
     return out
@@ -460,7 +460,7 @@ def get_time_of_miss(records: Records) -> float:
     return max((r.time_limit for r in records), default=1.0)
 
 
-def compute_geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
+def compute_mean_times_by_law(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
     """Return (shifted geometric mean [s], solved, cases) by law, tolerance and solver; a miss takes the time limit.
 
     A law's table has the solvers that accept every case of it.

@@ -27,9 +27,8 @@ def make_call_arguments(measurement: Any, iterations: int) -> dict[str, Any]:
     `iterations` is the number that a solve took.
     """
     arguments: dict[str, Any] = {"tol": measurement.tol}
-    is_common = (
-        measurement.interleave_group and measurement.max_iter
-    )  # timed alternately: one limit that suffices for all cases
+    # Solvers that are timed alternately get one max_iter, which suffices for all cases.
+    is_common = measurement.interleave_group and measurement.max_iter
     if measurement.mode == "budget" or is_common or exceeds_default_budget(measurement.solver, iterations):
         arguments["max_iter"] = measurement.max_iter
     if measurement.mode == "time":

@@ -76,7 +76,10 @@ class Witness:
 
 
 def compute_witness(problem: Problem, operator: Operator, impulse: FloatArray) -> Witness:
-    """Compute the witness (2) of an impulse y (m,) [N s]; law linear, lcp or cone, and `operator.refusal()` None."""
+    """Compute the witness (2) of an impulse y (m,) [N s], for law linear, lcp or cone.
+
+    `operator.explain_refusal()` must be None.
+    """
     d = problem.d
     w, off = operator.compute_slack(impulse)
     e = np.empty(problem.m)

@@ -71,7 +71,7 @@ class Operator:
         return self.a @ x - self.b, self.slack_gamma * (self.abs_a @ np.abs(x) + np.abs(self.b))
 
     def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
-        """Compute the energy norm of x, every entry of which is uncertain by `uncertainty` (m,)."""
+        """Compute sqrt(1/2 x.A x) [sqrt J], and an upper bound for all x within `uncertainty` (m,) of it."""
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
         rounding = (self.slack_gamma + _bound_sum_rounding(len(x) + 1)) * float(y @ (self.abs_a @ y))

@@ -351,7 +351,7 @@ class Search:
         return _Undecided(f"{_join_names(names)}: {explanation}", names)
 
     def _enclose_island(self, which: Any, lam: list[Any], base: list[Any]) -> None:
-        """Enclose the impulses of `which`, by (2), into `lam`."""
+        """Compute balls that contain the impulses of the blocks `which` by equation (2); write them to `lam`."""
         own = set(which.tolist())
         sliding = [
             (block.first, component)

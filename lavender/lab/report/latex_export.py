@@ -193,7 +193,7 @@ def _write_tables(report: Report, own: Records) -> str:
         for row, line in zip(advice.rows, report.rankings, strict=True)
     ]
     parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
-    for law, by_tolerance in statistics.compute_geometric_means(own).items():
+    for law, by_tolerance in statistics.compute_mean_times_by_law(own).items():
         solvers = set(next(iter(by_tolerance.values())))
         rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - solvers)
         others = f" (not {', '.join(rest)})" if rest else ""

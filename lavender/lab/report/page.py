@@ -131,7 +131,7 @@ def _describe_cases(report: Report) -> dict[str, Any]:
     records, tolerances = report.ranked_records, report.tolerances
     by_case: dict[str, list[statistics.Reach]] = {}
     if not report.is_campaign:
-        for reach in statistics.compute_reaches(records, tolerances):
+        for reach in statistics.summarize_runs_by_case(records, tolerances):
             by_case.setdefault(reach.case, []).append(reach)
     tolerance = tolerances[len(tolerances) // 2]
     fastest = {name: _select_fastest(rows, tolerance) for name, rows in by_case.items()}

@@ -103,9 +103,9 @@ def list_sections(report: Report) -> list[Section]:
             "time of all steps, of a part if a limit ended the run; median residual by budget; carried from step to "
             "step, or cold if the solver takes no start"
         )
-        cases = tabulate_reaches(statistics.compute_reaches(records, tolerances), tolerances).without_columns(
-            "form"
-        )
+        cases = tabulate_reaches(
+            statistics.summarize_runs_by_case(records, tolerances), tolerances
+        ).without_columns("form")
         sections = [
             Section("By structure", by_structure, tabulate_advice(report)),
             Section("By sweeps", by_sweeps, tabulate_sweeps(report.rankings)),
@@ -356,7 +356,7 @@ def tabulate_motion_errors(report: Report) -> Table:
     """Tabulate time to each motion error, the smallest, relative, and its bound, of each case and solver."""
     tolerances = report.velocity_tolerances
     rows: Rows = []
-    for m in statistics.compute_reaches(report.records_by_motion_error, tolerances):
+    for m in statistics.summarize_runs_by_case(report.records_by_motion_error, tolerances):
         known = [
             f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
             for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))

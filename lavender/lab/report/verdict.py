@@ -98,7 +98,7 @@ def build_verdict(
     plan = next((run.plan for run in reversed(list(records.runs.values()))), {})
     speeds = get_velocity_tolerances(records)
     if speeds and plan.get("velocity_tolerances"):
-        return _recommend_by_speed(convert_to_motion_errors(records))
+        return _recommend_by_motion_error(convert_to_motion_errors(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
     subjects = list_subjects(records, times)
@@ -189,8 +189,11 @@ def _recommend(
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
 
 
-def _recommend_by_speed(records: Records) -> Verdict:
-    """Recommend a solver by motion error. It uses no interleaved calls."""
+def _recommend_by_motion_error(records: Records) -> Verdict:
+    """Recommend the solver that is fastest to bring every body's velocity error below the middle tolerance.
+
+    Single cases decide if there are any, else sequences. Interleaved calls are not used.
+    """
     subject = list_subjects(records)[0]
     best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
     cases, reached = _describe_subject(records, subject, n), _describe_speed(subject.best.target)

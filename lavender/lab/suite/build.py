@@ -101,7 +101,7 @@ def build_joint_problem(
     return Problem.from_rows(rows, target, **more)
 
 
-def place_four_corners(body: Any, centre: Any, half_x: Any) -> Contacts:
+def place_corner_contacts(body: Any, centre: Any, half_x: Any) -> Contacts:
     """Place four corner points on horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3) [m]; normals up."""
     sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
     half = np.broadcast_to(np.asarray(half_x, float), (len(body),))

@@ -23,7 +23,7 @@ from lavender.lab.suite.build import (
     build_joint_problem,
     guess_static_loads,
     map_scalar,
-    place_four_corners,
+    place_corner_contacts,
     place_tower,
 )
 from lavender.lab.suite.case import Draft, Reference, register_family
@@ -132,7 +132,7 @@ def _build_cube_column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
     mass = np.ones(n)
     mass[-1] = mass_ratio
     position, pairs, contact_point = place_tower(n)
-    return Bodies(position, mass, BOX), place_four_corners(pairs, contact_point, 0.5)
+    return Bodies(position, mass, BOX), place_corner_contacts(pairs, contact_point, 0.5)
 
 
 @register_family(pyramidF=WITH_FRICTION)
@@ -176,7 +176,7 @@ def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) ->
     low = np.where(a < 0, x[b], np.maximum(x[np.maximum(a, 0)], x[b])) - 0.5
     high = np.where(a < 0, x[b], np.minimum(x[np.maximum(a, 0)], x[b])) + 0.5
     centre = np.stack([0.5 * (low + high), 0.0 * low, row[b].astype(float)], 1)
-    return bodies, place_four_corners(pairs, centre, 0.5 * (high - low))
+    return bodies, place_corner_contacts(pairs, centre, 0.5 * (high - low))
 
 
 def _build_box_problem(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:

@@ -14,7 +14,7 @@ from lavender.lab.suite.build import (
     Contacts,
     build_contact_problem,
     map_scalar,
-    place_four_corners,
+    place_corner_contacts,
 )
 from lavender.lab.suite.case import Draft, Reference, register_family
 from lavender.lab.suite.families import BOX, check_min_sizes, check_positive, make_rest_reference
@@ -59,7 +59,7 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, BOX)
     bodies.v_free[0, :3] = [FALL_SPEED * math.sin(a), 0.0, -FALL_SPEED * math.cos(a)]
     problem = build_contact_problem(
-        bodies, place_four_corners([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu
+        bodies, place_corner_contacts([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu
     )
 
     def closed_form() -> Reference:

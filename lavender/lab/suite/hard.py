@@ -20,7 +20,7 @@ from lavender.lab.suite.build import (
     build_contact_problem,
     build_joint_problem,
     map_scalar,
-    place_four_corners,
+    place_corner_contacts,
     place_tower,
 )
 from lavender.lab.suite.case import Draft, Reference, register_family
@@ -95,7 +95,7 @@ def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 
     pairs = [[-1, 0], [-1, 1], [0, 2], [1, 2]]
     centre = [[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-5.0, 0.0, 1.0], [5.0, 0.0, 1.0]]
     problem = build_contact_problem(
-        bodies, place_four_corners(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT
+        bodies, place_corner_contacts(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT
     )
     rest = make_rest_reference(problem) if friction == "none" or sliding == 0.0 else None
     return Draft(problem, "heavy on light with levers of ten metres", rest, EXPECT_SWEEPS_STALL)
@@ -265,7 +265,7 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     check_positive(kg=kg, m=m, s=s)
     check_min_sizes(1, n=n)
     position, pairs, contact_point = place_tower(n)
-    bodies, contacts = Bodies(position, 1.0, BOX), place_four_corners(pairs, contact_point, 0.5)
+    bodies, contacts = Bodies(position, 1.0, BOX), place_corner_contacts(pairs, contact_point, 0.5)
     arm_a, arm_b = contacts.compute_arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(

@@ -81,7 +81,10 @@ class Snapshot:
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]
         if hashlib.sha256(body).digest() != checksum:
-            raise InputError(f"the snapshot {str(path)!r} is damaged: its checksum does not fit")
+            raise InputError(
+                f"the snapshot {str(path)!r} is damaged: its checksum does not match its content. Save or copy it "
+                "again"
+            )
         try:
             snapshot = cls._parse(body)
         except (ValueError, KeyError, TypeError, RecursionError) as error:

@@ -167,7 +167,7 @@ def test_sequences_are_compared_carried_against_cold():
     assert curves == [("pgs", budget.residuals["carried"]), ("pgs (cold)", budget.residuals["cold"])]
     total = pytest.approx(np.cumsum(exact.times["cold"]))  # the time so far
     assert [c.y for c in to_tolerance.curves if c.solver == "direct"] == [total]
-    assert report.compute_reaches(records) == []  # steps are no cases of their own
+    assert report.summarize_runs_by_case(records) == []  # steps are no cases of their own
 
 
 def test_misses_in_a_time_count():

@@ -21,7 +21,7 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
         record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
         record("a", "y", 3.0, 0.5, tol=1e-3, **FALSE_CLAIM),
     )
-    x, y = report.compute_reaches(found)
+    x, y = report.summarize_runs_by_case(found)
     assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
     assert (x.best, x.status) == (1e-8, "CONVERGED")
     assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
@@ -41,7 +41,7 @@ def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, 
     found = records_of(record("a", "x", 1.0, 0.5, **claim))
     assert len(report.list_failures(found)) == (0 if check == "confirmed" else 1)
     assert [c.wrong for c in report.count_claims(found)] == [wrong]
-    table = table_specs.tabulate_reaches(report.compute_reaches(found), TOLERANCES)
+    table = table_specs.tabulate_reaches(report.summarize_runs_by_case(found), TOLERANCES)
     assert str(table.rows[0][table.heads.index("claim")]) == mark
     assert table.marks == ["bad" if wrong else ""]
 
@@ -63,7 +63,7 @@ def test_shifted_geometric_means_charge_misses_the_limit():
         record("a", "y", 1.0, 1e-7), record("b", "y", 0.5, 1.0, success=False),
         record("a", "z", 1.0, 1e-7),  # does not take b: not compared
     )  # fmt: skip
-    means = report.compute_geometric_means(found)["lcp"][1e-6]
+    means = report.compute_mean_times_by_law(found)["lcp"][1e-6]
     shift = statistics.MEAN_TIME_SHIFT
     assert set(means) == {"x", "y"}
     assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)

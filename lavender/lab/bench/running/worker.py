@@ -206,7 +206,10 @@ def parse_outcome(
         raise ValueError(str(error)) from None
     parts = (*outcome.setups, *outcome.solves)
     if not parts or len(outcome.setups) != len(outcome.solves):
-        raise ValueError("no times")
+        raise ValueError(
+            f"the worker returned {len(outcome.setups)} setup and {len(outcome.solves)} solve times; equally many, at "
+            "least one, are needed"
+        )
     times = [t - lead for t in outcome.times]
     valid = all(t >= 0.0 for t in (*parts, *times))
     if not valid or not max(math.fsum(parts), math.fsum(times)) <= elapsed:
