@@ -103,10 +103,11 @@ def test_real_friction_problems(problem_dir, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [150, 180])
 def test_piles_that_creep_are_solved_along_a_path_through_its_folds(step, problem_dir):
-    """126 balls in a box, between stick and slip: rounds end at 1e-5, interior points at 7e-3."""
+    """126 balls in a box, between stick and slip: interior points end at 7e-3."""
     problem = lv.io.load(problem_dir / "engine" / f"balls_step_0{step}.npz")
     solution = lv.solve(problem, "newton", tol=1e-6)
     assert good(solution, 1e-6) and "path steps" in solution.message, solution
     with newton_without("path"):
         other = lv.solve(problem, "newton", tol=1e-6, max_iter=1000)
-    assert not good(other, 1e-6), other
+    # Without the path, De Saxce's steps reach it after up to four times the factorisations, or nearly the same number.
+    assert solution.work["factorisations"] < 1.5 * other.work["factorisations"], (solution, other)

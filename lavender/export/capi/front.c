@@ -266,12 +266,19 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 
 static int32_t check_bodies(const lav_problem *q, where_t *at) {
   const int64_t n = q->n_bodies, c = q->n_blocks - q->n_joints, mj = q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints;
-  const rows_t r = {.n_bodies = q->n_bodies, .n_joints = q->n_joints, .n_contacts = (int32_t)c, .inv_mass = q->inv_mass,
-                    .inv_inertia = q->inv_inertia, .normal = q->normal, .tangent = q->tangent, .joint_body = q->joint_body,
-                    .contact_body = q->contact_body};
+  rows_t r; /* The check reads only the fields that are set here. */
   const struct core_faults_body_tolerances_t tolerances = {ROUNDED, ROUNDED, ROUNDED, 0.0};
   double length;
   int64_t i = 0;
+  r.n_bodies = q->n_bodies;
+  r.n_joints = q->n_joints;
+  r.n_contacts = (int32_t)c;
+  r.inv_mass = q->inv_mass;
+  r.inv_inertia = q->inv_inertia;
+  r.normal = q->normal;
+  r.tangent = q->tangent;
+  r.joint_body = q->joint_body;
+  r.contact_body = q->contact_body;
   NEEDED(inv_mass, n);
   NEEDED(inv_inertia, 9 * n);
   OPTIONAL(velocity, 6 * n);

@@ -40,8 +40,8 @@ static double see(lav_solver *s, struct judge_best_best_t *best, const double *i
   judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
   relative = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   judge_best_note_score(best, &s->p, &t, relative);
-  if (tol < 0.0) judge_best_see_start(best, &s->p, impulse);
-  else judge_best_see_impulse(best, &s->p, impulse, tol);
+  if (tol < 0.0) judge_best_store_start(best, &s->p, impulse);
+  else judge_best_store_better_islands(best, &s->p, impulse, tol);
   return relative;
 }
 

@@ -136,7 +136,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   }
   copy_or(s->p.lower, q->lower, m, -INFINITY);
   copy_or(s->p.upper, q->upper, m, INFINITY);
-  core_block_types_spell_bounds(&s->p);
+  core_block_types_write_contact_bounds(&s->p);
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
   copy_or(s->p.rolling, q->rolling, k, 0.0);
