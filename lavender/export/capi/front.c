@@ -216,10 +216,18 @@ static int32_t refuse(where_t *at, int32_t code, const char *array, int64_t inde
 }
 
 static int32_t check_blocks(const lav_problem *q, where_t *at) {
-  const blocks_t p = {.n_blocks = q->n_blocks, .n_rows = q->n_rows, .ptr = q->block_ptr, .kind = q->kind, .lower = q->lower,
-                      .upper = q->upper, .mu = q->mu, .patch_radius = q->patch_radius, .rolling = q->rolling};
+  blocks_t p; /* The check reads only the fields that are set here. */
   int64_t index = 0;
   int32_t i;
+  p.n_blocks = q->n_blocks;
+  p.n_rows = q->n_rows;
+  p.ptr = q->block_ptr;
+  p.kind = q->kind;
+  p.lower = q->lower;
+  p.upper = q->upper;
+  p.mu = q->mu;
+  p.patch_radius = q->patch_radius;
+  p.rolling = q->rolling;
   if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "n_blocks", 0);
   for (i = 0; q->kind && i < q->n_blocks; i++)
     if (q->kind[i] < LAV_ROW || q->kind[i] > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
