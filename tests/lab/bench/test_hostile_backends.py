@@ -177,7 +177,7 @@ from lavender.lab.bench.running.worker import Worker
 sys.path[:0] = [sys.argv[1]]
 from test_hostile_backends import stack, task
 p = stack()
-Worker().measure(p, task(p, "x_fork", time_limit=600.0))
+Worker().measure_task(p, task(p, "x_fork", time_limit=600.0))
 """
 
 

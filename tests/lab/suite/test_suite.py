@@ -74,7 +74,7 @@ def test_a_function_and_its_name_agree():
         ("pyramid(k=abc)", lv.InputError, "a number"),
         ("pyramid(mass_ratio=1e999)", lv.InputError, "a finite number"),
         ("pyramid(mass_ratio=0)", lv.InputError, "above 0"),
-        ("pyramid(friction=3)", lv.InputError, "a word"),
+        ("pyramid(friction=3)", lv.InputError, "a text"),
         ("pyramid(friction=glue)", lv.InputError, "none, coulomb, cone"),
         ("boxed_friction(scene=glue)", lv.InputError, "box_stack, pyramid, granular"),
         ("toy_stack(kick=-1)", lv.InputError, "upwards"),
