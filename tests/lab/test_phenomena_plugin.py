@@ -56,7 +56,9 @@ def test_a_wrong_engine_fails_with_quantity_value_and_bound(tmp_path):
 
 
 def test_tests_of_the_engine_itself_run_too(tmp_path):
-    (tmp_path / "test_own.py").write_text("def test_own():\n    assert True\n")
+    (tmp_path / "test_own.py").write_text(
+        "import their_engine\n\ndef test_own():\n    assert their_engine.Frozen.dt > 0.0\n"
+    )
     output, code = run_pytest(
         tmp_path, "--phenomena", "their_engine:Good", "--phenomena-names", "stick", "-vv"
     )
