@@ -152,7 +152,7 @@ def measure(cache):
     ours = [name for name, spec in built_in().items() if not spec.external]
     cache.mkdir(parents=True, exist_ok=True)
     solvers = ours + [name for name in BACKENDS if registry.specs()[name].missing() is None]
-    return bench.run(CASES, solvers, PLAN, cache / f"records-{fingerprint()}.jsonl").latest()
+    return bench.run(CASES, solvers, PLAN, cache / f"records-{fingerprint()}.jsonl").select_latest_run()
 
 
 def fingerprint():
