@@ -440,7 +440,7 @@ def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     )
 
 
-@_register("solvers with `history`", lambda spec: spec.history)
+@_register("solvers with `history`", lambda spec: spec.history and not spec.delegates)
 def require_history_at_fixed_counts(spec: SolverSpec) -> None:
     """Require that a history records the residual at fixed iteration counts and does not change the result."""
     problem = _first_problem(spec)

@@ -120,6 +120,9 @@ class History:
     energy : (k,), sqrt J
     velocity : (k,), m/s
         Relative residual, energy error and largest velocity error, as in `Residual`.
+    solvers : (k,) str
+        Solver of each record if `auto` ran, else empty. `iterations` counts all stages, each in the unit of its
+        solver: sweeps of `anderson`, steps of `newton`, `admm`, `nncg` and `direct`, pivots of `lemke`.
     """
 
     iterations: np.ndarray
@@ -127,6 +130,7 @@ class History:
     relative: FloatArray
     energy: FloatArray
     velocity: FloatArray
+    solvers: tuple[str, ...] = ()
 
     def plot(self, against: str = "iterations") -> Any:
         """Plot the relative residual and return the matplotlib figure.
@@ -143,9 +147,15 @@ class History:
         figure = Figure(figsize=(6.0, 4.0), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        x = self.iterations if against == "iterations" else self.time
+        x = np.asarray(self.iterations if against == "iterations" else self.time)
         shown = self.relative > 0.0
-        axes.semilogy(np.asarray(x)[shown], self.relative[shown], marker="o", markersize=3)
+        line = axes.semilogy(x[shown], self.relative[shown], marker="o", markersize=3)[0]
+        if self.solvers:
+            line.set(marker="", color="0.6")
+            for name in dict.fromkeys(self.solvers):
+                chosen = shown & (np.array(self.solvers) == name)
+                axes.semilogy(x[chosen], self.relative[chosen], "o", markersize=3, label=name)
+            axes.legend()
         axes.set_xlabel("iterations" if against == "iterations" else "time [s]")
         axes.set_ylabel("relative residual [-]")
         axes.grid(alpha=0.3)

@@ -49,7 +49,9 @@ from lavender.solvers.certify import (
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.islands import count_pairs
+from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.recording import Recorder
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
 from lavender.solvers.setup_times import (
     first_factor_time,
@@ -322,10 +324,13 @@ class AutoState:
     problem : Problem
     failed_call : tuple of int or None
         Counts of a compiled call that has failed; None if it has not been made.
+    loop : Loop or None
+        Loop of the solve, if it records a history.
     """
 
     problem: Problem
     failed_call: tuple[int, ...] | None = None
+    loop: Loop | None = None
 
 
 @dataclass(frozen=True)
@@ -345,6 +350,24 @@ class Auto(Solver):
     def run(
         self, state: AutoState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
+        if state.loop is None:
+            return self._run(state, impulse, max_iter, tol, time_limit)
+        recorder = Recorder(state.loop)
+        recorder.record("start", 0, impulse)
+        claim = self._run(state, impulse, max_iter, tol, time_limit, recorder)
+        recorder.finish(claim, impulse)
+        return claim
+
+    def _run(
+        self,
+        state: AutoState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
+        recorder: Recorder | None = None,
+    ) -> Claim:
+        """Run as `run`, and write the history with the recorder."""
         problem, deadline = state.problem, Deadline(time_limit)
         if problem.has_singular_program:
             return run_backends(problem, impulse, max_iter, tol, deadline)
@@ -356,6 +379,8 @@ class Auto(Solver):
                 if result is not None and result.relative <= tol:
                     claim = AUTO.claim(problem, counts, impulse, result.relative)
                     if claim.iterations <= max_iter:
+                        if recorder is not None:
+                            recorder.add_call(AUTO, impulse, tol, claim)
                         impulse[:] = result.impulse
                         return claim
         failed = AUTO.failed_claims(problem, counts)
@@ -368,6 +393,7 @@ class Auto(Solver):
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         log = SolveLog(problem, tol, max_iter, deadline)
         log.begin(impulse)
+        log.recorder = recorder
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:

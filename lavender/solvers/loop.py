@@ -69,8 +69,12 @@ class Loop:
     callback : callable, optional
     records : list, optional
         Records of the history, which are appended.
+    record_solvers : list of str
+        Solver of each record, if `auto` makes them.
     time : float, s
         Time of the solver, without the judge.
+    recording_time : float, s
+        Time of the judge for the records.
     done : int
         Iterations.
     work : dict
@@ -90,7 +94,9 @@ class Loop:
     deadline: Deadline
     callback: Callback | None = None
     records: list[Record] | None = None
+    record_solvers: list[str] = field(default_factory=list)
     time: float = 0.0
+    recording_time: float = 0.0
     done: int = 0
     work: dict[str, int] = field(default_factory=dict)
     broken: bool = False
@@ -105,7 +111,8 @@ class Loop:
             try:
                 claim = self.call(max_iter, self.deadline.remaining(MIN_TIME_LIMIT))
             finally:
-                self.time = watch.seconds
+                self.time = watch.seconds - self.recording_time
+            self.done = claim.iterations
             if not self.broken:
                 return claim
         except KeyboardInterrupt:
@@ -215,9 +222,11 @@ class Loop:
 
     def _record(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
+        watch = Stopwatch()
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
+        self.recording_time += watch.seconds
         self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then steps of an eighth.
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
@@ -230,10 +239,17 @@ class Loop:
         """Return the history, or None if it was not requested."""
         if self.records is None:
             return None
+        solvers = self.record_solvers
+        if (
+            solvers and self.records[-1][0] == self.done
+        ):  # The result of `auto` is the best impulse of all stages.
+            self.records.pop()
         if not self.records or self.records[-1][0] != self.done:
             self._record()
-        columns = list(zip(*self.records, strict=True))
-        return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
+        if solvers:
+            solvers = [*solvers, solvers[-1]][: len(self.records)]
+        done, time, relative, energy, velocity = (np.array(c) for c in zip(*self.records, strict=True))
+        return History(done.astype(np.int64), time, relative, energy, velocity, tuple(solvers))
 
 
 def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:

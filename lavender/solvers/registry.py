@@ -176,7 +176,7 @@ class SolverSpec:
     callback : bool
         It accepts a `callback`; requires `resumable`.
     history : bool
-        It records `history`; requires `resumable`.
+        It records `history`; requires `resumable` or `delegates`.
     delegates : bool
         It calls other solvers (only "auto" does).
     round_cones : bool
@@ -288,7 +288,7 @@ class SolverSpec:
         object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
-            object.__setattr__(self, "history", False)
+            object.__setattr__(self, "history", self.history and self.delegates)
 
     @property
     def accepts(self) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
+
+if TYPE_CHECKING:
+    from lavender.solvers.recording import Recorder
 
 __all__ = ["SolveLog"]
 
@@ -50,6 +53,7 @@ class SolveLog:
         self.certificate: FloatArray | None = None  # (m,)
         self.direction: FloatArray | None = None  # (m,): not a certificate, but it bounds the impulses.
         self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
+        self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
     def begin(self, start: FloatArray) -> None:
         """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""

@@ -97,7 +97,14 @@ class Step:
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
         claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
         self.offer()
+        self.record(claim)
         return claim
+
+    def record(self, claim: Claim) -> None:
+        """Record the iterate at the end of a stage, if a history is requested."""
+        log = self.log
+        if log.recorder is not None:
+            log.recorder.record(self.name, log.iterations + claim.iterations, self.impulse)
 
     def offer(self) -> None:
         """Offer the iterate to the log if it is finite."""
@@ -130,6 +137,7 @@ class Newton(Step):
         claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.has_stalled = claim.status is Status.STALLED
         self.offer()
+        self.record(claim)
         return claim
 
 
@@ -146,9 +154,12 @@ class Iterations(Step):
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
             deadline=log.deadline if left is None or self.time_fraction == 1.0 else Deadline(self.time_fraction * left),
-            pace=ITERATION_TIME_PER_COST * sweep_cost(log.problem),
+            pace=ITERATION_TIME_PER_COST * sweep_cost(log.problem), records=None if log.recorder is None else [],
         )  # fmt: skip
+        begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.iterate(loop, n)
+        if log.recorder is not None:
+            log.recorder.add_loop(self.name, log.iterations, begun, loop)
         self.offer()
         if log.best > log.tol:
             best, impulse = self.state.best

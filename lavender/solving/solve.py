@@ -127,7 +127,7 @@ def solve(
         other packages run in a separate process, which is reused by later solves and killed at the limit (at twice the
         limit if the package has a time limit of its own); `isolate=False` runs them in this process.
     history : bool
-        Record iterations, time and residual at fixed numbers of iterations.
+        Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all stages.
     callback : callable (iterations, impulse, residual), optional
         Called whenever history would be recorded; the solve stops if it returns a true value.
     **options
@@ -381,9 +381,9 @@ class Prepared:
                 self._replace_problem(problem)
                 self._prepare_solver(deadline)
             self._refresh(problem, deadline)
-            if self.spec.delegates and self.state is not None:
-                self.state.failed_call = failed_call
             loop = self._loop(start, tol, deadline, history, callback)
+            if self.spec.delegates and self.state is not None:
+                self.state.failed_call, self.state.loop = failed_call, loop if history else None
             return self._run(loop, max_iter)
         finally:
             if self._is_late:
@@ -819,8 +819,13 @@ def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -
     """Raise an error if `history` or `callback` is not valid or not supported by the solver."""
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
-    if (callback is not None and not spec.callback) or (check_bool("history", history) and not spec.history):
+    if callback is not None and not spec.callback:
         raise CapabilityError(
-            f"solver {spec.name!r} runs in one call; it takes no callback and records no history: use a solver of "
+            f"solver {spec.name!r} runs in one call and takes no callback: use a solver of "
+            "lavender.available(problem, callback=True)"
+        )
+    if check_bool("history", history) and not spec.history:
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call and records no history: use a solver of "
             "lavender.available(problem, history=True)"
         )

@@ -1,0 +1,76 @@
+"""`history=True` of `auto`: the records of all stages, which do not change the result."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+# Stages of the compiled call, of sweeps, of sweeps and Newton's method, of the cone law, and of the alternation.
+CASES = {
+    "box_stack(n=10)": {"start", "direct"},
+    "ramp(angle=30)": {"start", "anderson"},
+    "pyramid(k=6, mass_ratio=100)": {"start", "anderson"},
+    "box_stackF(n=10)": {"start", "anderson", "newton"},
+    "granularF(n=3, sliding=0.5)": {"start", "anderson", "nncg from the cone law"},
+    "anisotropic(ratio=100, speed=3)": {"start", "anderson"},
+    "hang(n=33)": {"start", "newton"},
+    "wedge(angle=1e-8)": {"start", "anderson", "newton", "admm", "nncg", "linear program"},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_history_has_all_stages_and_changes_no_bit(name):
+    problem = lv.suite.case(name).problem
+    recorded, plain = lv.solve(problem, history=True), lv.solve(problem)
+    history = recorded.history
+    assert recorded.impulse.tobytes() == plain.impulse.tobytes()
+    assert (recorded.status, recorded.iterations, recorded.message) == (
+        plain.status,
+        plain.iterations,
+        plain.message,
+    )
+    assert set(history.solvers) == CASES[name]
+    assert len(history.solvers) == len(history.iterations) == len(history.time)
+    assert history.iterations[0] == 0 and history.iterations[-1] == recorded.iterations
+    assert np.all(np.diff(history.iterations) > 0) and np.all(np.diff(history.time) >= 0.0)
+    assert history.relative[0] == pytest.approx(1.0)
+    assert history.relative[-1] == recorded.residual.relative
+
+
+def test_sweeps_within_the_compiled_call_are_recorded():
+    history = lv.solve(lv.suite.case("ramp(angle=30)").problem, history=True).history
+    assert len(history.iterations) > 2
+    assert np.all(np.diff(history.relative) < 0.0)
+
+
+def test_a_start_that_is_a_solution_has_one_record():
+    problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
+    history = lv.solve(problem, impulse=lv.solve(problem).impulse, history=True).history
+    assert (history.iterations.tolist(), history.solvers) == ([0], ("start",))
+
+
+def test_a_prepared_auto_records_only_if_requested():
+    problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
+    prepared = lv.prepare(problem)
+    first, second, third = (
+        prepared.solve(history=True),
+        prepared.solve(max_iter=500),
+        prepared.solve(history=True),
+    )
+    assert second.history is None
+    assert first.history.iterations.tolist() == third.history.iterations.tolist()
+    assert first.impulse.tobytes() == third.impulse.tobytes()
+
+
+def test_programs_with_a_singular_matrix_record_start_and_end():
+    problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [-1.0, 1.0], lb=[0.0, 0.0])
+    solution = lv.solve(problem, history=True)
+    assert solution.success
+    assert solution.history.iterations[-1] == solution.iterations
+    assert solution.history.relative[-1] == solution.residual.relative
+
+
+def test_the_plot_names_the_solver_of_each_stage():
+    history = lv.solve(lv.suite.case("box_stackF(n=10)").problem, history=True).history
+    labels = [text.get_text() for text in history.plot().axes[0].get_legend().get_texts()]
+    assert labels == ["start", "anderson", "newton"]
