@@ -174,7 +174,9 @@ def law_figures(records):
     out = {}
     for law in LAWS:
         drawn = (build_work_precision(records, c) for c, info in records.cases.items() if info.law == law)
-        some = [replace(figure, curves=tuple(curve.lower_front for curve in figure.curves)) for figure in drawn]
+        some = [
+            replace(figure, curves=tuple(curve.lower_front for curve in figure.curves)) for figure in drawn
+        ]
         if some:
             text = io.StringIO()
             with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
