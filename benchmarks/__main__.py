@@ -17,6 +17,7 @@ NAMES = (
     "limits",
     "page",
     "peers",
+    "rates",
     "stability",
     "stand",
     "worlds",

@@ -17,10 +17,11 @@ from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import Many, check_impulses, check_problems, residual_many
-from lavender.judge.residuals import estimate_pass_time, judge_impulse, residual
+from lavender.judge.residuals import judge_impulse, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
+from lavender.solvers.costs import RATES, estimate_judge_setup_cost, estimate_pass_cost
 from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.solve import (
@@ -54,9 +55,9 @@ if TYPE_CHECKING:
 __all__ = ["Solutions", "solve_many"]
 
 # Worlds that are not started before the deadline are late: their start is judged.
-JUDGE_TIME_OF_LATE_WORLD = 4e-6  # [s] Time to judge a late world with J and M in the compiled loop.
-JUDGE_TIME_PER_PRODUCT = 5e-9  # [s] Additional time for each multiply-add.
-LATE_WORLD_TIME = 4e-5  # [s] Time to store a late world of a list, which is judged when its numbers are read.
+# Costs [ns]: to judge such a world with J and M in the compiled loop, which grows with the judge's rate per entry, and
+# to store one of a list, whose numbers are judged when they are read.
+JUDGED_LATE_WORLD_COST, LATE_WORLD_COST = 4e3, 4e4
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
@@ -209,17 +210,19 @@ class Solutions(Many, Sequence[Solution]):
             first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
-    def _estimate_late_judging_time(self) -> float:
-        """Estimate the time [s] of the results if no world is started before the deadline."""
+    def _estimate_late_judging_cost(self) -> float:
+        """Estimate the cost [ns] of the results if no world is started before the deadline."""
         if isinstance(self.problems, Batch):
             rows, columns = (
                 self.problems.at[:, PLACE[name]].astype(float) for name in ("rows", "velocities")
             )
             entries = np.where(columns > 0.0, columns, rows)  # entries of a row of J, or of A
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
-            return JUDGE_TIME_OF_LATE_WORLD * len(rows) + JUDGE_TIME_PER_PRODUCT * products
+            return float(JUDGED_LATE_WORLD_COST * len(rows) + RATES["judge entry"] * products)
         return sum(
-            JUDGE_TIME_OF_LATE_WORLD + estimate_pass_time(p) if data and p.generalized else LATE_WORLD_TIME
+            JUDGED_LATE_WORLD_COST + estimate_judge_setup_cost(p) + estimate_pass_cost(p)
+            if data and p.generalized
+            else LATE_WORLD_COST
             for p, data in zip(self.problems, self._data, strict=True)
         )
 
@@ -364,7 +367,7 @@ def solve_many(
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     if deadline.is_set:
-        deadline.reserve(solutions._estimate_late_judging_time())
+        deadline.reserve(1e-9 * solutions._estimate_late_judging_cost())
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
@@ -395,7 +398,7 @@ def solve_many(
         has_failed = solutions._worlds.code[i] == CODE["tried"]
         if deadline.is_set:
             if not isinstance(worlds, Batch):
-                deadline.reserve(-LATE_WORLD_TIME)
+                deadline.reserve(-1e-9 * LATE_WORLD_COST)
             if deadline.passed():
                 check_accepted(problem, spec, deadline)
                 unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")

@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers.registry import Solver
+from lavender.solvers.registry import Cost, Solver
 from lavender_ext.judge.measure import all_finite
 
 
@@ -52,12 +52,16 @@ class Foreign(Solver):
     def _call_optional(self, method: str, *arguments: Any) -> Any:
         return self._call_method(method, *arguments) if self._has_method(method) else None
 
-    def setup_time(self, problem: Problem) -> float:
-        """Return the solver's estimate of the time [s] of `prepare`, 0 if it has none."""
-        estimate = self._call_optional("setup_time", problem)
-        return (
-            0.0 if estimate is None else check_float(f"setup_time of solver {self.name!r}", estimate, low=0.0)
-        )
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Return the solver's estimate of its costs [ns], 0 for `prepare` if it has none."""
+        estimate = self._call_optional("cost", problem)
+        if estimate is None:
+            return Cost()
+        if not isinstance(estimate, Cost):
+            raise InputError(
+                f"cost of solver {self.name!r} is a {type(estimate).__name__}; a lavender.registry.Cost is needed"
+            )
+        return Cost(check_float(f"cost of the set-up of solver {self.name!r}", estimate.setup, low=0.0))
 
     def start_workers(self, state: State, time_limit: float) -> None:
         """Start worker processes before the clock of a time limit starts."""

@@ -75,12 +75,6 @@ MAX_REST_VELOCITY = (
     1e-9  # m/s. With a smaller V0 a problem is at rest: the zero impulse counts as its solution.
 )
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half its spacing at 1
-# Times of the judge, fitted by the command that `solvers/setup_times.py` names.
-RESULT_TIME = 1e-4  # s to build one result
-PASS_TIME_PER_PRODUCT = 1.5e-9  # [s] Time for each multiply-add of a pass.
-WHITENING_TIME_PER_PRODUCT = 4e-10  # [s] Time for each product of J L^-1.
-READ_TIME_PER_ENTRY = 5e-9  # [s] Time to read an entry of J L^-1 or of a matrix.
-PRODUCTS_PER_BODY_ROW = 32  # multiply-adds of a pass for each row between two bodies
 
 # at_floor(relative, floor) of one island; solvers and the judge share this test, its reason is in the kernel.
 at_floor = measure.at_floor
@@ -364,44 +358,6 @@ def combine_best_islands(
     get_reference(problem)
     best: FloatArray = measure.best_of_islands(problem.metric, list(starts), list(impulses), tol)
     return best
-
-
-def estimate_judging_time(problem: Problem) -> float:
-    """Estimate the time [s] of one pass of the judge and of building its result, from the size of its data."""
-    return RESULT_TIME + PASS_TIME_PER_PRODUCT * (
-        float(problem.metric.work) if _is_set_up(problem) else _estimate_pass(problem)[0]
-    )
-
-
-def estimate_judge_setup_time(problem: Problem) -> float:
-    """Estimate the time [s] to set up the judge's first pass: A by rows, J L^-1, or the arrays of bodies."""
-    return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
-
-
-def estimate_pass_time(problem: Problem) -> float:
-    """Estimate the time [s] to set up and run one pass without building a result."""
-    return estimate_judge_setup_time(problem) + estimate_judging_time(problem) - RESULT_TIME
-
-
-def _is_set_up(problem: Problem) -> bool:
-    """Return whether the data that the judge reads are set up."""
-    view = problem.derived.view
-    return "metric" in problem.__dict__ or (view is not None and view.ready)
-
-
-def _estimate_pass(problem: Problem) -> tuple[float, float]:
-    """Return the maximum multiply-adds of a pass and the time to set it up [s]."""
-    general = problem.generalized
-    if general is not None:
-        # A row of J L^-1 has at most as many entries as the row of J, times the mean length of the rows of L.
-        reached = (len(general.operator.mass[1]) + general.operator.fill) / max(general.nv, 1)
-        entries = min(len(general.operator.jac[1]) * reached, float(general.m) * general.nv)
-        return 2.0 * entries, (READ_TIME_PER_ENTRY + WHITENING_TIME_PER_PRODUCT * reached) * entries
-    if problem.rows is not None:
-        return PRODUCTS_PER_BODY_ROW * float(
-            problem.m
-        ), PASS_TIME_PER_PRODUCT * PRODUCTS_PER_BODY_ROW * problem.m
-    return float(problem.matrix.size), READ_TIME_PER_ENTRY * float(problem.matrix.size)
 
 
 def store_result(problem: Problem, last: measure.Judged) -> None:

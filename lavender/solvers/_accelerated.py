@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
-from lavender.solvers.setup_times import forming_time
+from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_sweep_cost
 from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core.order import SYMMETRIC
@@ -61,11 +62,16 @@ class Accelerated(Sweeping):
         state: AcceleratedState = super().prepare(problem)
         return state
 
-    def _forming(self, problem: Problem) -> float:
+    def _estimate_formation_cost(self, problem: Problem) -> float:
         over_a = _max_entries(problem) is not None or not (
             problem.rows is not None or reads_whitened(problem)
         )
-        return forming_time(problem) if over_a else 0.0
+        return estimate_formation_cost(problem) if over_a else 0.0
+
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the costs; an iteration is a sweep over the data of `operator`."""
+        setup = partial(self._estimate_setup_cost, problem)
+        return Cost(setup, lambda: estimate_sweep_cost(problem, count_sweep_work(problem)))
 
     def _check(self, problem: Problem) -> None:
         """Raise InputError if the options `sweep` and `convex` are not valid for the problem."""
@@ -105,7 +111,7 @@ def operator(problem: Problem) -> Any:
     return swept_data(problem) if _max_entries(problem) is None else problem.csr_data
 
 
-def sweep_work(problem: Problem) -> int:
+def count_sweep_work(problem: Problem) -> int:
     """Estimate the multiply-adds of one sweep over the data of `operator` (`Data.work`), without forming A."""
     entries = _max_entries(problem)
     if entries is None and problem.generalized is not None and not reads_whitened(problem):

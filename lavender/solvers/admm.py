@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,16 @@ from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import MAX_MEMORY
+from lavender.solvers.costs import (
+    RATES,
+    SCIPY_MODULES,
+    Cost,
+    count_dense_work,
+    estimate_analysis_cost,
+    estimate_formation_cost,
+    estimate_import_cost,
+    estimate_symmetry_cost,
+)
 from lavender.solvers.factors import (
     MAX_DENSE_RANK_ROWS,
     PANELS_WORK_COST,
@@ -37,21 +48,6 @@ from lavender.solvers.factors import (
 )
 from lavender.solvers.newton_systems.sparse import BACKWARD_TOLERANCE
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import (
-    ANALYSIS_ENTRY_TIME,
-    DENSE_FACTOR_WORK_TIME,
-    FORM_ROW_TIME,
-    FULL_LAYOUT_ENTRY_TIME,
-    LAYOUT_ENTRY_TIME,
-    SCIPY_CALLS_TIME,
-    SCIPY_MODULES,
-    START_TIME,
-    analysis_time,
-    comparison_time,
-    dense_work,
-    forming_time,
-    loading_time,
-)
 from lavender.solvers.sweeping import create_stopping_test, make_claim
 from lavender_ext.accelerate import admm
 from lavender_ext.factor.sparse import SparsePanels
@@ -64,13 +60,12 @@ _START_RHO = 0.1  # First penalty; B has unit diagonal, so its scale is 1. Measu
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# `prepare` scales the problem if that is estimated to take up to this time [s]; otherwise `run` does.
-MAX_SETUP_SCALING_TIME = 5e-3
-_SCALING_ENTRY_TIME = 1e-8  # Time [s] per entry of A.
+# `prepare` scales the problem if that is estimated to cost up to this [ns]; otherwise `run` does.
+MAX_SETUP_SCALING_COST = 5e6
+_SCALING_ENTRY_COST = 10.0  # Cost [ns] per entry of A.
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
-# Time [s] per multiply-add of a factor by panels, and of L U in one panel.
-_PANELS_WORK_TIME, _ONE_PANEL_WORK_TIME = 1e-9 * PANELS_WORK_COST, 4e-10
+_ONE_PANEL_WORK_COST = 0.4  # Cost [ns] per multiply-add of L U in one panel.
 
 
 class _Breakdown(Exception):
@@ -88,10 +83,10 @@ class AdmmState:
         self.watch: Any = None
         self.factor: Any = None
         self.is_scaled = self.is_analysed = False
-        self.seconds = _estimate_scaling_time(
+        self.next_cost = _estimate_scaling_cost(
             problem
-        )  # Estimated time of the next step: scaling, analysis, or a factor.
-        if self.seconds <= MAX_SETUP_SCALING_TIME:
+        )  # Cost [ns] of the next step: scaling, analysis, or a factor.
+        if self.next_cost <= MAX_SETUP_SCALING_COST:
             self._scale()
 
     def open(self) -> None:
@@ -101,13 +96,13 @@ class AdmmState:
             self._scale()
         if not self.is_analysed:
             self._check_deadline()
-            self.seconds = self._estimate_first_factor_time()
+            self.next_cost = self._estimate_first_factor_cost()
             self.is_analysed = True
         if self.factor is None:
             self.factor = self._factor()
 
     def _check_deadline(self) -> None:
-        if self.deadline.passed(self.seconds):
+        if self.deadline.passed(1e-9 * self.next_cost):
             raise TooLate
 
     def _scale(self) -> None:
@@ -123,7 +118,10 @@ class AdmmState:
             form = problem.velocity_form()
             # The form is scaled with D = diag d of the judge.
             self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
-            self.is_scaled, self.seconds = True, 0.0  # There is no matrix to analyse before the first factor.
+            self.is_scaled, self.next_cost = (
+                True,
+                0.0,
+            )  # There is no matrix to analyse before the first factor.
             return
         a = problem.csr
         values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
@@ -133,23 +131,21 @@ class AdmmState:
         if problem.m:
             self.matrix = mirror_pattern(self.matrix)
             self.panels = Panels(*rows_of(self.matrix)[:2])
-        self.is_scaled, self.seconds = True, analysis_time(problem) if problem.m else 0.0
+        self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
-    def _estimate_first_factor_time(self) -> float:
-        """Estimate the time [s] of the first factor from the structure; later ones take as long as the one before."""
-        problem = self.problem
+    def _estimate_first_factor_cost(self) -> float:
+        """Estimate the cost [ns] of the first factor from the structure; later ones cost as much as the one before."""
+        problem, rates = self.problem, RATES
         if self.kind == _BODIES:
             assert problem.rows is not None
             rows, n = problem.rows, 6 * problem.rows.n_bodies
-            setup = SCIPY_CALLS_TIME + LAYOUT_ENTRY_TIME * _JACOBIAN_ROW_ENTRIES * problem.m
-            setup += ANALYSIS_ENTRY_TIME * _NORMAL_ENTRIES_PER_VELOCITY * n
+            setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
+            setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
             work = Layout(rows.block_bodies, rows.n_bodies, 6).work
-            return float(setup + FORM_ROW_TIME * n + _PANELS_WORK_TIME * work)
-        return (
-            FORM_ROW_TIME * problem.m + _PANELS_WORK_TIME * _analyse(self.panels, self.lu).work
-            if problem.m
-            else 0.0
-        )
+            return float(setup + rates["form row"] * n + PANELS_WORK_COST * work)
+        if not problem.m:
+            return 0.0
+        return float(rates["form row"] * problem.m + PANELS_WORK_COST * _analyse(self.panels, self.lu).work)
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -167,7 +163,7 @@ class AdmmState:
         watch = Stopwatch()
         factor = self._make_factor()
         self.factorisations += 1
-        self.seconds = watch.seconds
+        self.next_cost = 1e9 * watch.seconds
         return factor
 
     def _make_factor(self) -> tuple[int, int, tuple[Any, ...]]:
@@ -199,7 +195,7 @@ class AdmmState:
             done = _factor_panels(panels, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # Pivoting across panels is needed: a full matrix has only one panel.
-            if self.deadline.passed(_ONE_PANEL_WORK_TIME * dense_work(m)):
+            if self.deadline.passed(1e-9 * _ONE_PANEL_WORK_COST * count_dense_work(m)):
                 raise TooLate
             self.full = True
             self.matrix = matrix = _store_all_entries(matrix)
@@ -215,21 +211,23 @@ def _is_over_bodies(problem: Problem) -> bool:
     return rows is not None and 0 < 6 * rows.n_bodies < problem.m
 
 
-def _estimate_scaling_time(problem: Problem) -> float:
-    """Estimate the time of scaling [s]."""
-    if _is_over_bodies(problem):
-        return (
-            3.0 * SCIPY_CALLS_TIME + LAYOUT_ENTRY_TIME * _JACOBIAN_ROW_ENTRIES * problem.m
-        )  # J, the square root of M^-1, and their product.
-    entries, formed = problem.max_entries, forming_time(problem)
+def _estimate_scaling_cost(problem: Problem) -> float:
+    """Estimate the cost of scaling [ns]."""
+    rates = RATES
+    if _is_over_bodies(problem):  # J, the square root of M^-1, and their product.
+        return float(3.0 * rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m)
+    entries, form = problem.max_entries, estimate_formation_cost(problem)
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # One product of dense matrices.
-        formed = min(
-            formed,
-            START_TIME
-            + FULL_LAYOUT_ENTRY_TIME * entries
-            + DENSE_FACTOR_WORK_TIME * float(problem.metric.products_of_a),
-        )
-    return START_TIME + formed + comparison_time(problem) + _SCALING_ENTRY_TIME * entries
+        product = rates["full layout entry"] * entries
+        product += rates["dense factor"] * float(problem.metric.products_of_a)
+        form = min(form, rates["set-up"] + product)
+    return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + _SCALING_ENTRY_COST * entries)
+
+
+def _estimate_setup_cost(problem: Problem) -> float:
+    """Estimate the cost of `ADMM.prepare` [ns]."""
+    scaling = _estimate_scaling_cost(problem)
+    return (scaling if scaling <= MAX_SETUP_SCALING_COST else 0.0) + estimate_import_cost(*SCIPY_MODULES)
 
 
 def _analyse(panels: Panels, lu: bool) -> SparsePanels:
@@ -279,13 +277,12 @@ class ADMM(Solver):
 
     needs_scipy = True
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]; later set-up starts in `set_deadline` or `run` if it fits the limit."""
-        scaling = _estimate_scaling_time(problem)
-        return (scaling if scaling <= MAX_SETUP_SCALING_TIME else 0.0) + loading_time(*SCIPY_MODULES)
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the cost of `prepare`; later set-up starts in `set_deadline` or `run` if it fits the limit."""
+        return Cost(partial(_estimate_setup_cost, problem))
 
     def prepare(self, problem: Problem) -> AdmmState:
-        """Build the state; the problem is scaled if that takes up to `MAX_SETUP_SCALING_TIME`."""
+        """Build the state; the problem is scaled if that takes up to `MAX_SETUP_SCALING_COST`."""
         import_numerics()
         return AdmmState(problem, self.memory, self.relaxation)
 

@@ -1,4 +1,4 @@
-"""Select and combine other solvers by their estimated costs (`costs.py`).
+"""Select and combine other solvers by their estimated costs (`Solver.cost`).
 
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method is
@@ -40,12 +40,18 @@ from lavender.judge.residuals import combine_best_islands
 from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
-from lavender.solvers import costs
 from lavender.solvers.certify import (
     MIN_LINEAR_PROGRAM_COST,
     certify_by_least_violation,
     certify_by_linear_programs,
     certify_infeasibility,
+)
+from lavender.solvers.costs import (
+    estimate_first_factor_cost,
+    estimate_first_sweep_cost,
+    estimate_formation_cost,
+    estimate_matrix_setup_cost,
+    get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.islands import count_pairs
@@ -53,14 +59,6 @@ from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.recording import Recorder
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
-from lavender.solvers.setup_times import (
-    first_factor_time,
-    first_sweep_time,
-    formation_time,
-    forming_time,
-    matrix_setup_time,
-    tight_limit,
-)
 from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, time_fraction
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import (
@@ -69,7 +67,7 @@ from lavender.solvers.steps import (
     Newton,
     Step,
     Sweeps,
-    setup_time,
+    estimate_cost,
 )
 
 assert __doc__ is not None
@@ -125,12 +123,12 @@ class Tree:
     @cached_property
     def sweep(self) -> float:
         """Cost of one sweep [ns]."""
-        return costs.sweep_cost(self.problem)
+        return estimate_cost("anderson", self.problem).iteration
 
     @cached_property
     def min_newton_cost(self) -> float:
         """Lower bound of the cost of Newton's method [ns], without its analysis."""
-        return costs.newton_cost(costs.min_count(self.problem), self.law)
+        return estimate_cost("newton", self.problem).total
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
@@ -151,7 +149,7 @@ class Tree:
         p, state = self.problem, self.states.get("newton")
         if state is None or state.general is None or p.cones.has_round:
             return inf
-        return costs.newton_cost(costs.formed_count(p), self.law)
+        return estimate_cost("newton over rows", p).total
 
     def add_row_form(self, max_cost: float) -> bool:
         """Analyse A of J and M, too, if its Newton's method costs less than `max_cost` [ns] and has time.
@@ -161,8 +159,10 @@ class Tree:
         p, states = self.problem, self.states
         if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
             return False
-        if self.deadline.is_set and self.deadline.passed(matrix_setup_time(p) + 3.0 * forming_time(p)):
-            return False
+        if self.deadline.is_set:
+            cost = estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
+            if self.deadline.passed(1e-9 * cost):
+                return False
         self.states = states | self.prepare_newton("newton over rows")
         return len(self.states) > len(states)
 
@@ -170,11 +170,16 @@ class Tree:
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
         p = self.problem
-        found = {name: state.cost for name, state in self.states.items()}
+        found = {name: estimate_cost(name, p, state).total for name, state in self.states.items()}
         if p.matrix is not None and self.law == "lcp":
-            found["direct"] = costs.direct_cost(p)
+            found["direct"] = self.direct
         failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
         return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
+
+    @cached_property
+    def direct(self) -> float:
+        """Cost of `direct` on bounded rows of a matrix [ns]."""
+        return estimate_cost("direct", self.problem).total
 
     @property
     def newton(self) -> float:
@@ -190,12 +195,12 @@ class Tree:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
         if not self.deadline.is_set:
             return True
-        needed = 1e-9 * (before + cost)
+        needed = before + cost
         if name == "newton" and "states" in vars(self):
-            return not self.deadline.passed(needed)
-        if not self.deadline.passed(tight_limit(self.problem) + needed):
+            return not self.deadline.passed(1e-9 * needed)
+        if not self.deadline.passed(1e-9 * (get_loose_limit(self.problem) + needed)):
             return True
-        return not self.deadline.passed(setup_time(name, self.problem) + needed)
+        return not self.deadline.passed(1e-9 * (estimate_cost(name, self.problem).setup + needed))
 
     @cached_property
     def factorises_first(self) -> bool:
@@ -208,7 +213,7 @@ class Tree:
         if self.law == "linear" or p.cones.has_round:
             return True
         if p.matrix is not None:
-            return self.law == "lcp" and costs.direct_cost(p) < first
+            return self.law == "lcp" and self.direct < first
         return self.min_newton_cost < first and self.newton < first
 
     @cached_property
@@ -227,7 +232,7 @@ class Tree:
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
         first = DECISIONS.first_sweeps * self.sweep
         if self.factorises_first and p.matrix is not None and self.law == "lcp":
-            cost = ratio * costs.direct_cost(p)
+            cost = ratio * self.direct
             yield Stage(
                 "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
             )
@@ -299,14 +304,12 @@ class Tree:
         why = f"in turn, {times:g} times the cheapest factorising solver's cost"
         yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         p = self.problem
-        # Time to form A of J and M if no stage did, and its first factor; it does not depend on cached data.
-        time_to_form = (
-            0.0 if p.generalized is None or "newton over rows" in self.states else formation_time(p)
-        )
-        if (
-            p.generalized is None
-            or 1e9 * (time_to_form + first_factor_time(p.m, float(p.metric.entries_of_a))) <= cost
-        ):
+        setup = 0.0
+        if p.generalized is not None:
+            # A of J and M is formed if no stage did, and factored; the cost does not depend on cached data.
+            setup = estimate_formation_cost(p, "newton over rows" in self.states)
+            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_a))
+        if setup <= cost:
             yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)
         if not self.sweeps_failed and not self.problem.cones.has_round:
@@ -386,7 +389,7 @@ class Auto(Solver):
         failed = AUTO.failed_claims(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        if deadline.passed(first_sweep_time(problem)):
+        if deadline.passed(1e-9 * estimate_first_sweep_cost(problem)):
             impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = Tree(problem, deadline)
@@ -494,7 +497,8 @@ def solve(log: SolveLog, tree: Tree) -> None:
                     METHODS[stage.solver][0], tree.solver_costs.get(stage.solver, stage.cost)
                 )
             elif step.state is None:
-                step.over = log.deadline.passed(setup_time(stage.solver, log.problem) / DECISIONS.time_share)
+                setup = estimate_cost(stage.solver, log.problem).setup
+                step.over = log.deadline.passed(1e-9 * setup / DECISIONS.time_share)
         is_hopeless = isinstance(step, Sweeps) and step.predicted > stage.least
         if step.over or is_hopeless:
             tree.remaining_cost += stage.cost

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
+from lavender.solvers.costs import estimate_formation_cost
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import forming_time
 from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
 from lavender_ext.sweep import serial
 
@@ -27,8 +27,10 @@ from lavender_ext.sweep import serial
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _forming(self, problem: Problem) -> float:
-        return forming_time(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
+    def _estimate_formation_cost(self, problem: Problem) -> float:
+        return (
+            estimate_formation_cost(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
+        )
 
     def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
         data = swept_data(problem)

@@ -33,10 +33,10 @@ from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import group_blocks_by_island
+from lavender.solvers.costs import estimate_import_cost
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
-from lavender.solvers.setup_times import loading_time
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import by_island
@@ -221,7 +221,7 @@ def certify_infeasibility(log: SolveLog) -> None:
 def certify_by_linear_programs(log: SolveLog) -> None:
     """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + 1e9 * loading_time("scipy.optimize")):
+    if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize")):
         return
     total_rows = 0
     for part, rows in _unsolved_islands(log):

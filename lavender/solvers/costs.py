@@ -1,61 +1,135 @@
-"""Estimate the costs of Newton's method and of sweeps [ns] from their structure; `auto` compares only these numbers.
+"""Estimate costs [ns]: counted operations times the rates of `rates.json`, from the data and without a clock.
+
+`Solver.cost(problem)` returns a `Cost`; `auto`, deadlines and `explain` read it. Two kinds of operations are counted.
+
+Iterations, which `auto` compares; the rates are fitted means:
 
     Newton   start + n (row m + entry e + work w)                                                             (1)
     sweep    sweep_row m + entry e, under the cone law over J sweep_cone e                                    (2)
-
     direct   n (row m + work w)                                                                               (3)
 
 m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds of
 one factorisation and its solves, from the solver's own analysis (`NewtonState.count`) or from the band of A. n is the
 number of factorisations: 1 for linear problems, otherwise `DECISIONS.factorisations`, and
-`DECISIONS.pivot_factorisations` for `direct`. Over generalised velocities everything is compiled: start and row are 0.
-No clock is read: the same problem has the same counts on every machine.
-The rates of `rates.json` are fitted to measured times of random problems
-(docs/method.md, "Figures without a command").
+`DECISIONS.pivot_factorisations` for `direct`. Newton's method over generalised velocities is compiled without a start
+or row term, and so is its estimate (`lavender_ext/small/limits.pxd`).
+
+Set-ups and the judge, which are only estimated under a time limit, because they cannot be interrupted; their rates are
+1.5 times the fitted means. `python -m benchmarks rates` measures all rates and writes the file. The same problem has
+the same cost on every machine that has the same file.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf, nan
 from typing import Any
 
 from lavender.problem import Problem
-from lavender.solvers._accelerated import sweep_work
 from lavender.solvers.decisions import DECISIONS
-from lavender.solvers.setup_times import dense_work, formation_time
+from lavender_ext.factor.sparse import bandwidth
 
 __all__ = [
     "RATES",
+    "Cost",
     "Count",
-    "direct_cost",
-    "factorisations",
-    "formed_count",
-    "min_count",
-    "newton_cost",
-    "sweep_cost",
+    "count_dense_work",
+    "estimate_analysis_cost",
+    "estimate_direct_cost",
+    "estimate_disk_cost",
+    "estimate_elimination_cost",
+    "estimate_first_factor_cost",
+    "estimate_first_sweep_cost",
+    "estimate_formation_cost",
+    "estimate_import_cost",
+    "estimate_judge_setup_cost",
+    "estimate_matrix_setup_cost",
+    "estimate_newton_cost",
+    "estimate_order_cost",
+    "estimate_pass_cost",
+    "estimate_refusal_cost",
+    "estimate_result_cost",
+    "estimate_row_sums_cost",
+    "estimate_sparse_work",
+    "estimate_sweep_cost",
+    "estimate_symmetry_cost",
+    "get_factorisation_count",
+    "get_loose_limit",
+    "is_formed",
 ]
 
 # os.path is used because pathlib would take 4 % of the time of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
 
+SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factorisations need.
+# The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
+ANALYSIS_BANDWIDTH = 1500.0
+PRODUCTS_PER_BODY_ROW = 32  # Multiply-adds of a pass of the judge for each row between two bodies.
+# A time limit above these costs [ns], constant and per entry of a full A, is about a hundred times the set-up and the
+# judge together: nothing else is estimated before the solve, because estimates take longer than a small problem.
+LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
 
-@dataclass(frozen=True)
-class Count:
-    """Counts of one step of Newton's method.
+
+class Cost:
+    """Estimated cost of a solver on a problem [ns].
+
+    A value may be given as a function without arguments, which is called when the value is read.
 
     Parameters
     ----------
-    form : {"bodies", "dense", "panels", "velocities"}
+    setup : float, ns
+        `prepare`, which cannot be interrupted: a time limit decides whether it starts.
+    iteration : float, ns
+        One iteration; NaN if it is not known.
+    total : float, ns
+        All iterations to a solution, without the set-up; NaN if it is not known.
+    """
+
+    __slots__ = ("_iteration", "_setup", "_total")
+
+    def __init__(
+        self,
+        setup: float | Callable[[], float] = 0.0,
+        iteration: float | Callable[[], float] = nan,
+        total: float | Callable[[], float] = nan,
+    ) -> None:
+        self._setup, self._iteration, self._total = setup, iteration, total
+
+    @property
+    def setup(self) -> float:
+        """Cost of `prepare` [ns]."""
+        return self._setup() if callable(self._setup) else self._setup
+
+    @property
+    def iteration(self) -> float:
+        """Cost of one iteration [ns]; NaN if it is not known."""
+        return self._iteration() if callable(self._iteration) else self._iteration
+
+    @property
+    def total(self) -> float:
+        """Cost of all iterations [ns]; NaN if it is not known."""
+        return self._total() if callable(self._total) else self._total
+
+
+@dataclass(frozen=True)
+class Count:
+    """Counts of one step of Newton's method over rows or bodies.
+
+    Parameters
+    ----------
+    form : {"bodies", "dense", "panels"}
         Matrix that is factored.
     work : float
         Multiply-adds of one factorisation.
     entries : float
         Numbers that a step reads in addition.
     rows : float
-        Number of rows; 0 over generalised velocities.
+        Number of rows.
     set_up : float, ns
         Cost of forming A of J and M.
     """
@@ -67,43 +141,189 @@ class Count:
     set_up: float = 0.0
 
 
-def factorisations(law: str) -> float:
+# -- iterations ----------------------------------------------------------------------------------
+
+
+def get_factorisation_count(law: str) -> float:
     """Return the expected number of factorisations of Newton's method: 1 for linear problems."""
     return 1.0 if law == "linear" else DECISIONS.factorisations
 
 
-def newton_cost(count: Count, law: str) -> float:
-    """Return the estimated cost of Newton's method [ns], (1)."""
+def estimate_newton_cost(count: Count, law: str) -> float:
+    """Estimate the cost of Newton's method over rows or bodies [ns], (1)."""
     r = RATES
     step_cost = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
-    start = r["start"] if count.rows else 0.0
-    return float(start + count.set_up + factorisations(law) * step_cost)
+    return float(r["start"] + count.set_up + get_factorisation_count(law) * step_cost)
 
 
-def direct_cost(problem: Problem) -> float:
-    """Return the estimated cost of `direct` on bounded rows of a matrix [ns], (3)."""
+def estimate_direct_cost(problem: Problem) -> float:
+    """Estimate the cost of `direct` on bounded rows of a matrix [ns], (3)."""
     m = float(problem.m)
-    work = m * (1.0 + max(problem.bandwidth)) ** 2 if problem.is_symmetric else 2.0 * dense_work(problem.m)
+    work = (
+        m * (1.0 + max(problem.bandwidth)) ** 2 if problem.is_symmetric else 2.0 * count_dense_work(problem.m)
+    )
     return DECISIONS.pivot_factorisations * (RATES["pivot row"] * m + RATES["pivot work"] * work)
 
 
-def min_count(problem: Problem) -> Count:
-    """Return a lower bound of the counts of Newton's method that needs no analysis of the matrix."""
-    over_velocities = problem.generalized is not None
-    return Count("bodies", 0.0, float(problem.metric.work), 0.0 if over_velocities else float(problem.m))
-
-
-def sweep_cost(problem: Problem) -> float:
-    """Return the estimated cost of one sweep [ns], (2)."""
+def estimate_sweep_cost(problem: Problem, work: float) -> float:
+    """Estimate the cost of one sweep of `work` multiply-adds [ns], (2)."""
     cone = problem.law == "cone" and problem.matrix is None
+    return float(RATES["sweep row"] * problem.m + RATES["sweep cone" if cone else "entry"] * work)
+
+
+def count_dense_work(m: int) -> float:
+    """Return the multiply-adds of one factor of a full matrix of m rows."""
+    return m**3 / 3.0
+
+
+def estimate_sparse_work(entries: float, m: int) -> float:
+    """Estimate the multiply-adds of a sparse factor from its size, before an analysis; fill grows with the size."""
+    return 100.0 * entries * (1.0 + m / 1000.0)
+
+
+# -- set-ups -------------------------------------------------------------------------------------
+
+
+def get_loose_limit(problem: Problem) -> float:
+    """Return a cost [ns] of about a hundred times set-up and judge together, from the number of rows alone."""
+    return LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY * float(len(problem.b)) ** 2
+
+
+def is_formed(problem: Problem) -> bool:
+    """Return whether A is known, or has no rows."""
+    return problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__
+
+
+def estimate_formation_cost(problem: Problem, known: bool | None = None) -> float:
+    """Estimate the cost to form A of J and M or of bodies [ns], 0 if it is known; `known` replaces this check."""
+    if is_formed(problem) if known is None else known:
+        return 0.0
+    if problem.rows is None:
+        entries = RATES["form product"] * float(problem.metric.products_of_a)
+    else:
+        entries = RATES["form entry"] * problem.max_entries
+    return float(RATES["set-up"] + RATES["form row"] * problem.m + entries)
+
+
+def estimate_disk_cost(problem: Problem) -> float:
+    """Estimate the cost to build `problem.disk` [ns]; 0 if it is known, or if the problem has no ellipses.
+
+    The estimate itself computes only the couplings of bodies, whose cost the caller has checked before.
+    """
+    if not problem.cones.has_ellipse or "_disk" in problem.__dict__:
+        return 0.0
+    if problem.generalized is not None:
+        entries = float(len(problem.generalized.operator.jac[1]))
+        return float(RATES["disk"] + RATES["disk row"] * problem.m + RATES["disk entry"] * entries)
+    entries = float(problem.max_entries if problem.matrix is None else problem.matrix.size)
+    setup = RATES["matrix disk"] + RATES["matrix disk row"] * problem.m + RATES["matrix disk entry"] * entries
+    return float(setup + estimate_formation_cost(problem) + estimate_import_cost("scipy.sparse"))
+
+
+def estimate_refusal_cost(problem: Problem) -> float:
+    """Estimate the cost of `SolverSpec.refusal` [ns]: adapters of other packages read a complete matrix."""
+    if problem.matrix is None or "_scan" in problem.__dict__:
+        return 0.0
+    return float(estimate_judge_setup_cost(problem) + RATES["judge entry"] * float(problem.matrix.size))
+
+
+def estimate_import_cost(*modules: str) -> float:
+    """Estimate the cost to import the modules of SciPy that are not imported yet [ns]."""
+    return float(RATES["import"] * sum(module not in sys.modules for module in modules))
+
+
+def estimate_symmetry_cost(problem: Problem) -> float:
+    """Estimate the cost to check whether A is symmetric [ns]; 0 if it is known."""
+    is_known = problem.matrix is None or "_scan" in problem.__dict__
+    return 0.0 if is_known else float(RATES["judge entry"] * problem.max_entries)
+
+
+def estimate_matrix_setup_cost(problem: Problem) -> float:
+    """Estimate the cost to form A, check its symmetry, and lay it out for a solver [ns]."""
+    entries = problem.max_entries
+    imports = estimate_import_cost(*SCIPY_MODULES) if problem.m > DECISIONS.small_rows else 0.0
+    if entries == float(problem.m) ** 2:
+        layout = RATES["full layout entry"] * entries
+    else:
+        layout = RATES["scipy calls"] + RATES["layout entry"] * entries
+    form = estimate_formation_cost(problem)
+    return float(RATES["set-up"] + form + estimate_symmetry_cost(problem) + layout + imports)
+
+
+def estimate_analysis_cost(problem: Problem) -> float:
+    """Estimate the cost of an elimination order of A and its fill [ns]; the rows of a block are one node."""
+    entries, m = problem.max_entries, float(problem.m)
+    if entries == m * m:
+        return float(RATES["full analysis entry"] * entries)
+    is_known = problem.matrix is not None or "_compressed" in problem.__dict__
+    band = max(bandwidth(*problem._compressed[:2])) if is_known else m
     return float(
-        RATES["sweep row"] * problem.m + RATES["sweep cone" if cone else "entry"] * sweep_work(problem)
+        RATES["analysis entry"] * entries * (problem.n_blocks / m) * (1.0 + band / ANALYSIS_BANDWIDTH)
     )
 
 
-def formed_count(problem: Problem) -> Count:
-    """Return a lower bound of the counts of Newton's method over the rows of an A formed of J and M."""
-    m = float(problem.m)
-    entries = min(float(problem.metric.entries_of_a), m * m)
-    work = 0.0 if entries < 0.5 * m * m else dense_work(problem.m)
-    return Count("dense", work, entries, m, 1e9 * formation_time(problem))
+def estimate_row_sums_cost(problem: Problem) -> float:
+    """Estimate the cost to form A and to sum its rows with SciPy [ns]."""
+    sums = RATES["set-up"] + RATES["row sum entry"] * problem.max_entries
+    return float(estimate_formation_cost(problem) + sums + estimate_import_cost("scipy.sparse"))
+
+
+def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
+    """Estimate the cost of a first factor of m rows [ns]; sparse if `entries` is given and that is cheaper."""
+    dense = RATES["dense factor"] * count_dense_work(m)
+    return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
+
+
+def estimate_elimination_cost(problem: Problem, kind: str) -> float:
+    """Estimate the cost to prepare an elimination of bodies or of generalised velocities [ns], by its rate."""
+    return float(RATES["set-up"] + RATES[kind] * problem.metric.work)
+
+
+def estimate_first_sweep_cost(problem: Problem) -> float:
+    """Estimate the cost to prepare sweeps over the given form, with the first sweep [ns]."""
+    return estimate_elimination_cost(problem, "sweep set-up")
+
+
+def estimate_order_cost(problem: Problem, order: object) -> float:
+    """Estimate the cost to compute an order of blocks [ns]; 0 for the given order."""
+    is_given = isinstance(order, str) and order == "given"
+    return 0.0 if is_given else estimate_elimination_cost(problem, "order")
+
+
+# -- the judge -----------------------------------------------------------------------------------
+
+
+def estimate_judge_setup_cost(problem: Problem) -> float:
+    """Estimate the cost to set up the judge's first pass [ns]: A by rows, J L^-1, or the arrays of bodies."""
+    return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
+
+
+def estimate_pass_cost(problem: Problem) -> float:
+    """Estimate the cost of one pass of the judge [ns], from the size of its data."""
+    work = float(problem.metric.work) if _is_set_up(problem) else _estimate_pass(problem)[0]
+    return float(RATES["judge product"] * work)
+
+
+def estimate_result_cost(problem: Problem) -> float:
+    """Estimate the cost of one pass of the judge and of building its result [ns]."""
+    return float(RATES["result"] + estimate_pass_cost(problem))
+
+
+def _is_set_up(problem: Problem) -> bool:
+    """Return whether the data that the judge reads are set up."""
+    view = problem.derived.view
+    return "metric" in problem.__dict__ or (view is not None and view.ready)
+
+
+def _estimate_pass(problem: Problem) -> tuple[float, float]:
+    """Return the maximum multiply-adds of a pass and the cost to set it up [ns]."""
+    general = problem.generalized
+    if general is not None:
+        # A row of J L^-1 has at most as many entries as the row of J, times the mean length of the rows of L.
+        reached = (len(general.operator.mass[1]) + general.operator.fill) / max(general.nv, 1)
+        entries = min(len(general.operator.jac[1]) * reached, float(general.m) * general.nv)
+        return 2.0 * entries, (RATES["judge entry"] + RATES["judge whitening"] * reached) * entries
+    if problem.rows is not None:
+        work = PRODUCTS_PER_BODY_ROW * float(problem.m)
+        return work, RATES["judge product"] * work
+    return float(problem.matrix.size), RATES["judge entry"] * float(problem.matrix.size)

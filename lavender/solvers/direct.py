@@ -23,6 +23,7 @@ follow.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,10 +35,15 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
+from lavender.solvers.costs import (
+    Cost,
+    estimate_direct_cost,
+    estimate_first_factor_cost,
+    estimate_matrix_setup_cost,
+)
 from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import first_solve_time, matrix_setup_time
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
 from lavender_ext.pivot.direct import CYCLING, PASS_ENDED, PASSES_USED
@@ -47,6 +53,12 @@ REFINEMENT_RESIDUAL = (
     1e-13  # Refinement ends at this relative residual, or at the round-off floor if that is larger.
 )
 ROUNDS_PER_CHECK = 32  # Rounds of exchanges between two checks of the clock and the residual.
+
+
+def _estimate_linear_cost(problem: Problem) -> float:
+    """Estimate the cost to set up a linear problem and to compute the factor of all its rows [ns]."""
+    factor = estimate_first_factor_cost(problem.m, problem.max_entries)
+    return estimate_matrix_setup_cost(problem) + factor
 
 
 @dataclass
@@ -91,9 +103,13 @@ class Direct(Solver):
 
     needs_scipy = True
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        return first_solve_time(problem) if problem.law == "linear" else matrix_setup_time(problem)
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the cost of `prepare`, which includes the factor of a linear problem, and of exchanges."""
+        if problem.law == "linear":
+            return Cost(partial(_estimate_linear_cost, problem))
+        return Cost(
+            partial(estimate_matrix_setup_cost, problem), total=partial(estimate_direct_cost, problem)
+        )
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"

@@ -22,7 +22,7 @@ from lavender.base.lazy_import import import_numerics, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
-from lavender.solvers.setup_times import dense_work
+from lavender.solvers.costs import count_dense_work
 from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
 PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
@@ -82,7 +82,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
 
 def dense_cost(m: int) -> float:
     """Return the cost of one full Cholesky factor of m rows [ns], without the call."""
-    return DENSE_WORK_COST * dense_work(m) + DENSE_ENTRY_COST * float(m) ** 2
+    return DENSE_WORK_COST * count_dense_work(m) + DENSE_ENTRY_COST * float(m) ** 2
 
 
 def panels_cost(nnz: int, m: int) -> float:

@@ -10,12 +10,14 @@ converge for k >= 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import compute_block_order
+from lavender.solvers.costs import Cost, estimate_row_sums_cost
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import row_sums_time
 from lavender.solvers.sweeping import SweepSolver, SweepState, plan_of
 from lavender_ext.sweep import serial
 
@@ -36,9 +38,9 @@ class Jacobi(SweepSolver):
         if self.omega is not None:
             check_float("omega", self.omega, above=0.0)
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        return row_sums_time(problem)
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the cost of `prepare`."""
+        return Cost(partial(estimate_row_sums_cost, problem))
 
     def prepare(self, problem: Problem) -> SweepState:
         data, order = problem.csr_data, compute_block_order(problem)

@@ -13,6 +13,8 @@ cycles in exact arithmetic.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +29,10 @@ from lavender.solvers.certify import (
     MIN_LINEAR_PROGRAM_COST,
     find_certificate_by_linear_program,
 )
+from lavender.solvers.costs import Cost, estimate_import_cost, estimate_matrix_setup_cost
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import loading_time, matrix_setup_time
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
@@ -56,9 +58,9 @@ class Lemke(Solver):
 
     needs_scipy = True
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        return matrix_setup_time(problem)
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the cost of `prepare`."""
+        return Cost(partial(estimate_matrix_setup_cost, problem))
 
     def prepare(self, problem: Problem) -> PivotState:
         return PivotState(problem)
@@ -137,7 +139,7 @@ class Lemke(Solver):
 def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray | None:
     """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
     if problem.m > CERTIFICATE_ROWS or deadline.passed(
-        1e-9 * MIN_LINEAR_PROGRAM_COST + loading_time("scipy.optimize")
+        1e-9 * (MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize"))
     ):
         return None
     y = find_certificate_by_linear_program(problem, deadline)

@@ -29,6 +29,7 @@ In between, Python checks the clock, Ctrl-C and certificates. `newton_systems/` 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -41,19 +42,21 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work
 from lavender.problem import OPERATORS, Problem
-from lavender.solvers.costs import Count, factorisations, newton_cost
+from lavender.solvers.costs import (
+    Cost,
+    Count,
+    count_dense_work,
+    estimate_analysis_cost,
+    estimate_elimination_cost,
+    estimate_formation_cost,
+    estimate_matrix_setup_cost,
+    estimate_newton_cost,
+    get_factorisation_count,
+)
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, use_dense_matrix
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import (
-    analysis_time,
-    body_setup_time,
-    dense_work,
-    formation_time,
-    matrix_setup_time,
-    velocity_setup_time,
-)
-from lavender.solvers.small import NEWTON
+from lavender.solvers.small import NEWTON, estimate_velocity_cost
 from lavender.solvers.warm_start import make_warm_start_claim, warm_start
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED
@@ -61,8 +64,6 @@ from lavender_ext.newton.solve import COUNTED
 FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of it.
 VELOCITY_MAX_COST_RATIO = 10.0
-# Smallest count of one multiply-add over velocities.
-VELOCITY_UNIT_COUNT = Count("velocities", 1.0, 0.0, 0.0)
 MAX_FORMED_ROWS = (
     3000  # If the velocity form fails, A is formed and the row form continues up to this many rows.
 )
@@ -99,16 +100,13 @@ class NewtonState:
 
     @property
     def count(self) -> Count:
-        """Counts of one step, from the analysis of the matrix."""
+        """Counts of one step over rows or bodies, from the analysis of the matrix."""
         problem, system = self.problem, self.system
-        read = float(problem.metric.work)
-        if self.general is not None:
-            return Count("velocities", self.general.work, read, 0.0)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
-            return Count("bodies", system.work, read, float(problem.m))
-        set_up = 0.0 if problem.generalized is None else 1e9 * formation_time(problem)
+            return Count("bodies", system.work, float(problem.metric.work), float(problem.m))
+        set_up = 0.0 if problem.generalized is None else estimate_formation_cost(problem, False)
         return Count(
             "dense" if system.dense else "panels",
             system.work,
@@ -121,12 +119,14 @@ class NewtonState:
     def steps(self) -> float:
         """Expected number of iterations; over velocities, an iteration is a step of one island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
-        return factorisations(self.problem.law) * islands
+        return get_factorisation_count(self.problem.law) * islands
 
     @property
     def cost(self) -> float:
-        """Estimated cost to the end [ns]."""
-        return newton_cost(self.count, self.problem.law)
+        """Estimated cost of all steps [ns]."""
+        if self.general is not None:
+            return estimate_velocity_cost(self.problem, self.general.work)
+        return estimate_newton_cost(self.count, self.problem.law)
 
 
 @dataclass(frozen=True)
@@ -144,15 +144,34 @@ class Newton(Solver):
 
     needs_scipy = True
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        if problem.generalized is not None and self.form != "impulse":
-            return velocity_setup_time(problem)
-        bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
-        if bodies:
-            return body_setup_time(problem)
+    def cost(self, problem: Problem, state: NewtonState | None = None) -> Cost:
+        """Estimate the costs; without a state, the total is a lower bound that needs no analysis of the matrix."""
+        setup = partial(self._estimate_setup_cost, problem)
+        if state is None:
+            return Cost(setup, total=partial(self._estimate_min_cost, problem))
+        return Cost(setup, lambda: state.cost / state.steps, lambda: state.cost)
+
+    def _estimate_setup_cost(self, problem: Problem) -> float:
+        """Estimate the cost of `prepare` [ns]."""
+        if self.form != "impulse":
+            if problem.generalized is not None:
+                return estimate_elimination_cost(problem, "velocity elimination")
+            if problem.rows is not None and problem.rows.n_bodies > 0:
+                return estimate_elimination_cost(problem, "body elimination")
         is_sparse = not use_dense_matrix(problem.max_entries, problem.m, problem.law == "cone")
-        return matrix_setup_time(problem) + (analysis_time(problem) if is_sparse else 0.0)
+        return estimate_matrix_setup_cost(problem) + (estimate_analysis_cost(problem) if is_sparse else 0.0)
+
+    def _estimate_min_cost(self, problem: Problem) -> float:
+        """Return a lower bound of the cost of all steps [ns] that needs no analysis."""
+        m = float(problem.m)
+        if problem.generalized is None:
+            return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem.law)
+        if self.form != "impulse":
+            return estimate_velocity_cost(problem, 0.0)
+        entries = min(float(problem.metric.entries_of_a), m * m)
+        work = 0.0 if entries < 0.5 * m * m else count_dense_work(problem.m)
+        count = Count("dense", work, entries, m, estimate_formation_cost(problem, False))
+        return estimate_newton_cost(count, problem.law)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """Build the linear system of a problem, or the driver over its velocities."""
@@ -181,9 +200,10 @@ class Newton(Solver):
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
             max_cost = VELOCITY_MAX_COST_RATIO * _full_row_form_cost(problem) if self.form == "auto" else inf
-            kernel = general.prepare(problem, max_cost / newton_cost(VELOCITY_UNIT_COUNT, problem.law))
-            if kernel is not None and NewtonState(problem, None, kernel).cost > max_cost:
-                kernel = None
+            fixed = estimate_velocity_cost(problem, 0.0)
+            kernel = general.prepare(
+                problem, (max_cost - fixed) / (estimate_velocity_cost(problem, 1.0) - fixed)
+            )
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
             bodies = find_bodies(problem)  # Interior points over bodies are then faster.
         if bodies is None and kernel is not None:
@@ -324,8 +344,8 @@ def _full_row_form_cost(problem: Problem) -> float:
     m = float(problem.m)
     if m > MAX_FORMED_ROWS or problem.cones.has_round:
         return inf
-    rows = Count("dense", dense_work(problem.m), m * m, m, 1e9 * formation_time(problem))
-    return newton_cost(rows, problem.law)
+    form = estimate_formation_cost(problem, False)
+    return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem.law)
 
 
 def _run_stages(

@@ -19,8 +19,8 @@ import numpy as np
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
+from lavender.solvers.costs import estimate_formation_cost
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import forming_time
 from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
@@ -40,8 +40,8 @@ class PGS(Sweeping):
     def _complete_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
-    def _forming(self, problem: Problem) -> float:
-        return 0.0 if reads_whitened(problem) else forming_time(problem)
+    def _estimate_formation_cost(self, problem: Problem) -> float:
+        return 0.0 if reads_whitened(problem) else estimate_formation_cost(problem)
 
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if reads_whitened(problem):

@@ -9,6 +9,12 @@ from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.lazy_import import import_numerics
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
+from lavender.solvers.costs import (
+    RATES,
+    count_dense_work,
+    estimate_first_factor_cost,
+    estimate_sparse_work,
+)
 from lavender.solvers.factors import (
     BAND_WORK_COST,
     MAX_COMPILED_FACTOR_ROWS,
@@ -22,7 +28,6 @@ from lavender.solvers.factors import (
     narrow_order,
     permuted_band,
 )
-from lavender.solvers.setup_times import DENSE_FACTOR_WORK_TIME, dense_work, first_factor_time, sparse_work
 from lavender_ext.pivot.direct import Pivoting
 
 SWEEP_ENTRY_TIME = 4e-9  # Time [s] per nonzero of a symmetric sweep with its slack.
@@ -82,7 +87,9 @@ class PivotState:
                 band, factor = -1, LUFactor(problem)
         #: Whether the factor is sparse.
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
-        self.outside = None if factor is None else TimedFactor(factor, self._first_factor_time())
+        self.outside = (
+            None if factor is None else TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
+        )
         get_reference(problem)
         # Time [s] of one round with a compiled factor: estimated for all rows free, then that of the last round.
         self.seconds = (
@@ -93,14 +100,14 @@ class PivotState:
             self.symmetric,
         )  # fmt: skip
 
-    def _first_factor_time(self) -> float:
-        """Estimate the time of the first factor [s] from the structure."""
-        seconds = first_factor_time(
+    def _estimate_first_factor_cost(self) -> float:
+        """Estimate the cost of the first factor [ns] from the structure."""
+        cost = estimate_first_factor_cost(
             self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf
         )
         if self.symmetric:
-            return seconds
-        return 2.0 * (max(seconds, _filled_factor_time(self.problem)) if self.is_sparse else seconds)
+            return cost
+        return 2.0 * (max(cost, _estimate_filled_factor_cost(self.problem)) if self.is_sparse else cost)
 
     @property
     def sweeps(self) -> int:
@@ -110,7 +117,7 @@ class PivotState:
         m, data = self.problem.m, self.problem.csr_data
         factor = dense_cost(m)
         if self.is_sparse:
-            factor = min(factor, sparse_work(self.problem.csr.nnz, m))
+            factor = min(factor, estimate_sparse_work(self.problem.csr.nnz, m))
         return int(
             min(max(MIN_GUESS_SWEEPS, GUESS_COST_FRACTION * factor / (2.0 * data.work)), MAX_GUESS_SWEEPS)
         )
@@ -150,10 +157,11 @@ class PivotState:
         return int(self.rows.rank)
 
 
-def _filled_factor_time(problem: Problem) -> float:
-    """Estimate the time [s] of a banded LU in an order of small bandwidth, which includes the fill."""
+def _estimate_filled_factor_cost(problem: Problem) -> float:
+    """Estimate the cost [ns] of a banded LU in an order of small bandwidth, which includes the fill."""
     width = float(permuted_band(problem, narrow_order(problem)) + 1)
-    return DENSE_FACTOR_WORK_TIME * problem.m * min(width * width, dense_work(problem.m) / problem.m)
+    work = problem.m * min(width * width, count_dense_work(problem.m) / problem.m)
+    return float(RATES["dense factor"] * work)
 
 
 def _same_pattern(p: Problem, q: Problem) -> bool:

@@ -30,10 +30,10 @@ from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.registry import Solver
+from lavender.solvers.registry import Cost, Solver
 
 # Assumed number of rows of (1) or (2) per row of the problem, and time [s] per row to build them.
-ROWS_RATIO, ROW_TIME = 3.0, 2e-5
+ROWS_RATIO, ROW_COST = 3.0, 2e4
 
 
 @dataclass(frozen=True)
@@ -170,10 +170,12 @@ class ThroughRows(Solver):
     def __init__(self, solver: Solver) -> None:
         self.solver, self.needs_scipy = solver, solver.needs_scipy
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        own = self.solver.setup_time(problem)
-        return own if problem.law in ("linear", "lcp") else ROWS_RATIO * own + ROW_TIME * problem.m
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the costs of the inner solver, with the conversion of the rows."""
+        own = self.solver.cost(problem)
+        if problem.law in ("linear", "lcp"):
+            return own
+        return Cost(lambda: ROWS_RATIO * own.setup + ROW_COST * problem.m)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""

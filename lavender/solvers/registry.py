@@ -22,9 +22,10 @@ from lavender.base.renamed import SOLVER_HINTS
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
+from lavender.solvers.costs import Cost
 from lavender.solvers.decisions import DECISIONS
 
-__all__ = ["Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
+__all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
 # Up to this many rows, the overhead of Python dominates a solve: the compiled call `SolverSpec.small` is tried first.
@@ -122,9 +123,12 @@ class Solver:
 
     needs_scipy = False  # whether `prepare` uses parts of SciPy that may not be imported yet
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s] from the size of the problem; a time limit decides whether it starts."""
-        return 0.0
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the costs [ns] from the size of the problem, and from the state that `prepare` returned if given.
+
+        A time limit decides by them whether `prepare` starts, and `auto` which solver does.
+        """
+        return Cost()
 
     def start_workers(self, state: Any, time_limit: float) -> None:
         """Start worker processes for a solve with a limit [s]; this time does not count."""

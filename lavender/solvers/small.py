@@ -17,16 +17,22 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import estimate_pass_time, get_reference, judge_impulse
+from lavender.judge.residuals import get_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work
 from lavender.problem import Problem
-from lavender.solvers.costs import RATES, factorisations, sweep_cost
+from lavender.solvers.costs import (
+    RATES,
+    estimate_formation_cost,
+    estimate_judge_setup_cost,
+    estimate_pass_cost,
+    get_factorisation_count,
+    get_loose_limit,
+)
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
-from lavender.solvers.registry import SMALL_ROWS
-from lavender.solvers.setup_times import forming_time, tight_limit
+from lavender.solvers.registry import SMALL_ROWS, get
 from lavender_ext.batch.many import Limits, solve_first
 from lavender_ext.small.call import Islands, Rules, Small
 
@@ -65,7 +71,7 @@ def make_limits(
         and do at most this many steps.
     """
     sweep = TREE_OVERHEAD_COST, RATES["sweep row"], RATES["sweep cone"], sweeps
-    step = RATES["entry"], RATES["work"]["velocities"], factorisations("lcp")
+    step = RATES["entry"], RATES["work"]["velocities"], get_factorisation_count("lcp")
     rows = SMALL_ROWS, MAX_ALWAYS_DENSE_ROWS, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
     return Limits(
         np.array(
@@ -91,17 +97,14 @@ def time_fraction(problem: Problem, seconds: float) -> float:
         return 1.0
     if problem.generalized is None and problem.law in ("linear", "lcp"):
         return 0.0
-    if seconds > tight_limit(problem):
+    if 1e9 * seconds > get_loose_limit(problem):
         return DECISIONS.time_share
     if problem.generalized is not None:
-        set_up = 1e9 * estimate_pass_time(problem)
+        cost = estimate_judge_setup_cost(problem) + estimate_pass_cost(problem)
     else:
-        set_up = (
-            ISLANDS_ROW_COST * problem.m
-            + 1e9 * forming_time(problem)
-            + MAX_SWEEPS_BEFORE_FACTOR * sweep_cost(problem)
-        )
-    return DECISIONS.time_share if 1e-9 * set_up <= DECISIONS.time_share * seconds else 0.0
+        sweeps = MAX_SWEEPS_BEFORE_FACTOR * get("anderson").load()().cost(problem).iteration
+        cost = ISLANDS_ROW_COST * problem.m + estimate_formation_cost(problem) + sweeps
+    return DECISIONS.time_share if 1e-9 * cost <= DECISIONS.time_share * seconds else 0.0
 
 
 def prepare_call(problem: Problem) -> Any:
@@ -337,6 +340,13 @@ def describe_work(name: str, work: Mapping[str, int]) -> str:
 AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", make_limits(inf), False)
+
+
+def estimate_velocity_cost(problem: Problem, work: float) -> float:
+    """Estimate the cost [ns] of Newton's method over velocities, with `work` multiply-adds to factorise all islands."""
+    limits = NEWTON.limits
+    assert limits is not None
+    return float(limits.cost(problem.metric, work, 1)[0])
 
 
 def _named_call(name: str) -> SmallCall:

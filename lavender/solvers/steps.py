@@ -14,16 +14,15 @@ from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import state_as_given
-from lavender.solvers.costs import sweep_cost
+from lavender.solvers.costs import Cost, estimate_formation_cost
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
 from lavender.solvers.registry import get
-from lavender.solvers.setup_times import forming_time
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "make_solver", "setup_time"]
+__all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "estimate_cost", "make_solver"]
 
 NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 #: Solver and options of each step, by its name.
@@ -41,8 +40,8 @@ MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations of one call.
 MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions use at least this relative residual as tol.
 # Upper bound of the time [s] of an iteration per estimated cost [ns].
 ITERATION_TIME_PER_COST = 4e-9
-# Sweeps use a formed A only if this multiple of the time to form it remains.
-FORMING_TIME_RATIO = 4.0
+# Sweeps use a formed A only if this multiple of the cost to form it remains.
+FORMATION_COST_RATIO = 4.0
 
 
 def make_solver(name: str, problem: Problem) -> Any:
@@ -57,9 +56,10 @@ def make_solver(name: str, problem: Problem) -> Any:
     return get(solver).load()(**options)
 
 
-def setup_time(name: str, problem: Problem) -> float:
-    """Estimate the set-up time [s] of a step before its first iteration; 0 if it is negligible."""
-    return float(make_solver(name, problem).setup_time(problem))
+def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
+    """Estimate the costs of the solver of a step."""
+    cost: Cost = make_solver(name, problem).cost(problem, state)
+    return cost
 
 
 class Step:
@@ -154,7 +154,8 @@ class Iterations(Step):
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
             deadline=log.deadline if left is None or self.time_fraction == 1.0 else Deadline(self.time_fraction * left),
-            pace=ITERATION_TIME_PER_COST * sweep_cost(log.problem), records=None if log.recorder is None else [],
+            pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
+            records=None if log.recorder is None else [],
         )  # fmt: skip
         begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.iterate(loop, n)
@@ -198,7 +199,9 @@ class Sweeps(Iterations):
     def begin(self) -> None:
         """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
         p = self.log.problem
-        too_late = self.log.deadline.is_set and self.log.deadline.passed(FORMING_TIME_RATIO * forming_time(p))
+        too_late = self.log.deadline.is_set and self.log.deadline.passed(
+            1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
+        )
         self.state = state_as_given(self.solver, p) if too_late else self.solver.prepare(p)
         self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 

@@ -7,6 +7,7 @@ expected end, so the number of sweeps between checks depends only on the numbers
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from lavender.base.arrays import FloatArray
@@ -14,8 +15,8 @@ from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
+from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_order_cost
 from lavender.solvers.registry import Solver
-from lavender.solvers.setup_times import forming_time, order_time
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
 from lavender_ext.sweep import serial
 
@@ -117,12 +118,15 @@ class Sweeping(SweepSolver):
     ground: Any = None
     seed: int = 0
 
-    def setup_time(self, problem: Problem) -> float:
-        """Estimate the time of `prepare` [s]."""
-        return order_time(problem, self.order) + self._forming(problem)
+    def cost(self, problem: Problem, state: Any = None) -> Cost:
+        """Estimate the cost of `prepare`."""
+        return Cost(partial(self._estimate_setup_cost, problem))
 
-    def _forming(self, problem: Problem) -> float:
-        return forming_time(problem)
+    def _estimate_setup_cost(self, problem: Problem) -> float:
+        return estimate_order_cost(problem, self.order) + self._estimate_formation_cost(problem)
+
+    def _estimate_formation_cost(self, problem: Problem) -> float:
+        return estimate_formation_cost(problem)
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""

@@ -28,12 +28,9 @@ from lavender.base.renamed import suggest_argument
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
-    RESULT_TIME,
     Residual,
     combine_best_islands,
     convert_from_disk,
-    estimate_judge_setup_time,
-    estimate_judging_time,
     find_known_relative,
     get_reference,
     make_residual,
@@ -54,16 +51,19 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasible
+from lavender.solvers.costs import (
+    SCIPY_MODULES,
+    estimate_disk_cost,
+    estimate_import_cost,
+    estimate_judge_setup_cost,
+    estimate_pass_cost,
+    estimate_refusal_cost,
+    estimate_result_cost,
+    get_loose_limit,
+)
 from lavender.solvers.islands import find_islands
 from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import (
-    SCIPY_MODULES,
-    estimate_disk_time,
-    estimate_refusal_time,
-    loading_time,
-    tight_limit,
-)
 from lavender.solvers.small import time_fraction
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender.solving.velocity import accept_velocity, relative_tolerance
@@ -367,14 +367,15 @@ class Prepared:
             if is_tight(original, deadline):
                 # The judge measures the result, and the start if it is not zero.
                 passes = 2 if start is not None or disk.guess is not None else 1
-                judge_time = passes * estimate_judging_time(disk)
-                if deadline.passed(estimate_judge_setup_time(disk) + judge_time) and not self.spec.external:
+                judge_time = 1e-9 * passes * estimate_result_cost(disk)
+                setup_time = 1e-9 * estimate_judge_setup_cost(disk)
+                if deadline.passed(setup_time + judge_time) and not self.spec.external:
                     self._replace_problem(problem)
                     return create_unjudged(
                         original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
                     )
                 deadline.reserve(judge_time)
-                selection_time = SELECTION_PASSES * (estimate_judging_time(disk) - RESULT_TIME)
+                selection_time = 1e-9 * SELECTION_PASSES * estimate_pass_cost(disk)
                 if self.spec.delegates and not deadline.passed(4.0 * selection_time):
                     deadline.reserve(selection_time)
             if self.solver is None:
@@ -456,7 +457,7 @@ class Prepared:
                 claim.status is TIME_LIMIT
                 and spec.delegates
                 and problem.m > SMALL_ROWS
-                and loading_time(*SCIPY_MODULES)
+                and estimate_import_cost(*SCIPY_MODULES)
             ):
                 claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
         refutation = ""
@@ -529,14 +530,14 @@ class Prepared:
             get_reference(problem)  # The judge computes its reference before a solver gets the problem.
         is_new, self._failure = is_new or bool(self._failure), ""
         if deadline.is_set:
-            self._is_late = deadline.passed(self.solver.setup_time(problem))
-            if self._is_late and self.solver.needs_scipy and loading_time(*SCIPY_MODULES):
+            self._is_late = deadline.passed(1e-9 * self.solver.cost(problem).setup)
+            if self._is_late and self.solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES):
                 # SciPy is imported outside the limit, like the start of processes: otherwise no call with this limit
                 # would ever have it.
                 watch = Stopwatch()
                 import_numerics()
                 deadline.reserve(-watch.seconds)
-                self._is_late = deadline.passed(self.solver.setup_time(problem))
+                self._is_late = deadline.passed(1e-9 * self.solver.cost(problem).setup)
             if self._is_late:
                 self.state = None
                 return
@@ -748,21 +749,22 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     if (
         problem.rows is not None
         and problem.cones.has_ellipse
-        and deadline.passed(estimate_judge_setup_time(problem))
+        and deadline.passed(1e-9 * estimate_judge_setup_cost(problem))
     ):
         return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
-    needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
+    refusal = estimate_refusal_cost(problem) if spec.external else 0.0
+    needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
     if (
         needed > 0.0
         and problem.generalized is None
         and deadline.passed(needed)
-        and loading_time("scipy.sparse")
+        and estimate_import_cost("scipy.sparse")
     ):
         watch = Stopwatch()
         import_numerics()
         # SciPy is imported outside the limit: otherwise no call with this limit would ever have it.
         deadline.reserve(-watch.seconds)
-        needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
+        needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
     return needed > 0.0 and deadline.passed(needed)
 
 
@@ -771,7 +773,7 @@ def is_tight(problem: Problem, deadline: Deadline) -> bool:
 
     Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
     """
-    return deadline.is_set and deadline.passed(tight_limit(problem))
+    return deadline.is_set and deadline.passed(1e-9 * get_loose_limit(problem))
 
 
 def check_time_limit(time_limit: Any) -> float:

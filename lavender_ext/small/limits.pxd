@@ -2,8 +2,8 @@
 
     count (entry (2 Y + 4 m) + work w)                                                                     (1)
 
-Y: entries of J L^-1, m: rows, w: multiply-adds to factorise N of every island, count: number of factorisations, as in
-`lavender/solvers/costs.py`.
+Y: entries of J L^-1, m: rows, w: multiply-adds to factorise N of every island, count: number of factorisations. Python
+calls this estimate, too (`estimate_velocity_cost` of `lavender/solvers/small.py`); the rates are in `rates.json` there.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
@@ -12,7 +12,7 @@ from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_friction, is_r
 from lavender_ext.core.view cimport generalized_t
 
 
-cdef struct limits_t:           # as in lavender/solvers/costs.py
+cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.py
     double entry                # ns per multiply-add of a sweep
     double work                 # ns per multiply-add of a factorisation
     double count                # factorisations, if some row is not free

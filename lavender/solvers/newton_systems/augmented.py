@@ -23,7 +23,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
-from lavender.solvers.setup_times import SCIPY_CALLS_TIME, SPARSE_FACTOR_WORK_TIME, loading_time, sparse_work
+from lavender.solvers.costs import RATES, estimate_import_cost, estimate_sparse_work
 from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
 
@@ -46,15 +46,15 @@ class Augmented:
             It would end after the deadline.
         """
         if self.k is None:
-            if self.deadline.passed(SCIPY_CALLS_TIME):
+            if self.deadline.passed(1e-9 * RATES["scipy calls"]):
                 raise TooLate
             self.k = self._build_jacobian()
             # The system contains K twice, and the block matrices.
             entries = 2.0 * self.k.nnz + len(self.block_entries[0])
-            self.seconds = (
-                SCIPY_CALLS_TIME
-                + SPARSE_FACTOR_WORK_TIME * sparse_work(entries, sum(self.k.shape))
-                + loading_time("scipy.sparse.linalg")
+            self.seconds = 1e-9 * (
+                RATES["scipy calls"]
+                + RATES["sparse factor"] * estimate_sparse_work(entries, sum(self.k.shape))
+                + estimate_import_cost("scipy.sparse.linalg")
             )
         if self.deadline.passed(self.seconds):
             raise TooLate

@@ -13,10 +13,10 @@ from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
+from lavender.solvers.costs import count_dense_work
 from lavender.solvers.factors import MAX_DENSE_ROWS, USE_WIDE_LANES
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
-from lavender.solvers.setup_times import dense_work
 from lavender_ext.factor import graph
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
@@ -139,7 +139,7 @@ class MatrixSystem(System):
             self.h *= solve.scale[:, None]
             self.h *= solve.scale
             solve.over_rows(self.h, self.symmetric, USE_WIDE_LANES)
-            self.work = dense_work(m)
+            self.work = count_dense_work(m)
         else:
             values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))

@@ -16,12 +16,15 @@ import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.base.lazy_import import import_numerics
-from lavender.judge import residuals
-from lavender.judge.residuals import estimate_judging_time
 from lavender.problem.derived import once
 from lavender.problem.operators import Operators
 from lavender.solvers import factors
-from lavender.solvers.setup_times import estimate_disk_time, forming_time
+from lavender.solvers.costs import (
+    estimate_disk_cost,
+    estimate_formation_cost,
+    estimate_judge_setup_cost,
+    estimate_result_cost,
+)
 from lavender.solvers.small import AUTO
 
 
@@ -187,13 +190,13 @@ def slow_disks(clock, monkeypatch):
     make_disk, make_metric = disk.function, metric.function
 
     def slow_disk(problem):
-        counted = estimate_disk_time(problem)
+        counted = 1e-9 * estimate_disk_cost(problem)
         found = make_disk(problem)
         clock.now, made.disks = clock.now + counted, made.disks + 1
         return found
 
     def slow_metric(problem):
-        clock.now += residuals.estimate_judge_setup_time(problem)
+        clock.now += 1e-9 * estimate_judge_setup_cost(problem)
         return make_metric(problem)
 
     monkeypatch.setattr(disk, "function", slow_disk)
@@ -406,10 +409,10 @@ def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatc
     problem = lv.Problem.from_jacobian(
         jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
     )
-    limit = (
-        residuals.estimate_judge_setup_time(problem)
-        + estimate_judging_time(problem)
-        + 0.5 * forming_time(problem)
+    limit = 1e-9 * (
+        estimate_judge_setup_cost(problem)
+        + estimate_result_cost(problem)
+        + 0.5 * estimate_formation_cost(problem)
     )
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

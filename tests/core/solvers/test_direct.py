@@ -11,8 +11,8 @@ import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender.base.lu import factor_sparse_lu
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import estimate_judging_time
 from lavender.solvers import pivoting
+from lavender.solvers.costs import estimate_result_cost
 from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
 from lavender_ext.pivot import direct, principal
@@ -279,7 +279,7 @@ def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeyp
             return code
 
     monkeypatch.setattr(pivoting, "Pivoting", Played)
-    limit = estimate_judging_time(fresh(problem)) + 5e-4 + share * each
+    limit = 1e-9 * estimate_result_cost(fresh(problem)) + 5e-4 + share * each
     found = lv.solve(fresh(problem), "direct", time_limit=limit)
     assert clock.now <= limit
     assert found.residual.relative <= lv.residual(problem, problem.start()).relative

@@ -96,7 +96,7 @@ def test_a_refusal_that_raises_refuses_for_its_own_solver_alone(register):
 
 
 @pytest.mark.parametrize("counted", ["long", -1.0, float("nan")])
-def test_a_set_up_time_that_is_none_is_refused_by_the_solver_s_name(counted, register):
+def test_a_cost_that_is_not_a_number_is_refused_by_the_solver_s_name(counted, register):
     class Wrong:
         def prepare(self, problem):
             return problem
@@ -104,11 +104,11 @@ def test_a_set_up_time_that_is_none_is_refused_by_the_solver_s_name(counted, reg
         def run(self, state, impulse, n, tol, time_limit):
             return lv.Claim(lv.Status.MAX_ITERATIONS, n)
 
-        def setup_time(self, problem):
-            return counted
+        def cost(self, problem):
+            return registry.Cost(counted)
 
     register(named("wrong", factory=Wrong))
-    with pytest.raises(lv.InputError, match="setup_time of solver 'wrong' is"):
+    with pytest.raises(lv.InputError, match="cost of the set-up of solver 'wrong' is"):
         lv.solve(TINY, "wrong", time_limit=10.0)
 
 

@@ -16,7 +16,7 @@ from scipy.sparse import block_diag, coo_array
 import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
-from lavender.solvers.costs import newton_cost
+from lavender.solvers.costs import RATES, get_factorisation_count
 from lavender.solvers.small import AUTO, SmallCall, describe_call, make_limits, time_fraction
 from lavender_ext.batch.many import solve_first
 
@@ -142,8 +142,9 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
     n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60)) if seed % 3 else 0
     problem = random_general(seed, friction, n=n, compliance=seed > 8, contacts=contacts)
     state = registry.get("newton").load()().prepare(problem)
-    cost = newton_cost(state.count, problem.law)
-    assert make_limits(0.0).cost(problem.metric, state.count.work, 1)[0] == pytest.approx(cost, rel=1e-12)
+    cost = registry.get("newton").load()().cost(problem, state).total
+    step = RATES["entry"] * problem.metric.work + RATES["work"]["velocities"] * state.general.work
+    assert cost == pytest.approx(step * get_factorisation_count(problem.law), rel=1e-12)
 
     def lets_in(of):
         return solve_first(problem.metric, None, np.inf, of)[0] is not None

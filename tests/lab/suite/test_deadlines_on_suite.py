@@ -13,11 +13,10 @@ from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.lazy_import import import_numerics
 from lavender.judge import residuals
-from lavender.judge.residuals import estimate_judging_time
 from lavender.solvers.auto import Tree
-from lavender.solvers.costs import sweep_cost
+from lavender.solvers.costs import estimate_judge_setup_cost, estimate_result_cost
 from lavender.solvers.newton_systems import augmented
-from lavender.solvers.steps import Newton, Step, setup_time
+from lavender.solvers.steps import Newton, Step, estimate_cost
 from lavender.solvers.sweeping import SweepSolver
 
 OWN = [
@@ -63,7 +62,7 @@ def play(monkeypatch, clock, pace, problem):
         return played
 
     def prepared(self, of):
-        clock.now += 0.0 if quiet else pace * setup_time("newton", of)
+        clock.now += 0.0 if quiet else 1e-9 * pace * estimate_cost("newton", of).setup
         return prepare(self, of)
 
     monkeypatch.setattr(SweepSolver, "run", swept)
@@ -90,7 +89,7 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
 def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
     """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
     problem = as_matrix(drawn(seed=97112, part="rolling").problem)
-    sweep, each = SweepSolver.run, 4.5e-9 * sweep_cost(problem)
+    sweep, each = SweepSolver.run, 4.5e-9 * estimate_cost("anderson", problem).iteration
 
     def swept(*of):
         found = sweep(*of)
@@ -107,7 +106,7 @@ def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, cloc
 def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
     """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
     problem = drawn(seed=95402, part="rolling").problem
-    monkeypatch.setattr(augmented, "loading_time", lambda *of: 0.0)
+    monkeypatch.setattr(augmented, "estimate_import_cost", lambda *of: 0.0)
     made, factor, each = [], augmented.factor_sparse_lu, 0.01
 
     def played(*of):
@@ -144,13 +143,13 @@ def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
         close = 0.9 * lv.solve(fresh(problem), tol=1e-3).impulse
         for start in (close, -1e3 * np.ones(problem.m)):
             least = min(lv.residual(problem, x).relative for x in (start, problem.start()))
-            counted = spec.load()().setup_time(problem)
+            counted = spec.load()().cost(problem).setup
             if counted == 0.0:
                 continue
             asked += 1
             with monkeypatch.context() as patch:
                 patch.setattr(spec.load(), "prepare", None)
-                limit = 2.0 * estimate_judging_time(problem) + 0.9 * counted
+                limit = 1e-9 * (2.0 * estimate_result_cost(problem) + 0.9 * counted)
                 solution = lv.solve(problem, name, impulse=start, time_limit=limit)
             assert solution.status is lv.Status.TIME_LIMIT and "set up" in solution.message
             assert solution.solver.name == name and not solution.work
@@ -187,7 +186,7 @@ def test_an_answer_is_no_worse_than_its_start(name, limit):
 def test_the_judge_begins_only_what_he_can_end(name, clock):
     """What he sets up fits, his pass behind it does not."""
     problem = fresh(PROBLEMS[name]())
-    limit = residuals.estimate_judge_setup_time(problem) + 0.9 * estimate_judging_time(problem)
+    limit = 1e-9 * (estimate_judge_setup_cost(problem) + 0.9 * estimate_result_cost(problem))
     solution = lv.solve(problem, "newton", time_limit=limit)
     assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
     assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
@@ -200,5 +199,5 @@ def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
     residuals.get_reference(problem)
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     assert (
-        lv.solve(problem, name, time_limit=2.0 * estimate_judging_time(problem), max_iter=3).iterations == 3
+        lv.solve(problem, name, time_limit=2e-9 * estimate_result_cost(problem), max_iter=3).iterations == 3
     )
