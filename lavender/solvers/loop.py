@@ -249,7 +249,10 @@ class Loop:
         if solvers:
             solvers = [*solvers, solvers[-1]][: len(self.records)]
         done, time, relative, energy, velocity = (np.array(c) for c in zip(*self.records, strict=True))
-        return History(done.astype(np.int64), time, relative, energy, velocity, tuple(solvers))
+        return History(
+            iterations=done.astype(np.int64), time=time, relative=relative, energy=energy, velocity=velocity,
+            solvers=tuple(solvers),
+        )  # fmt: skip
 
 
 def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:
