@@ -35,7 +35,7 @@ DEFAULT_CLAIM_WORLDS = 8  # Worlds of engines whose claims are compared: they st
     help="Engine that steps the worlds.",
 )
 @click.option("--max-velocity-error", type=float, metavar="M/S",
-              help="Exit with 1 if a step that is not at its floor has a larger velocity error [m/s].")  # fmt: skip
+              help="Exit with 1 if a step above its floor has a larger velocity error [m/s, rad/s].")  # fmt: skip
 @threshold_option
 @precision_option
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")

@@ -25,7 +25,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
 
     MODEL.xml is an MJCF file. For each contact, the table shows its mean sliding speed in the engine's answer, in the
     exact solution of the same problem, with round cones, with friction that is not softened, and with Coulomb's law.
-    The dominant cause is the replacement that changes the speed most, or a load above the friction limit.
+    The dominant cause is the replacement that changes the speed most, or a load above the friction limit. The sentence
+    below the table names the cause of the fastest contact, and a remedy.
 
     Exit code 1: no state has a contact with friction.
     """

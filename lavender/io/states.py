@@ -150,7 +150,7 @@ def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
     if size not in kinds or n == 0:
         raise InputError(
             f"{source}: {VECTOR} has shape {states.shape}; (n, {mj.mj_stateSize(model, integration)}) of "
-            "mjSTATE_INTEGRATION is needed for this model"
+            "mjSTATE_INTEGRATION, n at least 1, is needed for this model"
         )
     vectors, controls = [], []
     for state in states:

@@ -59,6 +59,7 @@ from lavender.problem import PRECISIONS, Problem
 
 AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
+VELOCITY_UNIT = "m/s, rad/s"  # of linear and of angular rows
 WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
@@ -254,8 +255,13 @@ class Audit:
         if n:
             text += (
                 f" ({format_percent(n, judged, 1)}), in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
-                f"the worst error is {format_size(self.max_velocity_error)} m/s"
+                f"the worst error is {format_size(self.max_velocity_error)} m/s (rad/s if its row is angular)"
             )
+            if self.worst and self.worst[0].velocity == self.max_velocity_error:
+                text += f", in {self.worst[0].where}"
+            wrong = int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
+            if wrong:
+                text += f"; {format_count(wrong, 'answer')} {'is' if wrong == 1 else 'are'} no better than zero forces"
         warning = "" if self.judged_sizes.has_enough_contact else (
             f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
             "Start from other states with --states."
@@ -287,7 +293,10 @@ class Audit:
         heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
         rows: list[list[str | Cell]] = []
         for of, selected in (("all steps judged", self.is_judged), (UNCONVERGED, self.is_unconverged)):
-            for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
+            for name, unit, x in (
+                ("velocity", VELOCITY_UNIT, self.numbers[0]),
+                ("impulse", "N s", self.numbers[1]),
+            ):
                 known = x[selected & np.isfinite(x)]
                 if len(known):
                     quantiles = np.quantile(known, QUANTILES, method="higher")
@@ -312,7 +321,7 @@ class Audit:
         """The worst rows of steps that stopped before convergence, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
         rows: list[list[str | Cell]] = [[name, str(n), Cell.size(largest)] for name, (n, largest) in ranked]
-        return Table(["worst row", UNCONVERGED, "at most [m/s]"], rows)
+        return Table(["worst row", UNCONVERGED, f"at most [{VELOCITY_UNIT}]"], rows)
 
     @property
     def table_of_diverged(self) -> Table:
@@ -323,7 +332,7 @@ class Audit:
             known = Cell.size(float(error))
             exact = "exact" if self.has_exact_solves(d) else "not exact"
             rows.append([d.cause, str(d.world), str(d.step), known, exact])
-        heads = ["too large", "world", "step", "error [m/s]", "solves until then"]
+        heads = ["too large", "world", "step", f"error [{VELOCITY_UNIT}]", "solves until then"]
         return Table(heads, rows, words=frozenset({"too large", "solves until then"}))
 
     @property
@@ -334,7 +343,9 @@ class Audit:
             for i, w in enumerate(self.worst, 1)
         ]
         return Table(
-            ["file", "world", "step", "m/s", "worst row"], rows, words=frozenset({"file", "worst row"})
+            ["file", "world", "step", VELOCITY_UNIT, "worst row"],
+            rows,
+            words=frozenset({"file", "worst row"}),
         )
 
     @property

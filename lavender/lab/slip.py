@@ -46,9 +46,18 @@ CAUSES = {
     "hard": "convex relaxation",
     "coulomb": "load above the friction limit",
 }
+#: Remedy of each cause, with the names of MuJoCo's settings.
+REMEDIES = {
+    "unfinished solving": "more iterations or a smaller tolerance of the engine's solver",
+    "shape of the cone": 'elliptic friction cones (MuJoCo: cone="elliptic")',
+    "softness of friction": "stiffer friction rows (MuJoCo: impratio above 1, or a shorter time constant in solref)",
+    "convex relaxation": "an engine with Coulomb's law; shorter time steps reduce this part",
+    "load above the friction limit": "a larger friction coefficient or normal force",
+}
 # Slip below this speed is not explained: it is far below the speeds at which objects leave a gripper, and above the
 # velocity error of solutions to 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
+UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 MAX_SEARCHED_ROWS = 120  # Several solutions are searched for only in problems of at most this many rows.
 
 
@@ -147,7 +156,7 @@ class SlipExplanation:
         notes = "".join(f" ({v.name}: {v.note})" for v in self.variants if v.note)
         return (
             f"{self.contacts[i]} slides fastest, with {format_size(speed)} m/s; the largest part, "
-            f"{format_size(part)} m/s, is caused by: {cause}.{notes}"
+            f"{format_size(part)} m/s, is caused by: {cause}.{notes} Remedy: {REMEDIES[cause]}."
         )
 
 
@@ -234,7 +243,7 @@ def explain_slip(
     hard, has_soft_friction = _harden_friction(own_disk)
     start = add("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
-        "Coulomb's law is not defined for its round cones" if hard.cones.has_round else ""
+        UNDEFINED_LAW if hard.cones.has_round else ""
     )  # fmt: skip
     rigid = hard if law_note else hard.relaxed("coulomb")
     start = add("coulomb", rigid, start, law_note)
@@ -303,7 +312,7 @@ def _speed_range(problem: Problem, slip: Any) -> FloatArray | None:
 
 def _format_speed(variant: SlipVariant, i: int) -> str:
     """Format a contact's speed, or its range over several solutions."""
-    if variant.note.startswith("not solved"):
+    if variant.note.startswith("not solved") or variant.note == UNDEFINED_LAW:
         return NONE
     if variant.speed_range is not None and np.ptp(variant.speed_range[:, i]) > MIN_EXPLAINED_SLIP:
         return " to ".join(map(format_size, variant.speed_range[:, i]))
@@ -369,7 +378,9 @@ def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
     speeds: dict[str, list[list[float]]] = {}
     parts: dict[str, dict[str, float]] = {}
     names: list[str] = []
+    undefined: set[int] = set()  # variants without values in one of the steps
     for explanation in explanations:
+        undefined |= {k for k, variant in enumerate(explanation.variants) if variant.note == UNDEFINED_LAW}
         names = names or [variant.name for variant in explanation.variants]
         for i, contact in enumerate(explanation.contacts):
             key = contact.partition(" (")[2].rstrip(")") or contact  # the geoms, without the contact's number
@@ -381,6 +392,7 @@ def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
     for key, values in speeds.items():
         mean = np.mean(values, axis=0)
         cause = max(parts[key], key=lambda c: parts[key][c]) if mean[0] > MIN_EXPLAINED_SLIP else "no slip"
-        rows.append([key, str(len(values)), *map(format_size, mean.tolist()), cause])
+        speeds_of_variants = [NONE if k in undefined else format_size(x) for k, x in enumerate(mean.tolist())]
+        rows.append([key, str(len(values)), *speeds_of_variants, cause])
     heads = ["contact", "steps x points", *(f"{name} [m/s]" for name in names), "dominant cause"]
     return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))

@@ -524,3 +524,28 @@ def test_data_of_a_second_model_are_refused():
     assert other.nv == model.nv
     with pytest.raises(lv.LavenderError):
         lv.io.from_mujoco(other, data)
+
+
+def test_data_without_a_forward_pass_are_rejected_by_name():
+    model = mj.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(lv.InputError, match="mj_forward"):
+        adapter.from_mujoco(model, mj.MjData(model))
+
+
+def test_a_changed_qvel_leaves_the_problem_of_the_forward_pass():
+    """`mj_step` changes qvel after the pass, so a change of it cannot be told from a step."""
+    model = mj.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom type='plane' size='1 1 .1'/>"
+        "<body pos='0 0 .09'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    data = mj.MjData(model)
+    data.qvel[2] = -1.0
+    mj.mj_forward(model, data)
+    before = adapter.from_mujoco(model, data)
+    data.qvel[2] = 5.0
+    after = adapter.from_mujoco(model, data)
+    assert np.array_equal(before.b, after.b) and np.array_equal(
+        before.velocity(before.b * 0), after.velocity(after.b * 0)
+    )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.lab.report.text import NONE
 from lavender.lab.slip import explain_slip, explain_slip_of_states, summarize_slip
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -179,3 +180,23 @@ def test_problems_without_contacts_or_velocities_are_rejected():
     matrix = lv.Problem.contact(np.eye(3), np.array([1.0, 1.0, 0.0]), mu=0.5)
     with pytest.raises(lv.LavenderError):
         explain_slip(matrix, np.zeros(3))
+
+
+def test_the_sentence_names_a_remedy_that_works():
+    """A larger impratio, the remedy of softness, reduces the slip."""
+    angle = 0.3
+    soft = explain_slip_of_states(block(angle, option='cone="elliptic"'), steps=600)[0]
+    assert "impratio above 1" in soft.sentence
+    stiff = explain_slip_of_states(block(angle, option='cone="elliptic" impratio="10"'), steps=600)[0]
+    # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
+    assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
+
+
+def test_a_law_that_is_not_defined_has_no_value():
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100)
+    table = explanations[0].table
+    column = table.heads.index("coulomb [m/s]")
+    assert {str(row[column]) for row in table.rows} == {NONE}
+    assert "not defined" in explanations[0].sentence
+    summary = summarize_slip(explanations)
+    assert all(str(row[summary.heads.index("coulomb [m/s]")]) == NONE for row in summary.rows)
