@@ -145,6 +145,7 @@ class Foreign(Solver):
             message=_join_lines(claim.message),
             form=_join_lines(claim.form),
             stages=(),
+            judged=None,
         )
 
 

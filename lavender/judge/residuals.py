@@ -69,8 +69,6 @@ from lavender_ext.judge import measure
 
 # [-] Above this relative residual, rounding to float64 does not excuse a solver.
 MAX_EXCUSED_RESIDUAL = 1e-5
-#: Key of `Derived.cache`: the residual of a result that is about to be returned.
-JUDGED_KEY = "lavender.judge.residuals: judged"
 MAX_REST_VELOCITY = (
     1e-9  # m/s. With a smaller V0 a problem is at rest: the zero impulse counts as its solution.
 )
@@ -360,26 +358,17 @@ def combine_best_islands(
     return best
 
 
-def store_result(problem: Problem, last: measure.Judged) -> None:
-    """Store a result for the next call of `residual` with the same impulse, bit for bit."""
-    problem.derived.cache[JUDGED_KEY] = last
+def judge_once(problem: Problem, impulse: FloatArray, judged: measure.Judged | None = None) -> measure.Judged:
+    """Return `judged` if it belongs to this problem and impulse, bit for bit; else judge a copy of the impulse."""
+    if judged is None or judged.data is not problem.metric or not measure.same_bits(judged.impulse, impulse):
+        return judge_impulse(problem, impulse.copy())
+    return judged
 
 
-def find_stored_residual(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
-    """Return the stored result if it belongs to `impulse`, bit for bit, and to this problem; else None."""
-    last: measure.Judged | None = problem.derived.cache.get(JUDGED_KEY)
-    if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
-        return None
-    return last
-
-
-def find_known_relative(problem: Problem, impulse: FloatArray) -> float | None:
-    """Return the relative residual if `impulse` is the stored or the zero impulse, bit for bit; else None."""
-    last = find_stored_residual(problem, impulse)
-    if last is not None:
-        return float(last.relative)
-    start: float = problem.metric.relative_at_zero
-    return start if start >= 0.0 and measure.same_bits(problem._start, impulse) else None
+def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None:
+    """Return the known relative residual if `impulse` is the zero impulse, bit for bit; else None."""
+    relative: float = problem.metric.relative_at_zero
+    return relative if relative >= 0.0 and measure.same_bits(problem._start, impulse) else None
 
 
 def compute_relative(
@@ -447,13 +436,9 @@ def residual(
         return convert_from_disk(
             problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         )
-    judgement = find_stored_residual(problem, impulse)
-    problem.derived.cache.pop(JUDGED_KEY, None)
-    if judgement is None:
-        judgement = judge_impulse(problem, impulse)
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
-    result = make_residual(problem, judgement.refine(tol) if judgement.loss > 0.1 * tol else judgement)
+    result = refine_residual(problem, judge_impulse(problem, impulse), tol)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
     return result if precision == "float64" else _with_float32_floor(problem, result, impulse)
@@ -516,6 +501,11 @@ def estimate_float32_errors(
 def _square_entries(a: Any) -> Any:
     """Square every entry of a sparse matrix."""
     return a.multiply(a).tocsr()
+
+
+def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Residual:
+    """Build a `Residual` from a raw judge pass, which is refined first if M is too ill-conditioned for `tol`."""
+    return make_residual(problem, judged.refine(tol) if judged.loss > 0.1 * tol else judged)
 
 
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:

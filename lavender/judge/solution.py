@@ -95,6 +95,9 @@ class Claim:
         solution.
     stages : tuple of SolverStage
         Stages of a solver that calls others.
+    judged : lavender_ext.judge.measure.Judged, optional
+        The judge's pass over the impulse that was returned, if the solver made one. It is read only if it belongs to
+        that problem and impulse, bit for bit.
     """
 
     status: Status
@@ -105,6 +108,7 @@ class Claim:
     dual: Any = None
     certificate: FloatArray | None = None
     stages: tuple[SolverStage, ...] = ()
+    judged: Any = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)

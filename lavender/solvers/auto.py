@@ -385,7 +385,7 @@ class Auto(Solver):
                         if recorder is not None:
                             recorder.add_call(AUTO, impulse, tol, claim)
                         impulse[:] = result.impulse
-                        return claim
+                        return replace(claim, judged=result)
         failed = AUTO.failed_claims(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")

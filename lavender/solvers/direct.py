@@ -32,7 +32,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import MAX_POLISHED_SLACK as CERTIFICATE_TOLERANCE
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.costs import (
@@ -144,11 +144,13 @@ class Direct(Solver):
             return run.claim(Status.MAX_ITERATIONS)
         try:
             if state.general is not None:
-                return run.linear_general(state.general)
-            assert state.pivot is not None
-            return run.pivoting(state.pivot)
+                claim = run.linear_general(state.general)
+            else:
+                assert state.pivot is not None
+                claim = run.pivoting(state.pivot)
         finally:
             run.store_best()
+        return replace(claim, judged=run.best_pass)
 
 
 @dataclass(frozen=True)
@@ -231,13 +233,12 @@ class _Run:
         return 0.0 if self.best_pass is None else self.best_pass.roundoff_floor
 
     def store_best(self) -> None:
-        """Copy the best iterate to the impulse and remember its residual."""
+        """Copy the best iterate to the impulse."""
         pivot = self.state.pivot
         if pivot is not None and pivot.rows.relative < self.best:
             self.offer(pivot.rows.best)  # An error or Ctrl-C ended the run between two rounds.
         if self.best_pass is not None:
             self.impulse[:] = self.best_pass.impulse
-            store_result(self.problem, self.best_pass)
 
     def is_good(self) -> bool:
         """Return whether the best residual is sufficient or at the round-off floor."""

@@ -12,7 +12,7 @@ cycles in exact arithmetic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import store_result
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.certify import (
@@ -88,7 +87,7 @@ class Lemke(Solver):
         paths = lemke.Lemke(state.rows)
         paths.begin(impulse)
         try:
-            return self._follow(
+            claim = self._follow(
                 state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (PIVOT_ENTRY_TIME * n * n)))
             )
         finally:
@@ -96,7 +95,7 @@ class Lemke(Solver):
             best = state.rows.best
             if best is not None:
                 impulse[:] = best.impulse
-                store_result(state.problem, best)
+        return replace(claim, judged=best)
 
     def _follow(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int

@@ -19,10 +19,9 @@ from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
-    find_stored_residual,
     judge_impulse,
+    judge_once,
     residual,
-    store_result,
 )
 from lavender.judge.solution import (
     INTERRUPTED,
@@ -84,6 +83,8 @@ class Loop:
         Iterations at the next record.
     pace : float, s
         Estimated upper bound of the time of an iteration; inf: the first chunk measures it.
+    judged : lavender_ext.judge.measure.Judged, optional
+        The judge's last pass over a result.
     """
 
     problem: Problem
@@ -102,6 +103,7 @@ class Loop:
     broken: bool = False
     next_record: int = 0
     pace: float = inf
+    judged: Any = None
 
     def run_once(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""
@@ -124,7 +126,9 @@ class Loop:
     def call(self, max_iter: int, time_limit: float | None) -> Claim:
         """Run at most `max_iter` iterations of the solver; an arithmetic error becomes a NUMERICAL_ERROR claim."""
         try:
-            return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
+            claim = self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
+            self.judged = claim.judged
+            return claim
         except BREAKDOWN as error:
             self.broken = True
             return Claim(NUMERICAL_ERROR, 0, {}, format_error(error))
@@ -193,10 +197,10 @@ class Loop:
         The zero impulse is only considered with `or_zero`.
         """
         problem = self.problem
-        result = find_stored_residual(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
+        result = judge_once(problem, self.impulse, self.judged)
         if result.relative > self.tol:
             result = best_of(problem, result, start, self.tol, or_zero)
-        store_result(problem, result)
+        self.judged = result
         self.impulse[:] = result.impulse
 
     def _keep_best(self) -> None:
@@ -212,12 +216,8 @@ class Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
-        last = find_stored_residual(self.problem, self.impulse) or judge_impulse(
-            self.problem, self.impulse.copy()
-        )
-        if last.relative <= self.tol:
-            store_result(self.problem, last)
-        else:
+        self.judged = judge_once(self.problem, self.impulse, self.judged)
+        if self.judged.relative > self.tol:
             self.impulse[:] = combine_best_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
     def _record(self) -> bool:

@@ -28,7 +28,7 @@ In between, Python checks the clock, Ctrl-C and certificates. `newton_systems/` 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
 from typing import Any
@@ -39,7 +39,7 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_relative
+from lavender.judge.residuals import compute_relative, judge_impulse
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import (
@@ -324,8 +324,10 @@ class Newton(Solver):
         if self.form == "auto" and problem.rows is not None and not is_continued:
             code, sweeps, warm_factorisations = warm_start(problem, impulse, tol, max_iter, time_limit)
             claim = make_warm_start_claim(code, sweeps, warm_factorisations)
-            if claim is not None and general.is_confirmed(problem, impulse, tol):
-                return claim
+            if claim is not None:
+                judged = judge_impulse(problem, impulse.copy())
+                if judged.relative <= tol:
+                    return replace(claim, judged=judged)
         max_iter -= warm_factorisations
         status, certificate = _run_stages(
             problem, system, impulse, max_iter, tol, time_limit, is_continued, max_total

@@ -12,10 +12,8 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
     combine_best_islands,
-    find_known_relative,
-    find_stored_residual,
-    judge_impulse,
-    store_result,
+    find_relative_at_zero,
+    judge_once,
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work
 from lavender.problem import Problem
@@ -47,6 +45,7 @@ class SolveLog:
         )  # Smallest relative residual, and its impulse (m,) [N s].
         self.result = problem._start  # (m,) [N s]: best impulse of each island, until one impulse meets tol.
         self.bad_start: FloatArray | None = None  # (m,) [N s]: a start that is worse than the zero impulse.
+        self.judged: Any = None  # The judge's pass over `impulse`, if it was made.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
@@ -62,17 +61,17 @@ class SolveLog:
             self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
             self.offer(self.problem._start, is_start=True)  # The zero impulse is better.
 
-    def offer(self, impulse: FloatArray, is_start: bool = False) -> None:
-        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
+    def offer(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
+        """Judge an impulse (m,) [N s], unless `judged` belongs to it, and store it in islands in which it is the best.
 
         No island of `result` has a larger relative residual than an impulse that was offered with `is_start`.
         """
-        relative = find_known_relative(self.problem, impulse)
+        relative = find_relative_at_zero(self.problem, impulse)
         if relative is None:
-            last = judge_impulse(self.problem, impulse.copy())
+            last = judge_once(self.problem, impulse, self.judged if judged is None else judged)
             relative, impulse = float(last.relative), last.impulse
             if relative < self.best:
-                store_result(self.problem, last)
+                self.judged = last
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol:
@@ -121,8 +120,8 @@ class SolveLog:
         """Return whether the best impulse is at the round-off floor."""
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
-        last = find_stored_residual(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
-        return bool(last.above_floor <= self.tol)
+        self.judged = judge_once(self.problem, self.impulse, self.judged)
+        return bool(self.judged.above_floor <= self.tol)
 
     @property
     def status(self) -> Status:
@@ -152,6 +151,7 @@ class SolveLog:
             "; ".join(filter(None, (message, self.failure, *self._conflict_messages()))),
             certificate=self.direction if self.certificate is None else self.certificate,
             stages=tuple(self.stages),
+            judged=self.judged,
         )
 
     def _conflict_messages(self) -> list[str]:

@@ -96,7 +96,7 @@ class Step:
         if self.state is None:
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
         claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
-        self.offer()
+        self.offer(claim.judged)
         self.record(claim)
         return claim
 
@@ -106,10 +106,10 @@ class Step:
         if log.recorder is not None:
             log.recorder.record(self.name, log.iterations + claim.iterations, self.impulse)
 
-    def offer(self) -> None:
-        """Offer the iterate to the log if it is finite."""
+    def offer(self, judged: Any = None) -> None:
+        """Offer the iterate, and the judge's pass over it if there is one, to the log if it is finite."""
         if all_finite(self.impulse):
-            self.log.offer(self.impulse)
+            self.log.offer(self.impulse, judged=judged)
 
 
 class Newton(Step):
@@ -136,7 +136,7 @@ class Newton(Step):
             self.started_from_zero = not (self.impulse - log.problem.start()).any()
         claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.has_stalled = claim.status is Status.STALLED
-        self.offer()
+        self.offer(claim.judged)
         self.record(claim)
         return claim
 

@@ -17,7 +17,8 @@ from lavender.judge.residuals import (
     combine_best_islands,
     divide_by_reference,
     get_reference,
-    residual,
+    judge_once,
+    refine_residual,
 )
 from lavender.judge.solution import (
     CONFIRMED,
@@ -73,9 +74,8 @@ def finish(
         impulse = combine_best_islands(
             problem, (problem._start,), (project_impulse(problem.cones, impulse),), tol
         )
-    judged = residual(
-        problem, impulse, "float64", tol=tol
-    )  # Solvers work in float64, whatever the precision of the data.
+    # Solvers work in float64, whatever the precision of the data.
+    judged = refine_residual(problem, judge_once(problem, impulse, claim.judged), tol)
     status, message = claim.status, claim.message
     relative = judged.relative
     if (

@@ -31,7 +31,7 @@ from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
     convert_from_disk,
-    find_known_relative,
+    find_relative_at_zero,
     get_reference,
     make_residual,
     residual,
@@ -430,7 +430,7 @@ class Prepared:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._failure)
         elif self._is_late or (loop.deadline.passed() and not spec.external):
             # If the start is the zero impulse, there is no better one to select, and judging is postponed.
-            at_zero = find_known_relative(problem, loop.impulse)
+            at_zero = find_relative_at_zero(problem, loop.impulse)
             if at_zero is not None and at_zero > loop.tol and loop.records is None and loop.deadline.passed():
                 start = loop.impulse
                 if self._original is not problem:
@@ -465,6 +465,7 @@ class Prepared:
             claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
         if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:
             claim = self._without_infeasible_islands(loop, claim, max_iter)
+        claim = replace(claim, judged=loop.judged)
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,

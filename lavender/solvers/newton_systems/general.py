@@ -5,12 +5,13 @@ One compiled call solves every island of trees; this module checks the clock and
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 from typing import Any
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.judge.residuals import get_reference, judge_impulse, store_result
+from lavender.judge.residuals import get_reference, judge_impulse
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender_ext.core.method import OUTCOMES
@@ -72,6 +73,7 @@ def run(
     deadline, watch = Deadline(time_limit), Stopwatch()
     counts = [0, 0, 0, 0]
     status, tolerance_ratio = Status.MAX_ITERATIONS, 1.0
+    judged: Any = None
     now = 0.0
     islands = max(1, kernel.islands)
     step = counted = FLOP_TIME * kernel.work
@@ -91,7 +93,9 @@ def run(
         status = _STATUS[kernel.step(min(steps, max_iter - counts[0]), impulse)]
         done = [now - then for now, then in zip(kernel.counts, before, strict=True)]
         counts = [total + new for total, new in zip(counts, done, strict=True)]
-        if status is Status.CONVERGED and not is_confirmed(problem, impulse, tol):
+        if status is Status.CONVERGED:
+            judged = judge_impulse(problem, impulse.copy())
+        if status is Status.CONVERGED and not judged.relative <= tol:
             # The kernel rounds sums in another order, and its squares may underflow.
             status = Status.MAX_ITERATIONS if tolerance_ratio > MIN_TOLERANCE_RATIO else Status.STALLED
             tolerance_ratio *= 0.25
@@ -110,14 +114,7 @@ def run(
         if left is not None:
             step = max(now / max(1, counts[0]), (now - last) / max(1, done[0]))
             steps = max(1, int(min(clock, CALL_TIME_FRACTION * left / max(step, counted, 1e-9))))
-    return claim(status, counts)
-
-
-def is_confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
-    """Return whether the judge confirms the kernel's result; the judge's pass is remembered for the solution."""
-    result = judge_impulse(problem, impulse.copy())
-    store_result(problem, result)
-    return bool(result.relative <= tol)
+    return replace(claim(status, counts), judged=judged)
 
 
 def claim(status: Status, counts: Any) -> Claim:

@@ -123,13 +123,12 @@ def test_every_array_of_a_problem_is_read_only(form):
 
 
 def test_a_verdict_on_another_problem_is_not_taken(plug_in):
-    from lavender.judge.residuals import judge_impulse, store_result
+    from lavender.judge.residuals import judge_impulse
 
     def run(problem, impulse):
         easy = lv.Problem.lcp(problem.delassus(), np.zeros(problem.m) - 1.0)
         impulse[:] = 0.0
-        store_result(problem, judge_impulse(easy, impulse.copy()))
-        return says(lv.Status.CONVERGED)
+        return replace(says(lv.Status.CONVERGED), judged=judge_impulse(easy, impulse.copy()))
 
     problem = random_lcp(9)
     solution = lv.solve(problem, plug_in(run))

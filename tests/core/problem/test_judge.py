@@ -23,7 +23,7 @@ import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import natural_map, qp_residual, siconos_error
-from lavender.judge.residuals import find_known_relative, judge_impulse, store_result
+from lavender.judge.residuals import find_relative_at_zero, judge_impulse, judge_once, refine_residual
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -273,24 +273,24 @@ def test_bounds_that_are_huge_beside_the_step_are_seen():
         assert lv.solve(problem, "pgs").impulse.tolist() == [bound, 1.0]
 
 
-def test_a_remembered_result_serves_its_own_impulse_alone():
+def test_a_pass_serves_its_own_impulse_and_problem_alone():
     problem = random_contact_problem(2)
     first = np.linspace(0.1, 1.0, problem.m)
     other = first.copy()
     other[-1] = np.nextafter(other[-1], 2.0)
     fresh = [lv.residual(problem, x) for x in (first, other)]
-    store_result(problem, judge_impulse(problem, first.copy()))
+    judged = judge_impulse(problem, first.copy())
+    assert judge_once(problem, first, judged) is judged
+    assert judge_once(random_contact_problem(2), first, judged) is not judged
     for x, expected in ((other, fresh[1]), (first, fresh[0])):
-        found = lv.residual(problem, x)
+        found = refine_residual(problem, judge_once(problem, x, judged), 1e-6)
         assert (found.relative, found.roundoff_floor, found.worst_row) == (
             expected.relative, expected.roundoff_floor, expected.worst_row
         )  # fmt: skip
         np.testing.assert_array_equal(found.error, expected.error)
         np.testing.assert_array_equal(found.slack, expected.slack)
-    assert find_known_relative(problem, problem.start()) == lv.residual(problem, problem.start()).relative
-    assert find_known_relative(problem, other) is None
-    store_result(problem, judge_impulse(problem, other))
-    assert find_known_relative(problem, other) == fresh[1].relative
+    assert find_relative_at_zero(problem, problem.start()) == lv.residual(problem, problem.start()).relative
+    assert find_relative_at_zero(problem, other) is None
 
 
 # -- nothing to do ----------------------------------------------------------------------------------

@@ -7,11 +7,15 @@ import time
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem
+from calls import over_velocities
+from random_problems import random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender.batch import residuals as loop
 from lavender.batch import solve as many
+from lavender.judge import residuals
+from lavender.solvers import direct
+from lavender.solvers.newton_systems import general
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
@@ -125,3 +129,30 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
     with pytest.raises(KeyboardInterrupt):
         lv.solve_many([dataclasses.replace(TINY, copy=False) for _ in range(n)], solver, threads=2)
     assert 1 <= len(begun) < n / 2
+
+
+@pytest.mark.parametrize("name", ["auto", "newton", "direct", "pgs", "anderson", "lemke"])
+def test_a_solve_leaves_no_result_with_its_problem(name):
+    """A residual was stored with the problem for the next call of the judge."""
+    problem = random_lcp(3, m=90)
+    lv.solve(problem, name)
+    keys = set(problem.derived.cache)
+    assert lv.solve(problem, name).success and set(problem.derived.cache) == keys
+    assert not any("judged" in str(key) for key in keys)
+
+
+@pytest.mark.parametrize("name", ["newton", "direct"])
+def test_the_judge_measures_the_result_of_a_solver_that_judged_it_once(name, monkeypatch):
+    problem, counted = random_lcp(3, m=90), []
+    if name == "newton":
+        problem = over_velocities(30, 60, compliance=0.1)
+    prepared, judge = lv.prepare(problem, name), residuals.judge_impulse
+
+    def count(of, impulse):
+        counted.append(impulse.tobytes())
+        return judge(of, impulse)
+
+    for module in (residuals, general, direct):
+        monkeypatch.setattr(module, "judge_impulse", count)
+    solution = prepared.solve(tol=1e-8)
+    assert solution.success and counted.count(solution.impulse.tobytes()) <= 1
