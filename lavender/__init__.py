@@ -49,7 +49,8 @@ from lavender.solvers.registry import SolverSpec, available, get, known, registe
 from lavender.judge.residuals import Residual, residual
 from lavender.problem.rows import Rows
 from lavender.judge.solution import Claim, History, Solution, Status, SolverStage
-from lavender.solving.solve import prepare, solve
+from lavender.solving.prepared import prepare
+from lavender.solving.solve import solve
 
 if TYPE_CHECKING:
     from lavender import contract as contract

@@ -126,7 +126,8 @@ def clock(monkeypatch):
 
     made = Clock()
     monkeypatch.setattr(deadline, "perf_counter", made)
-    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
+    for name in ("solve", "compiled_call"):
+        monkeypatch.setattr(sys.modules[f"lavender.solving.{name}"], "perf_counter", made)
     return made
 
 

@@ -20,7 +20,8 @@ from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.scene.scene import Scene
-from lavender.solving.solve import prepare, solve
+from lavender.solving.prepared import prepare
+from lavender.solving.solve import solve
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from lavender.judge.residuals import get_reference
 from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
-from lavender.solving.solve import prepare
+from lavender.solving.prepared import prepare
 
 TARGETS = (1e-3, 1e-6, 1e-9)  # relative residuals to reach
 SCRATCH = ", from scratch"  # suffix of lavender's solvers that are timed with forming A

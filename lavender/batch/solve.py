@@ -24,17 +24,10 @@ from lavender.problem.derived import cached_property
 from lavender.solvers.costs import RATES, estimate_judge_setup_cost, estimate_pass_cost
 from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
-from lavender.solving.solve import (
-    COST_PER_SECOND,
-    NO_STAGE_MESSAGE,
-    check_accepted,
-    check_budget,
-    check_time_limit,
-    compute_postponed_fields,
-    create_unjudged,
-    solve,
-    solve_prepared,
-)
+from lavender.solving.compiled_call import COST_PER_SECOND, NO_STAGE_MESSAGE, compute_postponed_fields
+from lavender.solving.limits import check_accepted, check_budget, check_time_limit
+from lavender.solving.outcome import create_unjudged
+from lavender.solving.solve import solve, solve_prepared
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite

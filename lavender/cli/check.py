@@ -53,7 +53,7 @@ def check(
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.lab import bench
     from lavender.lab.check import cross_check
-    from lavender.solving.solve import check_time_limit
+    from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
     for name in files:

@@ -34,7 +34,8 @@ from lavender.judge.solution import Solution, Status
 from lavender.problem import LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.solvers.registry import SolverSpec
-from lavender.solving.solve import prepare, solve
+from lavender.solving.prepared import prepare
+from lavender.solving.solve import solve
 
 __all__ = [
     "CHECKS",

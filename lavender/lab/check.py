@@ -22,7 +22,7 @@ from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.lab.motion.bound import compute_separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
-from lavender.solving.solve import check_budget, check_time_limit
+from lavender.solving.limits import check_budget, check_time_limit
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # for relaxed friction, which is not a QP

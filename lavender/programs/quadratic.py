@@ -25,8 +25,9 @@ from lavender.problem.generalized import Generalized
 from lavender.problem.program import QuadraticProgram
 from lavender.solvers.registry import get
 from lavender.solvers.small import describe_stages
+from lavender.solving.limits import check_time_limit
 from lavender.solving.outcome import finish
-from lavender.solving.solve import check_time_limit, solve
+from lavender.solving.solve import solve
 
 MAX_SOLVES = 5  # solves of one constraint problem, each with a smaller tol
 MIN_TOL = 1e-15  # the smallest tol of such a solve

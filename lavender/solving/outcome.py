@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, mark_read_only
 from lavender.base.errors import InputError
 from lavender.judge.certificates import format_lower_bound, prove_infeasibility
 from lavender.judge.residuals import (
@@ -19,6 +19,7 @@ from lavender.judge.residuals import (
     get_reference,
     judge_once,
     refine_residual,
+    residual,
 )
 from lavender.judge.solution import (
     CONFIRMED,
@@ -45,6 +46,9 @@ from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
 from lavender_ext.judge.measure import Judged, all_finite
 
+# Fields of an unjudged solution, besides its residual, that are computed when one is first read.
+LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
+         "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
 # A lower bound of every solution's impulse is reported if it is at least this multiple of sum |b_i| / d_i, the impulse
 # that the rows would need one by one. Below, the bound is true of well-posed problems, too, and says nothing about the
 # data. Rows that contradict each other up to a relative difference delta need about 1 / delta times that sum.
@@ -169,6 +173,34 @@ def finish(
             "stages": claim.stages,
         }
     )
+
+
+def create_unjudged(
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: Any,
+    tol: float,
+    message: str,
+    setup_time: float = 0.0,
+) -> Solution:
+    """Return the start as a solution if even the judge would exceed the limit; its fields are judged when accessed."""
+    start = problem._start if problem.guess is None else problem.guess
+    start = start.copy() if impulse is None else problem.impulse_array(impulse)
+    late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
+    return Solution.late(mark_read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
+
+
+def judge_late_fields(
+    problem: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
+) -> dict[str, Any]:
+    """Return the fields that `create_unjudged` postpones; impulse (m,) [N s], read-only."""
+    disk = problem.disk
+    solution = finish(disk, spec, options, problem.on_disk(impulse), claim, tol, 0.0, 0.0, None)
+    if problem is not disk:
+        judged = residual(problem, impulse, "float64")
+        solution = replace(solution.unstretched(problem), residual=judged)
+    return {name: getattr(solution, name) for name in ("residual", *LATE_FIELDS)}
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:

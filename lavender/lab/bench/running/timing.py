@@ -31,7 +31,8 @@ from lavender.lab.bench.timed_call import make_call_arguments
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.outcome import finish
-from lavender.solving.solve import prepare, solve
+from lavender.solving.prepared import prepare
+from lavender.solving.solve import solve
 
 MAX_WARM_UP_TIME = 5e-3  # [s] A call that took longer is not repeated to warm the caches.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)

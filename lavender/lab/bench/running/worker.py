@@ -23,7 +23,9 @@ from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, parse_fiel
 from lavender.lab.bench.running.timing import Outcome, Task, attempt_task, judge_outcome, make_solution
 from lavender.problem import Problem
 from lavender.solvers import registry
-from lavender.solving.solve import Prepared, check_time_limit, solve
+from lavender.solving.limits import check_time_limit
+from lavender.solving.prepared import Prepared
+from lavender.solving.solve import solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN_CPU_TIME = 60.0  # [s] A worker without a parent is killed this CPU time after its task's limit.

@@ -1,0 +1,117 @@
+"""Solve a small problem in one compiled call; the solution's other fields are computed when one is first read."""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.judge.residuals import make_residual
+from lavender.judge.solution import CONFIRMED, CONVERGED, TIME_LIMIT, Claim, Solution, SolverRun, Status
+from lavender.problem import Problem
+from lavender.solvers.loop import best_of
+from lavender.solvers.registry import SMALL_ROWS, SolverSpec
+from lavender.solvers.small import time_fraction
+from lavender_ext.judge.measure import all_finite
+
+if TYPE_CHECKING:
+    pass
+
+COST_PER_SECOND = 0.9e9  # Largest estimated cost [ns] of a compiled call per second of its time limit.
+NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
+
+
+def solve_small(
+    problem: Problem,
+    spec: SolverSpec,
+    impulse: Any,
+    tol: float,
+    limit: float = math.inf,
+) -> tuple[Solution | None, tuple[int, ...] | None]:
+    """Solve and judge a small problem by one compiled call.
+
+    With at most SMALL_ROWS rows, the result at an estimated cost of the limit [s] is the best of the iterate so far and
+    the start. The fields of claim, counts and residual are computed when they are first accessed.
+
+    Returns
+    -------
+    Solution or None
+        None if `Prepared` has to solve the problem.
+    tuple of int or None
+        Counts of a call that has failed; None if no call was made.
+    """
+    small = spec.small
+    if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):
+        return None, None
+    if not 0.0 < tol < math.inf or problem.has_singular_program:
+        return None, None
+    if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
+        return None, None  # Islands may take long: they are solved after the checks of the clock.
+    fraction = 1.0
+    if limit < math.inf:
+        fraction = time_fraction(problem, limit)
+        if fraction == 0.0:
+            return None, ()
+    start = perf_counter()
+    if impulse is None:
+        first = problem.guess
+    elif (
+        type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
+        and impulse.flags.c_contiguous and all_finite(impulse)
+    ):  # fmt: skip
+        first = impulse
+    else:
+        first = problem.impulse_array(impulse)
+    judged, counts = small.attempt(problem, first, tol, COST_PER_SECOND * fraction * limit)
+    if judged is None:
+        return None, counts
+    status = CONVERGED
+    if judged.relative > tol:
+        if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
+            return None, counts  # Time remains, or rounding hides b next to such impulses.
+        status, judged = TIME_LIMIT, best_of(problem, judged, first, tol)
+    # The caller may change an impulse array of their own later.
+    start_point = first if first is None or impulse is None else first.copy()
+    judged.impulse.setflags(write=False)
+    solution = Solution.late(
+        judged.impulse,
+        status,
+        tol,
+        perf_counter() - start,
+        (compute_postponed_fields, (problem, spec, judged, counts, start_point, status)),
+    )
+    return solution, None
+
+
+def compute_postponed_fields(
+    problem: Problem,
+    spec: SolverSpec,
+    judged: Any,
+    counts: Any,
+    start: FloatArray | None,
+    status: Status = CONVERGED,
+) -> dict[str, Any]:
+    """Return the fields of the solution of a compiled call that `Solution.late` postpones."""
+    if spec.small is None:  # A world of `solve_many`.
+        claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
+    else:
+        claim = spec.small.claim(problem, counts, start, judged.relative, status)
+    return {
+        "residual": make_residual(problem, judged),
+        "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, {}, claim.form),
+        "message": claim.message,
+        "history": None,
+        "dual": None,
+        "certificate": None,
+        "impulse_bound": None,
+        "claim_check": CONFIRMED,
+        "status_conflict": "",
+        "sweeps_per_decade": math.nan,
+        "stages": claim.stages,
+    }

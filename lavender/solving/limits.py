@@ -1,0 +1,134 @@
+"""Check the arguments of a solve, and whether its time limit leaves time for the forms that a solver needs."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lavender.base.arrays import check_bool, check_float, check_int
+from lavender.base.deadline import NEVER, Deadline, Stopwatch
+from lavender.base.errors import CapabilityError, InputError
+from lavender.base.lazy_import import import_numerics
+from lavender.problem import Problem, check_problem
+from lavender.solvers.costs import (
+    estimate_disk_cost,
+    estimate_import_cost,
+    estimate_judge_setup_cost,
+    estimate_refusal_cost,
+    get_loose_limit,
+)
+from lavender.solvers.loop import Callback
+from lavender.solvers.registry import SolverSpec
+
+if TYPE_CHECKING:
+    pass
+
+
+def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
+    """Raise an error if the argument is not a problem or the solver refuses it; return `is_too_late`.
+
+    If it is too late, only the kind of the problem is checked, because the other checks would exceed the limit.
+    """
+    check_problem(problem)
+    late = is_too_late(problem, spec, deadline)
+    reason = spec.refuses(problem, late)
+    if reason:
+        raise CapabilityError(f"solver {spec.name!r} {reason}")
+    return late
+
+
+def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
+    """Return whether forms of a problem that are needed before a solver runs would be built after the deadline.
+
+    These are `problem.disk`, and A if a solver of another package refuses problems by its entries. Such a call returns
+    its start.
+    """
+    if not is_tight(problem, deadline):
+        return False
+    if (
+        problem.rows is not None
+        and problem.cones.has_ellipse
+        and deadline.passed(1e-9 * estimate_judge_setup_cost(problem))
+    ):
+        return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
+    refusal = estimate_refusal_cost(problem) if spec.external else 0.0
+    needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
+    if (
+        needed > 0.0
+        and problem.generalized is None
+        and deadline.passed(needed)
+        and estimate_import_cost("scipy.sparse")
+    ):
+        watch = Stopwatch()
+        import_numerics()
+        # SciPy is imported outside the limit: otherwise no call with this limit would ever have it.
+        deadline.reserve(-watch.seconds)
+        needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
+    return needed > 0.0 and deadline.passed(needed)
+
+
+def is_tight(problem: Problem, deadline: Deadline) -> bool:
+    """Return whether the set-up of the problem and the judge may use more than a hundredth of the remaining time.
+
+    Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
+    """
+    return deadline.is_set and deadline.passed(1e-9 * get_loose_limit(problem))
+
+
+def check_time_limit(time_limit: Any) -> float:
+    """Return a time limit [s] as a number; inf if it is None.
+
+    Raises
+    ------
+    InputError
+        It is not a positive number.
+    """
+    if type(time_limit) is float and time_limit > 0.0:
+        return time_limit
+    if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
+        return math.inf
+    return check_float("time_limit", time_limit, above=0.0)
+
+
+def make_deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
+    """Create the deadline of a call with a time limit [s].
+
+    Solvers of others, and the modules of SciPy that they need, are imported first, so that this time does not count.
+    """
+    if limit == math.inf:
+        return NEVER
+    if spec.external or not spec.builtin:
+        spec.load()
+        import_numerics(*(() if spec.external else spec.requires))
+        begun = None
+    return Deadline(limit, begun)
+
+
+def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
+    """Return `tol` and `max_iter` as numbers; `max_iter` is the spec's if it is None.
+
+    Raises
+    ------
+    InputError
+        A value is not valid.
+    """
+    tol = check_float("tol", tol, low=0.0)
+    return tol, check_int("max_iter", spec.max_iter if max_iter is None else max_iter)
+
+
+def check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
+    """Raise an error if `history` or `callback` is not valid or not supported by the solver."""
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
+    if callback is not None and not spec.callback:
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call and takes no callback: use a solver of "
+            "lavender.available(problem, callback=True)"
+        )
+    if check_bool("history", history) and not spec.history:
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call and records no history: use a solver of "
+            "lavender.available(problem, history=True)"
+        )
