@@ -4,10 +4,11 @@ Each model is simulated under random controls. At some of its steps the constrai
 solved from a cold start by both solvers to the same judged residual:
 
     MuJoCo      `mj_fwdConstraint` with the Newton solver, at the loosest tolerance with an accepted answer
-    lavender    `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
+    lavender    `lavender.solve(problem)`: prepare, solve and judge; `solve` of one that was prepared for the same
+                structure; `solve_many`; and `from_mujoco` with `lavender.solve`
 
-Building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of several repetitions
-that alternate.
+Except in the last, building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of
+several repetitions that alternate.
 
 `measure_model_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the
 impulses of the last step, matched by key. MuJoCo has its own tolerance.
@@ -26,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.base.arrays import FloatArray
 from lavender.batch.solve import solve_many
 from lavender.io import mujoco as adapter
 from lavender.io.recording import make_controller
@@ -33,6 +35,7 @@ from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry_impulses
 from lavender.problem import Problem
+from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
 TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
@@ -77,6 +80,10 @@ class Step(WarmStep):
         Loosest tolerance of MuJoCo that was accepted; 0 if none was.
     many : float, s
         Time of lavender's solver per problem in solve_many.
+    prepared : float, s
+        Time of `Prepared.solve` for another problem of the same structure.
+    imported : float, s
+        Time of `from_mujoco` and one call.
     strict : float
         Relative residual of lavender's solver with the tolerance STRICT_RESIDUAL.
     coulomb : float or None
@@ -87,6 +94,8 @@ class Step(WarmStep):
     law: str
     tolerance: float
     many: float
+    prepared: float
+    imported: float
     strict: float
     coulomb: float | None
 
@@ -147,6 +156,22 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
     return single_time, float(batch_time), float(residual_found)
 
 
+def time_prepared(problem: Problem) -> float:
+    """Return the minimum time of a prepared solve from a cold start [s]."""
+    prepared = prepare(problem)
+    problems = [copy_cold(problem) for _ in range(N_REPEATS)]
+    return measure_min_time(lambda: prepared.solve(problems.pop(), tol=TARGET_RESIDUAL))
+
+
+def time_import(model: Any, data: Any, start: FloatArray) -> float:
+    """Return the minimum time to build the problem of MuJoCo's present state and to solve it from `start` (m,) [s]."""
+
+    def run() -> Solution:
+        return solve(adapter.from_mujoco(model, data), tol=TARGET_RESIDUAL, impulse=start)
+
+    return measure_min_time(run)
+
+
 def _iterate_problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
     """Yield number, data and problem of each `every`-th step under random controls; None for problems without rows."""
     data, drive = mj.MjData(model), make_controller(model, "random", 0)
@@ -190,6 +215,8 @@ def measure_model(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
                 engine=engine,
                 ours=ours,
                 many=batch_time,
+                prepared=time_prepared(problem),
+                imported=time_import(model, data, problem.start()),
                 engine_residual=engine_residual,
                 residual=residual_found,
                 strict=0.0 if strict.at_floor else strict.relative,

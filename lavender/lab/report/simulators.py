@@ -38,9 +38,24 @@ def _make_row_head(name: str, part: Sequence[WarmStep]) -> list[str]:
 
 def format_time_ratio_table(steps: Sequence[Step]) -> str:
     """Return geometric means of time ratios by the number of rows, and how many problems were solved, as Markdown."""
-    heads = ["rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`"]
+    heads = [
+        "rows",
+        "models",
+        "problems",
+        "MuJoCo [µs]",
+        "one call",
+        "prepared",
+        "`solve_many`",
+        "with import",
+    ]
     rows = [
-        [*_make_row_head(name, part), f"{compute_geometric_mean([s.many / s.engine for s in part]):.2f}"]
+        [
+            *_make_row_head(name, part),
+            *(
+                f"{compute_geometric_mean([getattr(s, field) / s.engine for s in part]):.2f}"
+                for field in ("prepared", "many", "imported")
+            ),
+        ]
         for name, part in _group_by_class(steps)
     ]
     convex = [s for s in steps if s.strict <= STRICT_RESIDUAL]
@@ -52,7 +67,7 @@ def format_time_ratio_table(steps: Sequence[Step]) -> str:
         f"law, {solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents). {unreached} are not solved "
         f"to {TARGET_RESIDUAL:.0e} by MuJoCo with any tolerance; they count with its default tolerance."
     )
-    start = f"Cold start, to a judged residual of {TARGET_RESIDUAL:.0e}. `one call`, `solve_many`: {OVER}."
+    start = f"Cold start, to a judged residual of {TARGET_RESIDUAL:.0e}. All but the first columns: {OVER}."
     return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", summary])
 
 
