@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from lavender.base.lazy_import import sparse as sp
+from lavender_ext.factor.linear import LinearSystem
 
 
 def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
@@ -24,3 +25,10 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
     if not a.diagonal().all() and sp.csgraph.structural_rank(sp.csr_array(a)) < a.shape[0]:
         raise RuntimeError("the matrix is singular whatever its entries are")
     return splu(a, **options)
+
+
+def splu(system: LinearSystem) -> Any:
+    """Factor the matrix of a linear system by SuperLU, the fallback if its own factorisation fails."""
+    matrix = sp.csr_array((system.data, system.indices, system.indptr), copy=True)
+    matrix.eliminate_zeros()
+    return factor_sparse_lu(matrix, permc_spec="COLAMD")

@@ -36,7 +36,7 @@ MODULES = (
     "pivot.lemke",
     "pivot.principal",
     "factor.graph",
-    "factor.sparse",
+    "factor.linear",
     "engine.arrays",
     "engine.substep",
     "host.memory",

@@ -15,7 +15,8 @@ from lavender.problem import Problem
 from lavender.solvers.factors import USE_WIDE_LANES
 from lavender.solvers.newton_systems.systems import is_dense_faster
 from lavender_ext.derivative.linear import Linear
-from lavender_ext.factor.sparse import SparsePanels, free_part
+from lavender_ext.factor.linear import LinearSystem
+from lavender_ext.factor.sparse import free_part
 
 MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
 SHIFT_OF_SINGULAR = 1e-11  # eps of (6), relative to the diagonal
@@ -84,9 +85,9 @@ class System:
     def _factor_symmetric(self, shift: float) -> Solve | None:
         """Factor G = H, which is symmetric because no contact slides."""
         indptr, indices, data = self._form_h()
-        panels = SparsePanels(indptr, indices, False, USE_WIDE_LANES)
-        failed = panels.factor(data, np.ones(self.n), shift, MIN_PIVOT_RATIO)
-        return None if failed else lambda r, transpose: panels.solve(r)
+        system = LinearSystem((indptr, indices), USE_WIDE_LANES)
+        failed = system.factor(data, None, shift, MIN_PIVOT_RATIO)
+        return None if failed else lambda r, transpose: system.solve(r)
 
     def _form_matrix(self, shift: float) -> Any:
         """Form G + shift P = I - P + P (H + shift I) as a sparse matrix."""

@@ -18,6 +18,7 @@ from lavender_ext.core.checks import MAX_MAGNITUDE, norm_inf
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, general_data, zero_impulse
 from lavender_ext.factor import sparse
+from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.judge import measure
 
 # A matrix counts as positive semidefinite if A + SEMIDEFINITE_SHIFT D has a Cholesky factor, D = diag(d). Rounding of
@@ -343,17 +344,17 @@ def has_shifted_cholesky(a: Any) -> bool:
         except np.linalg.LinAlgError:
             return False
         return True
-    panels, values = analyze_panels(a)
-    return bool(panels.factor(values, np.ones(n), SEMIDEFINITE_SHIFT, 0.0) == 0)
+    system, values = analyse_symmetric(a)
+    return bool(system.factor(values, None, SEMIDEFINITE_SHIFT) == 0)
 
 
-def analyze_panels(a: Any) -> tuple[sparse.SparsePanels, FloatArray]:
+def analyse_symmetric(a: Any) -> tuple[LinearSystem, FloatArray]:
     """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
 
     Returns
     -------
-    panels, values
-        The symbolic factorisation, and the entries that its `factor` needs.
+    system, values
+        The analysed system, and the entries that its `factor` needs.
 
     Raises
     ------
@@ -363,7 +364,8 @@ def analyze_panels(a: Any) -> tuple[sparse.SparsePanels, FloatArray]:
     a = sp.csr_array(0.5 * (a + a.T))  # makes pattern and rounded entries symmetric
     a.sort_indices()
     try:
-        panels = sparse.SparsePanels(a.indptr.astype(np.int32), a.indices.astype(np.int32), False)
+        system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))
+        system.analyse()
     except OverflowError as error:
         raise TooLarge(f"A cannot be factored: {error}") from None
-    return panels, a.data
+    return system, a.data

@@ -42,19 +42,17 @@ from lavender.solvers.factors import (
     MAX_DENSE_RANK_ROWS,
     PANELS_WORK_COST,
     PIVOT_TOLERANCE,
-    Panels,
+    USE_WIDE_LANES,
     mirror_pattern,
     rows_of,
 )
-from lavender.solvers.newton_systems.sparse import BACKWARD_TOLERANCE
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.sweeping import create_stopping_test, make_claim
 from lavender_ext.accelerate import admm
-from lavender_ext.factor.sparse import SparsePanels
+from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
 
-_PANELS, _BODIES = 1, 2  # Kinds of factors, with the numbers of the kernel.
 _START_RHO = 0.1  # First penalty; B has unit diagonal, so its scale is 1. Measured.
 # Iterations without progress before it stalls. With large mass ratios, the residual rises while rho is adapted.
 _ADMM_PATIENCE = 5000
@@ -65,7 +63,7 @@ MAX_SETUP_SCALING_COST = 5e6
 _SCALING_ENTRY_COST = 10.0  # Cost [ns] per entry of A.
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
-_ONE_PANEL_WORK_COST = 0.4  # Cost [ns] per multiply-add of L U in one panel.
+_FULL_WORK_COST = 0.4  # Cost [ns] per multiply-add of L U of a full matrix.
 
 
 class _Breakdown(Exception):
@@ -112,12 +110,12 @@ class AdmmState:
         self.watch = create_stopping_test(problem, problem.data, _ADMM_PATIENCE)
         self.splitting = admm.Splitting(self.data, self.memory, _START_RHO, self.relaxation)
         self.matrix: Any = None
-        self.panels: Any = None  # Analysed panels of the matrix.
+        self.system: Any = None  # Linear system of the matrix.
         self.lu = self.full = False  # Whether L U is used, and whether its matrix is full.
         if _is_over_bodies(problem):
             form = problem.velocity_form()
             # The form is scaled with D = diag d of the judge.
-            self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
+            self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
             self.is_scaled, self.next_cost = (
                 True,
                 0.0,
@@ -127,16 +125,16 @@ class AdmmState:
         values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
         self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
         self.lu = not problem.is_symmetric
-        self.kind = _PANELS
+        self.is_over_bodies = False
         if problem.m:
             self.matrix = mirror_pattern(self.matrix)
-            self.panels = Panels(*rows_of(self.matrix)[:2])
+            self.system = LinearSystem(rows_of(self.matrix)[:2], USE_WIDE_LANES)
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _estimate_first_factor_cost(self) -> float:
         """Estimate the cost [ns] of the first factor from the structure; later ones cost as much as the one before."""
         problem, rates = self.problem, RATES
-        if self.kind == _BODIES:
+        if self.is_over_bodies:
             assert problem.rows is not None
             rows, n = problem.rows, 6 * problem.rows.n_bodies
             setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
@@ -145,7 +143,8 @@ class AdmmState:
             return float(setup + rates["form row"] * n + PANELS_WORK_COST * work)
         if not problem.m:
             return 0.0
-        return float(rates["form row"] * problem.m + PANELS_WORK_COST * _analyse(self.panels, self.lu).work)
+        work = (1.0 + self.lu) * _analyse(self.system).cost
+        return float(rates["form row"] * problem.m + PANELS_WORK_COST * work)
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -157,7 +156,7 @@ class AdmmState:
         """Iterations in which the residual falls tenfold; NaN if it does not fall."""
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
-    def _factor(self) -> tuple[int, int, tuple[Any, ...]]:
+    def _factor(self) -> tuple[Any, ...]:
         """Return the factor for the present rho in the format of the kernel, and measure its time."""
         self._check_deadline()
         watch = Stopwatch()
@@ -166,8 +165,8 @@ class AdmmState:
         self.next_cost = 1e9 * watch.seconds
         return factor
 
-    def _make_factor(self) -> tuple[int, int, tuple[Any, ...]]:
-        """Factor by panels; use L U, then L U of the full matrix, if that breaks down and is allowed.
+    def _make_factor(self) -> tuple[Any, ...]:
+        """Factor the matrix; use L U, then L U of the full matrix, if that breaks down and is allowed.
 
         Raises
         ------
@@ -178,32 +177,32 @@ class AdmmState:
         """
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
-            return self.kind, 0, ()
-        panels, matrix, shift = self.panels, self.matrix, rho
+            return ()
+        system, matrix, shift = self.system, self.matrix, rho
         extra: tuple[Any, ...] = ()
-        if self.kind == _BODIES:
+        if self.is_over_bodies:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
             matrix, shift = mirror_pattern(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # The pattern is analysed each time, because entries may cancel for some values of rho.
-            panels = Panels(*rows_of(matrix)[:2])
+            system = LinearSystem(rows_of(matrix)[:2], USE_WIDE_LANES)
             extra = (*rows_of(k), e)
-        done = _factor_panels(panels, matrix, shift, self.lu)
-        if not done and self.kind == _PANELS and not self.lu and self.problem.law == "linear":
+        done = _factor_system(system, matrix, shift, self.lu)
+        if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
             # L L^T needs a definite matrix, and a linear system may be indefinite.
             self.lu = True
-            done = _factor_panels(panels, matrix, shift, True)
+            done = _factor_system(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
-            # Pivoting across panels is needed: a full matrix has only one panel.
-            if self.deadline.passed(1e-9 * _ONE_PANEL_WORK_COST * count_dense_work(m)):
+            # Row exchanges across supernodes are needed.
+            if self.deadline.passed(1e-9 * _FULL_WORK_COST * count_dense_work(m)):
                 raise TooLate
             self.full = True
-            self.matrix = matrix = _store_all_entries(matrix)
-            self.panels = panels = Panels(*rows_of(matrix)[:2])
-            done = _factor_panels(panels, matrix, shift, True)
+            self.matrix = matrix = matrix.toarray()
+            self.system = system = LinearSystem(m, USE_WIDE_LANES)
+            done = _factor_system(system, matrix, shift, True)
         if not done:
             raise _Breakdown(f"the factor of A + rho D broke down at rho = {rho:.1e}")
-        return self.kind, matrix.shape[0], (_analyse(panels, self.lu), *extra)
+        return system, *extra
 
 
 def _is_over_bodies(problem: Problem) -> bool:
@@ -230,36 +229,32 @@ def _estimate_setup_cost(problem: Problem) -> float:
     return (scaling if scaling <= MAX_SETUP_SCALING_COST else 0.0) + estimate_import_cost(*SCIPY_MODULES)
 
 
-def _analyse(panels: Panels, lu: bool) -> SparsePanels:
+def _analyse(system: LinearSystem) -> LinearSystem:
     try:
-        return panels.analysed(lu)
+        system.analyse()
     except OverflowError as error:
         raise _Breakdown(str(error)) from None
+    return system
 
 
-def _factor_panels(panels: Panels, matrix: sp.csr_array, shift: float, lu: bool) -> bool:
+def _factor_system(system: LinearSystem, matrix: Any, shift: float, lu: bool) -> bool:
     """Factor M = matrix + shift; return whether that succeeded.
 
     L U must also solve a test system with a backward error within `BACKWARD_TOLERANCE`:
     max |r - M x| <= BACKWARD_TOLERANCE (max |M_ij| max |x| + max |r|).
     """
-    values, n = rows_of(matrix)[2], matrix.shape[0]
-    factor = _analyse(panels, lu)
-    if not np.isfinite(values).all() or factor.factor(values, np.ones(n), shift, PIVOT_TOLERANCE):
+    n = matrix.shape[0]
+    # L U overwrites a full matrix.
+    values = matrix.copy() if isinstance(matrix, np.ndarray) else rows_of(matrix)[2]
+    largest = np.abs(values).max()
+    if not np.isfinite(largest) or _analyse(system).factor(values, None, shift, PIVOT_TOLERANCE, lu):
         return False
     if not lu:
         return True
     r = np.linspace(1.0, 2.0, n)
-    x = factor.solve(r)
+    x = system.solve(r)
     error = np.abs(r - matrix @ x - shift * x).max()
-    return bool(error <= BACKWARD_TOLERANCE * ((np.abs(values).max() + shift) * np.abs(x).max() + 2.0))
-
-
-def _store_all_entries(matrix: sp.csr_array) -> sp.csr_array:
-    """Return the matrix with all entries stored."""
-    n = matrix.shape[0]
-    indptr, indices = np.arange(n + 1, dtype=np.int32) * n, np.tile(np.arange(n, dtype=np.int32), n)
-    return sp.csr_array((matrix.toarray().ravel(), indices, indptr), shape=matrix.shape)
+    return bool(error <= BACKWARD_TOLERANCE * ((largest + shift) * np.abs(x).max() + 2.0))
 
 
 @dataclass(frozen=True)
@@ -334,7 +329,7 @@ class ADMM(Solver):
             "undone": splitting.undone - undone,
         }
         state.reported = state.factorisations
-        form = "Cholesky over bodies" if state.kind == _BODIES else "LU" if state.lu else "Cholesky"
+        form = "Cholesky over bodies" if state.is_over_bodies else "LU" if state.lu else "Cholesky"
         return replace(result, work=work, form=form, message=message)
 
 

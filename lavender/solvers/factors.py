@@ -2,7 +2,7 @@
 
     band     LDL^T by diagonals in compiled code (small matrices, and matrices of small bandwidth)
     dense    Cholesky of a full matrix
-    sparse   Cholesky by dense panels of a permuted matrix, in compiled code (`lavender_ext/factor/sparse.pyx`)
+    sparse   Cholesky by supernodes of a permuted matrix, in compiled code (`lavender_ext/factor/linear.pxd`)
     general  LU if A is not symmetric positive definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few
              rows), or first by panels with row exchanges inside each panel if A is sparse with a symmetric pattern
 
@@ -23,7 +23,8 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.costs import count_dense_work
-from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
+from lavender_ext.factor.linear import LinearSystem
+from lavender_ext.factor.sparse import free_part, is_mirrored
 
 PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
 # Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
@@ -132,56 +133,32 @@ class DenseFactor:
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         free = np.flatnonzero(place >= 0)
         a = self.a.copy() if n_free == len(place) else self.a[np.ix_(free, free)]
-        d = self.d[free]
-        if shift > 0.0:
-            a.flat[:: n_free + 1] += shift * d
-        self.full = FullCholesky(a, PIVOT_TOLERANCE * d, USE_WIDE_LANES)
-        return self.full.lost
+        self.system = LinearSystem(n_free, USE_WIDE_LANES)
+        return self.system.factor(a, self.d[free], shift, PIVOT_TOLERANCE)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return self.full.solve(rhs)
-
-
-class Panels:
-    """Factors L L^T and L U of matrices of one symmetric pattern, in one order, which is computed at the first use."""
-
-    def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        self.pattern, self.analyses = (indptr, indices), dict[bool, SparsePanels]()
-
-    def analysed(self, lu: bool) -> SparsePanels:
-        """Return the analysed panels of L U or L L^T, with their multiply-adds as `work`; numbers are not read."""
-        if lu not in self.analyses:
-            self.analyses[lu] = SparsePanels(*self.pattern, lu, USE_WIDE_LANES, self.analyses.get(not lu))
-        return self.analyses[lu]
-
-    def work(self, lu: bool = False) -> float:
-        """Return the multiply-adds of one factor; inf if it has more entries than can be counted."""
-        try:
-            return float(self.analysed(lu).work)
-        except OverflowError:
-            return np.inf
+        return self.system.solve(rhs)
 
 
 class SparseFactor:
-    """Cholesky factor by panels, in an order of minimum degree."""
+    """Cholesky factor by supernodes, in an order of minimum degree."""
 
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
         self.pattern = rows_of(mirror_pattern(problem.csr))
-        self.full_panels = Panels(*self.pattern[:2])
+        self.all_rows = LinearSystem(self.pattern[:2], USE_WIDE_LANES)
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         indptr, indices, data = self.pattern
-        if n_free == self.m:
-            self.panels, d = self.full_panels.analysed(False), self.d
-        else:
+        self.system, d = self.all_rows, self.d
+        if n_free < self.m:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
-            self.panels, d = SparsePanels(indptr, indices, False, USE_WIDE_LANES), self.d[place >= 0]
-        return self.panels.factor(data, d, shift, PIVOT_TOLERANCE)
+            self.system, d = LinearSystem((indptr, indices), USE_WIDE_LANES), d[place >= 0]
+        return self.system.factor(data, d, shift, PIVOT_TOLERANCE)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return self.panels.solve(rhs)
+        return self.system.solve(rhs)
 
 
 def mirror_pattern(matrix: sp.csr_array) -> sp.csr_array:
@@ -265,9 +242,9 @@ class PanelsLU:
 
     def __init__(self, problem: Problem) -> None:
         indptr, indices, data = problem._compressed
-        self.panels = SparsePanels(indptr, indices, True, USE_WIDE_LANES)
+        self.system = LinearSystem((indptr, indices), USE_WIDE_LANES)
         self.rank = problem.m
-        self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, PIVOT_TOLERANCE) == 0
+        self.usable = self.system.factor(data, problem.csr_data.d, 0.0, PIVOT_TOLERANCE, True) == 0
 
     @staticmethod
     def accepts(problem: Problem) -> bool:
@@ -276,7 +253,7 @@ class PanelsLU:
         return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and is_mirrored(indptr, indices)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return self.panels.solve(rhs)
+        return self.system.solve(rhs)
 
 
 class GeneralFactor:

@@ -9,8 +9,8 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
 
 At a fixed point x = z and B z - c + s + y = 0. The shift is added when both imbalances (3) are at most 1e-3 (or after 200
 iterations), that is, from the convex solution. If contacts stick, that is the solution, otherwise a start. (1) is solved with
-a factorisation that the caller computes: Cholesky of a dense matrix, L L^T or L U by panels
-(`factor/sparse.pyx`), or those of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
+a factorisation that the caller computes (`factor/linear.pxd`), over bodies that of
+I + K^T diag(1 / (theta + rho)) K, where B = K K^T + diag(theta):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
@@ -30,15 +30,9 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget,
 from lavender_ext.core.block cimport clip, length, norm2, row_group, locate_in_round_cone, round_scale, projected_normal
 from lavender_ext.core.block_types cimport CONE, blocks_t, is_round, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.dense cimport dense_cholesky_solve
-from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
+from lavender_ext.factor.linear cimport LinearSystem, linear_solve, linear_t
 from lavender_ext.judge.reference cimport is_inactive_contact, is_inactive_row
 
-
-cdef enum:
-    DENSE = 0
-    PANELS = 1
-    BODIES = 2
 
 cdef enum:
     RHO_UPDATE_INTERVAL = 20    # iterations between updates of rho; later a quarter of the iterations done
@@ -49,11 +43,8 @@ cdef enum:
 
 
 cdef struct factor_t:           # factor of B + rho, or of the body form
-    int32_t kind                # DENSE | PANELS | BODIES
-    int32_t n                   # order of the factor
-    const double* dense         # factor of factor/dense.pxd, for a host without panels
-    const sparse_t* panels
-    const int32_t* k_ptr        # K by rows (BODIES)
+    linear_t* linear
+    const int32_t* k_ptr        # K by rows over bodies, else NULL
     const int32_t* k_col
     const double* k_val
     const double* e             # (m) E
@@ -71,7 +62,7 @@ cdef struct admm_t:
     double* x                   # (m)
     double* g                   # (m)
     double* before              # (m) z of the previous iteration
-    double* work                # (n) scratch of BODIES
+    double* work                # (velocities) scratch over bodies
     double done                 # number of iterations
     double next                 # number of iterations at the next update of rho
     int32_t mixed               # 1 if u was mixed
@@ -80,22 +71,19 @@ cdef struct admm_t:
 
 
 cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
-    """Overwrite x (m) with (B + rho)^-1 x (1); t (n) is scratch of BODIES."""
+    """Overwrite x (m) with (B + rho)^-1 x (1); t (velocities) is scratch over bodies."""
     cdef int32_t i, k
     cdef double s
-    if f.kind == DENSE:
-        dense_cholesky_solve(m, f.dense, x)
+    if f.k_ptr == NULL:
+        linear_solve(f.linear, x)
         return
-    if f.kind == PANELS:
-        sparse_solve(f.panels, x, x)
-        return
-    for i in range(f.n):
+    for i in range(f.linear.n):
         t[i] = 0.0
     for i in range(m):
         s = f.e[i] * x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
             t[f.k_col[k]] += f.k_val[k] * s
-    sparse_solve(f.panels, t, t)
+    linear_solve(f.linear, t)
     for i in range(m):
         s = x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
@@ -361,7 +349,7 @@ cdef class Splitting:
     def run(self, double[::1] lam, int n, factor):
         """Run at most `n` iterations in place, without the GIL; return their number.
 
-        If `rho` has changed on return, a new factor is needed. factor is (PANELS or BODIES, order, arrays) with the arrays of
+        If `rho` has changed on return, a new factor is needed. factor is (LinearSystem,), over bodies followed by the arrays of
         `factor_t` in its order.
         """
         cdef factor_t f
@@ -370,15 +358,12 @@ cdef class Splitting:
         cdef double[::1] work
         cdef const double[::1] k_val, e
         cdef const int32_t[::1] k_ptr, k_col
-        cdef SparsePanels panels
-        f.kind = factor[0]
-        f.n = factor[1]
-        panels = factor[2][0]
-        f.panels = &panels.f
-        if f.kind == BODIES:
-            k_ptr, k_col, k_val, e = factor[2][1:]
+        cdef LinearSystem linear = factor[0]
+        f.linear, f.k_ptr = &linear.f, NULL
+        if len(factor) > 1:
+            k_ptr, k_col, k_val, e = factor[1:]
             f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
-        work = np.empty(f.n + 1)
+        work = np.empty(linear.f.n + 1)
         self.c.work = &work[0]
         with nogil:
             new_rho = lav_admm(&self.c, &f, &lam[0], &remaining)

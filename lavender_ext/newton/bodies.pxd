@@ -12,6 +12,7 @@ from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport (bind_block_factor, block_factor_index_size, block_factor_size,
                                          block_pattern_index_size)
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
+from lavender_ext.factor.linear cimport BLOCKS, NO_FACTOR
 from lavender_ext.factor.symbolic cimport block_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport compute_panel, factor_inertia
@@ -118,7 +119,7 @@ cdef inline bint needs_lu(const newton_t* s, const blocks_t* p) noexcept nogil:
 cdef inline int64_t body_workspace_size(const newton_t* s, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Return the number of doubles that `bind_body_workspace` assigns, after `analyse_blocks`."""
     return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + method_real_size(p.n_rows, s.sc.small) + 6 * <int64_t>r.n_bodies
-            + block_factor_size(&s.blocks, needs_lu(s, p)))
+            + block_factor_size(&s.linear.blocks, needs_lu(s, p)))
 
 
 cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
@@ -190,7 +191,8 @@ cdef inline void bind_factor(newton_t* s, const pattern_t* a, double* panel, con
     s.s.form, s.s.symmetric, s.s.y = BODIES, 1, y
     s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
     find_groups(&s.sc.e, a.group)
-    bind_block_factor(&s.blocks, lu, wide, index, real)
+    s.linear.kind, s.linear.n, s.linear.factored = BLOCKS, s.linear.blocks.factor.n, NO_FACTOR
+    bind_block_factor(&s.linear.blocks, lu, wide, index, real)
 
 
 cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, const view_t* v, bint wide,

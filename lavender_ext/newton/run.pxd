@@ -9,7 +9,7 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.factor.blocks cimport block_matrix_t
+from lavender_ext.factor.linear cimport linear_t
 from lavender_ext.judge.best cimport best_t, best_workspace_size, bind_best, note_score, relative_of_best, store_better_islands
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
@@ -171,7 +171,7 @@ cdef struct path_t:             # a path of smoothed problems; its vectors belon
 cdef struct newton_t:           # bound to its workspace; it must not move
     system_t s
     scaled_t sc
-    block_matrix_t blocks       # N of s over bodies, and its factor
+    linear_t linear             # of s, unless a host provides it
     problem_t problem
     double tol
     int32_t budget              # factorisations
@@ -256,7 +256,7 @@ cdef inline void bind_index_workspace(newton_t* n, int64_t m, int32_t* index) no
     """Assign the integer arrays."""
     bind_element_workspace(&n.sc, m, index)
     index += scaled_index_size(m)
-    n.active.bound, n.s.swap, n.s.free = index, index + m, index + 2 * m
+    n.active.bound, n.linear.swap, n.s.free = index, index + m, index + 2 * m
 
 
 cdef inline int64_t method_real_size(int64_t m, int64_t small) noexcept nogil:
@@ -294,9 +294,9 @@ cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* wo
     n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = x, x + small, x + 2 * small, x + 3 * small, x + 4 * small
     if n.sc.e.n == n.sc.e.m:                            # Bounded rows alone.
         n.s.bt = NULL
-    n.s.e, n.s.f = &n.sc.e, &n.blocks
+    n.s.e, n.s.linear = &n.sc.e, &n.linear
     n.s.others = NULL
-    n.s.wide = n.s.augmented = n.s.factorisations = n.disabled_phases = 0
+    n.s.augmented = n.s.factorisations = n.disabled_phases = 0
     return x + 5 * small
 
 

@@ -19,6 +19,7 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.blocks cimport (analyse_blocks, block_factor_index_size, block_factor_size, block_matrix_t,
                                          block_pattern_index_size)
+from lavender_ext.factor.linear cimport NO_FACTOR, LinearSystem, analyse_dense
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
                                          body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
@@ -54,6 +55,7 @@ PHASES = {
 }
 #: Compliance eps of a path of smoothed problems, relative to d.
 COMPLIANCE = path_compliance()
+cdef double PIVOT_TOLERANCE = 1e-13     # A pivot of a sparse matrix is lost up to this multiple of its diagonal entry.
 #: Names of the counts of `Solve.counts` in the message of a solution.
 COUNTED = (
     "exchanges",
@@ -117,6 +119,14 @@ cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_
     return is_known(&v.p)
 
 
+cdef inline void bind_dense_system(newton_t* n, bint wide, const double* h, double* matrix, double* lower) noexcept nogil:
+    """Bind H and the matrix (m, m), and L L^T (`dense_workspace_size`)."""
+    analyse_dense(&n.linear, n.sc.e.m)
+    n.linear.wide, n.linear.matrix, n.linear.lower = wide, matrix, lower
+    n.linear.factored = NO_FACTOR
+    n.s.form, n.s.h, n.s.multiplied = DENSE, h, lower
+
+
 cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int64_t m = v.p.n_rows
@@ -132,9 +142,8 @@ cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, con
     find_elements(&n.sc, v)
     memset(x, 0, method_real_size(m, n.sc.small) * sizeof(double))
     x = bind_real_workspace(n, v, x)
-    n.s.form, n.s.wide = DENSE, o.wide
-    n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
-    n.s.symmetric = form_scaled_matrix(&n.sc, v.a, <int32_t>m, n.s.swap, x)
+    bind_dense_system(n, o.wide, x, x + m * m, x + 2 * m * m)
+    n.s.symmetric = form_scaled_matrix(&n.sc, v.a, <int32_t>m, n.linear.swap, x)
     return begin(n, o, lam)
 
 
@@ -168,7 +177,7 @@ cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, c
         needed = first + 1 + factor_index_size(a.n, a.nptr[a.n], below)
         if not require_workspace(r, needed, 0):
             return NEEDS_WORKSPACE
-        r.work = analyse_blocks(&n.blocks, a.n, 6, a.nptr, a.nind, a.parent, a.lptr, index)
+        r.work = n.linear.cost = analyse_blocks(&n.linear.blocks, a.n, 6, a.nptr, a.nind, a.parent, a.lptr, index)
         r.is_bound = 1
     if not require_workspace(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, &v.p, v.r)):
         return NEEDS_WORKSPACE
@@ -184,22 +193,22 @@ cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, c
 cdef class Solve(Method)        # defined below
 
 
-cdef int32_t call_factor(void* at, int32_t augmented, int32_t what, double eps) noexcept with gil:
+cdef int32_t call_factor(void* at, int32_t what, double eps) noexcept with gil:
     cdef Solve self = <Solve>at
     try:
-        return bool(self.others.factor(augmented, what, eps))
+        return bool(self.others.factor(what, eps))
     except BaseException as error:                      # The step ends and its caller raises, also for Ctrl-C.
         self.raised = error
         self.n.stop = 1
         return 0
 
 
-cdef void call_solve(void* at, int32_t augmented, double* x) noexcept with gil:
+cdef void call_solve(void* at, double* x) noexcept with gil:
     cdef Solve self = <Solve>at
     cdef double[::1] view = <double[:self.m]>x
     cdef const double[::1] solution
     try:
-        solution = self.others.solve(augmented, np.asarray(view))
+        solution = self.others.solve(np.asarray(view))
         view[:] = solution
     except BaseException as error:
         self.raised = self.raised or error              # The first error may have caused this one.
@@ -271,6 +280,7 @@ cdef class Solve(Method):
     cdef external_t calls
     cdef list held
     cdef object others, raised, real, index
+    cdef LinearSystem linear                            # of a sparse H
     cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
     cdef readonly object v, einv, p, pair, bt           # small matrices of all elements
     cdef readonly int m
@@ -319,7 +329,7 @@ cdef class Solve(Method):
     # -- forms -------------------------------------------------------------------------------------
 
     def set_external(self, others):
-        """Set the object that factors sparse matrices or the augmented system."""
+        """Set the object that factors the augmented system."""
         self.others, self.n.s.others = others, &self.calls
 
     def over_rows(self, double[:, ::1] h, bint symmetric, bint wide):
@@ -327,15 +337,24 @@ cdef class Solve(Method):
         cdef double[::1] whole = np.empty(self.m * self.m + 1)
         cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
         self.held += [h, whole, lower]
-        self.n.s.form, self.n.s.symmetric, self.n.s.wide = DENSE, symmetric, wide and has_wide()
-        self.n.s.h, self.n.s.whole, self.n.s.lower = &h[0, 0] if self.m else NULL, &whole[0], &lower[0]
+        self.n.s.symmetric = symmetric
+        bind_dense_system(self.n, wide and has_wide(), &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
 
-    def over_entries(self, indptr, indices, values, bint symmetric):
-        """Use H in compressed rows, which the object of `set_external` factors."""
-        self.held += [indptr, indices, values]
-        self.n.s.form, self.n.s.symmetric = SPARSE, symmetric
+    def over_entries(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
+        """Use H in compressed rows, and its system `linear` over the rows of the graph (to, other) of elements.
+
+        h has the entries of H in these rows, diagonal (m,) those on the diagonal.
+        """
+        cdef double[::1] matrix = np.empty(len(h) + 1), y = np.empty(self.m)
+        self.held += [indptr, indices, values, to, other, h, diagonal, matrix, y]
+        self.n.s.form, self.n.s.symmetric, self.n.s.y = SPARSE, symmetric, &y[0]
         self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>address(indptr), <int32_t*>address(indices)
         self.n.s.a.data = <double*>address(values)
+        self.n.s.coupled.to, self.n.s.coupled.other = <int32_t*>address(to), <int32_t*>address(other)
+        self.n.s.coupled.diagonal, self.n.s.coupled.h = <int32_t*>address(diagonal), <double*>address(h)
+        linear.lend(np.asarray(matrix)[:len(h)], PIVOT_TOLERANCE)
+        self.n.s.coupled.indptr = linear.f.rows.indptr
+        self.linear, self.n.s.linear = linear, &linear.f
 
     def jacobian(self, const int32_t[:, ::1] pair, const int32_t[::1] column=None):
         """Return K = D^-1/2 J M^-1/2 (rows, 12) of the bodies and the used columns of a body: 1, 2, 3 or all 6.
@@ -365,7 +384,7 @@ cdef class Solve(Method):
 
     def over_bodies(self, panel, const int32_t[::1] columns, Layout layout, bint lu, bint wide):
         """Use K of `jacobian`, which is overwritten, with these columns of each body; lu: N may have to be factored as L U."""
-        cdef block_matrix_t* f = &self.n.blocks
+        cdef block_matrix_t* f = &self.n.linear.blocks
         cdef pattern_t a = layout.a
         cdef int32_t factored = a.n * layout.s
         f[0] = layout.blocks
@@ -388,6 +407,8 @@ cdef class Solve(Method):
     def step(self, int work, double[::1] impulse):
         """Do `work` factorisations or a few more; return the outcome, and write the best impulse (rows,)."""
         Method.step(self, work, impulse)
+        if self.linear is not None:
+            self.linear.raise_error()
         if self.raised is not None:
             error, self.raised = self.raised, None
             raise error
@@ -444,7 +465,7 @@ cdef class Solve(Method):
 
     @property
     def sign(self):
-        """Sign of the determinant of the last "natural" factor; 0 if an external object factored it."""
+        """Sign of the determinant of the last "natural" factor; 0 of a sparse or the augmented system."""
         return system_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):

@@ -5,23 +5,23 @@
     natural   (I - P + P (H + eps)) dz = r P is the derivative of the projection in the natural map       (3)
 
 Over bodies the matrix is I + K^T V K (elements.pxd). Over rows it is M = L H R^T + o L + I, or H + W for bounded rows
-alone. Dense matrices are factored here (factor/dense.pxd), in (3) on the rows with P != 0 only. Sparse matrices and the
-augmented system of the bodies, [I -R K^T; L K I], are factored by the caller (`external_t`).
+alone, dense or in compressed rows (coupled.pxd); a dense (3) has the rows with P != 0 only. All three are one `linear_t`
+(factor/linear.pxd). The augmented system of the bodies, [I -R K^T; L K I], is factored by the caller (`external_t`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.validate cimport norm_inf
+from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.blocks cimport block_matrix_t, factor_blocks
-from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
-                                        dense_lu_sign, dense_lu_solve)
-from lavender_ext.factor.supernodal cimport solve_supernodes, supernodal_lu_sign
+from lavender_ext.factor.dense cimport cholesky_workspace_size
+from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, linear_factor, linear_sign, linear_solve,
+                                         linear_solve_checked, linear_t)
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
+from lavender_ext.newton.coupled cimport couple_entries, coupled_t
 from lavender_ext.newton.elements cimport element_times, elements_t, is_row
 from lavender_ext.newton.natural_map cimport natural
 from lavender_ext.newton.normal_matrix cimport form_normal_matrix
@@ -38,38 +38,30 @@ cdef enum:                      # systems (1), (2), (3)
     PAIR = 1
     NATURAL = 2
 
-cdef enum:                      # factorisations
-    FACTOR_NONE = 0
-    FACTOR_CHOLESKY = 1
-    FACTOR_LU = 2
-
 cdef enum:
     REFINEMENT_STEPS = 2        # Refinements of (3), which remove eps; the next Newton step does the rest.
 
 
-cdef struct external_t:         # factorisations by the caller
+cdef struct external_t:         # factorisation of the augmented system by the caller
     void* at
-    int32_t (*factor)(void* at, int32_t augmented, int32_t what, double eps) noexcept nogil
-    void (*solve)(void* at, int32_t augmented, double* x) noexcept nogil       # x (m), in place
+    int32_t (*factor)(void* at, int32_t what, double eps) noexcept nogil
+    void (*solve)(void* at, double* x) noexcept nogil       # x (m), in place
 
 
 cdef struct system_t:
     int32_t form
     int32_t symmetric           # A is symmetric
     int32_t augmented           # the augmented system is factored and solved at present
-    int32_t wide                # four doubles fit one instruction
     int32_t factorisations
-    int32_t by                  # factorisation of the last matrix
     int32_t n_free              # rows of the last dense matrix, -1: all
     int32_t law                 # of the last natural map
     const elements_t* e
-    const block_matrix_t* f           # BODIES
+    linear_t* linear            # the matrix of (1), (2) or (3)
     const double* h             # (m, m) DENSE
     csr_t a                     # H, SPARSE
+    coupled_t coupled           # the same in the pattern of the elements
     const external_t* others    # or NULL
-    double* whole               # (m, m) DENSE: the matrix, or L U
-    double* lower               # (`dense_workspace_size`) L L^T, or scratch
-    int32_t* swap               # (m) row exchanges
+    double* multiplied          # (m, m) DENSE with cones: L H, in the place of L L^T
     int32_t* free               # (m) rows of the last dense matrix
     double* v                   # small matrices of the elements
     double* einv
@@ -78,11 +70,11 @@ cdef struct system_t:
     double* bt                  # or NULL
     double* t                   # (m)
     double* q                   # (m)
-    double* y                   # (bodies s)
+    double* y                   # (bodies s) BODIES, (m) SPARSE
 
 
 cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
-    """Return the number of doubles of `lower`; with cones it holds L H instead."""
+    """Return the number of doubles of L L^T, or with cones of L H."""
     return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
@@ -90,7 +82,7 @@ cdef inline void system_times(system_t* s, const double* x, double* out) noexcep
     """Compute out = H x; out must not be x."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES:
-        multiply_panel_transpose(s.e, s.f.n, x, s.y)
+        multiply_panel_transpose(s.e, s.linear.blocks.n, x, s.y)
         multiply_panel(s.e, s.y, out)
         for j in range(m):
             out[j] += s.e.theta[j] * x[j]
@@ -151,7 +143,7 @@ cdef inline void form_natural_matrix(system_t* s, double eps) noexcept nogil:
         nr = e.ptr[i + 1] - j
         for r in range(nr):
             p = s.p + e.wptr[i] + r * nr
-            y = s.whole + <int64_t>(n + r) * s.n_free
+            y = s.linear.matrix + <int64_t>(n + r) * s.n_free
             h = s.h + <int64_t>j * e.m
             if nr == 1:
                 for k in range(s.n_free):
@@ -179,49 +171,64 @@ cdef inline void form_dense_matrix(system_t* s, int32_t what, double eps) noexce
     if what == NATURAL:
         form_natural_matrix(s, eps)
     elif s.bt == NULL:
-        memcpy(s.whole, s.h, <int64_t>m * m * sizeof(double))
+        memcpy(s.linear.matrix, s.h, <int64_t>m * m * sizeof(double))
         for j in range(m):
-            s.whole[<int64_t>j * (m + 1)] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
+            s.linear.matrix[<int64_t>j * (m + 1)] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
     else:
-        multiply_left(e, s.bt if what == BARRIER else s.pair, s.h, s.lower)
+        multiply_left(e, s.bt if what == BARRIER else s.pair, s.h, s.multiplied)
         for j in range(m):
-            element_times(e, s.bt, s.lower + <int64_t>j * m, s.whole + <int64_t>j * m, False)
-            s.whole[<int64_t>j * (m + 1)] += 1.0
+            element_times(e, s.bt, s.multiplied + <int64_t>j * m, s.linear.matrix + <int64_t>j * m, False)
+            s.linear.matrix[<int64_t>j * (m + 1)] += 1.0
+
+
+cdef inline void form_sparse_matrix(system_t* s, int32_t what, double eps) noexcept nogil:
+    """Form the sparse matrix of a system."""
+    cdef int32_t j
+    cdef double* values = s.linear.rows.data
+    if what == NATURAL:
+        couple_entries(&s.coupled, s.e, s.p, s.p if s.bt == NULL else NULL, eps - 1.0, values)
+    elif s.bt != NULL:
+        couple_entries(&s.coupled, s.e, s.bt if what == BARRIER else s.pair, s.bt, 0.0, values)
+    else:
+        memcpy(values, s.coupled.h, s.coupled.indptr[s.e.m] * sizeof(double))
+        for j in range(s.e.m):
+            values[s.coupled.diagonal[j]] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
+
+
+cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcept nogil:
+    """Form and factor the sparse matrix of a system; return 0 if that fails."""
+    cdef int32_t j
+    cdef linear_t* f = s.linear
+    form_sparse_matrix(s, what, eps)
+    f.factored, f.d, f.by = NO_FACTOR, NULL, LU
+    if not all_finite(f.rows.data, s.coupled.indptr[s.e.m]):
+        return 0
+    if s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER):
+        f.by, f.d = CHOLESKY, s.q
+        for j in range(s.e.m):
+            s.q[j] = f.rows.data[s.coupled.diagonal[j]]         # A pivot is compared with its diagonal entry.
+    return linear_factor(f) == 0
 
 
 cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept nogil:
     """Form and factor the dense matrix of a system; return 0 if a pivot fails."""
-    cdef int32_t n = s.e.m, symmetric = s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER)
     form_dense_matrix(s, what, eps)
-    if s.n_free >= 0:
-        n = s.n_free
-    s.by = FACTOR_NONE
-    if symmetric and dense_cholesky(s.wide, n, s.whole, NULL, s.lower) == 0:
-        s.by = FACTOR_CHOLESKY
-    elif dense_lu(s.wide, n, s.whole, s.swap, 0.0) == 0:
-        s.by = FACTOR_LU
-    return s.by != FACTOR_NONE
+    s.linear.n = s.e.m if s.n_free < 0 else s.n_free
+    s.linear.by = CHOLESKY_OR_LU if s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER) else LU
+    return linear_factor(s.linear) == 0
 
 
 cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
-    """Solve with the last dense factor, in place."""
-    cdef int32_t j, n = s.e.m
-    cdef double* y = x
-    if s.n_free >= 0:
-        n = s.n_free
-        y = s.q
-        for j in range(n):
-            y[j] = x[s.free[j]]
-    if s.by == FACTOR_CHOLESKY:
-        dense_cholesky_solve(n, s.lower, y)
-    elif s.by == FACTOR_LU:
-        dense_lu_solve(n, s.whole, s.swap, y)
-    else:
-        for j in range(n):
-            y[j] = 1.0 / 0.0                            # The matrix is singular: the caller rejects the step.
-    if s.n_free >= 0:
-        for j in range(n):
-            x[s.free[j]] = y[j]
+    """Solve with the last dense factor, in place; infinite if the matrix is singular, so that the caller rejects the step."""
+    cdef int32_t j
+    if s.n_free < 0:
+        linear_solve(s.linear, x)
+        return
+    for j in range(s.n_free):
+        s.q[j] = x[s.free[j]]
+    linear_solve(s.linear, s.q)
+    for j in range(s.n_free):
+        x[s.free[j]] = s.q[j]
 
 
 # -- (1) to (3) ------------------------------------------------------------------------------------------------
@@ -229,42 +236,42 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
 
 cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcept nogil:
     """Factor (1), (2), or (3) with the last `system_natural`; return 0 if a pivot fails."""
-    cdef int32_t lu
     s.factorisations += 1
-    if s.augmented or s.form == SPARSE:
-        return s.others.factor(s.others.at, s.augmented, what, eps)
+    if s.augmented:
+        return s.others.factor(s.others.at, what, eps)
     if s.form == DENSE:
         return factor_dense(s, what, eps)
-    lu = what == PAIR or (what == NATURAL and s.law != CONE)
-    form_normal_matrix(s.e, s.v, s.f, lu)
-    s.by = FACTOR_LU if lu else FACTOR_CHOLESKY
-    return factor_blocks(s.f, lu) == 0
+    if s.form == SPARSE:
+        return factor_sparse(s, what, eps)
+    s.linear.by = LU if what == PAIR or (what == NATURAL and s.law != CONE) else CHOLESKY
+    form_normal_matrix(s.e, s.v, &s.linear.blocks, s.linear.by == LU)
+    return linear_factor(s.linear) == 0
 
 
 cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
-    """Return the sign of the determinant of the last (3); 0 if the caller factored it."""
-    if s.augmented or s.form == SPARSE:
-        return 0
-    if s.by != FACTOR_LU:
-        return s.by == FACTOR_CHOLESKY
-    if s.form == DENSE:
-        return dense_lu_sign(s.e.m if s.n_free < 0 else s.n_free, s.whole, s.swap)
-    return supernodal_lu_sign(&s.f.factor)
+    """Return the sign of the determinant of the last (3); 0 if it is not known."""
+    return 0 if s.augmented or s.form == SPARSE else linear_sign(s.linear)
 
 
 cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) noexcept nogil:
     """Compute out = K N^-1 K^T x."""
-    multiply_panel_transpose(s.e, s.f.n, x, s.y)
-    solve_supernodes(&s.f.factor, s.y, s.by == FACTOR_LU)
+    multiply_panel_transpose(s.e, s.linear.blocks.n, x, s.y)
+    linear_solve(s.linear, s.y)
     multiply_panel(s.e, s.y, out)
 
 
 cdef inline void solve_rows(system_t* s, double* x) noexcept nogil:
     """Solve over the rows of A with the last factor, in place."""
-    if s.augmented or s.form == SPARSE:
-        s.others.solve(s.others.at, s.augmented, x)
-    else:
+    cdef int32_t j
+    if s.augmented:
+        s.others.solve(s.others.at, x)
+    elif s.form == DENSE:
         solve_dense(s, x)
+    else:
+        memcpy(s.y, x, s.e.m * sizeof(double))
+        if not linear_solve_checked(s.linear, s.y, x, s.q):
+            for j in range(s.e.m):
+                x[j] = 1.0 / 0.0
 
 
 cdef inline void system_solve(system_t* s, int32_t what, const double* r, double* out) noexcept nogil:

@@ -62,6 +62,7 @@ struct lav_solver {
   double *table;               /* Lemke's dictionary, or the matrix of admm and its factor. */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
+  struct factor_linear_linear_t linear;
   int32_t factors, is_broken;
 #endif
 };

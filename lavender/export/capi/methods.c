@@ -247,7 +247,7 @@ static int32_t factor_shifted(lav_solver *s) {
       row[s->a.indices[q]] = s->a.data[q] / (root[i] * root[s->a.indices[q]]);
     row[i] += s->splitting.rho;
   }
-  return !factor_dense_dense_cholesky(LAVENDER_HAS_WIDE(), m, s->table, NULL, s->table + (int64_t)m * m);
+  return factor_linear_linear_factor(&s->linear) == 0;
 }
 
 static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
@@ -280,9 +280,13 @@ static int32_t start_admm(lav_solver *s) {
   memset(x, 0, (size_t)numbers * sizeof(double));
   k_admm_lay(&s->splitting, &s->p, s->options.memory, FIRST_RHO, RELAXATION, x);
   memset(&s->factor, 0, sizeof s->factor);
-  s->factor.kind = accelerate_admm_DENSE;
-  s->factor.n = (int32_t)m;
-  s->factor.dense = s->table + m * m;
+  memset(&s->linear, 0, sizeof s->linear);
+  factor_linear_analyse_dense(&s->linear, (int32_t)m);
+  s->linear.by = factor_linear_CHOLESKY;
+  s->linear.wide = LAVENDER_HAS_WIDE();
+  s->linear.matrix = s->table;
+  s->linear.lower = s->table + m * m;
+  s->factor.linear = &s->linear;
   s->factors = 0;
   s->is_broken = !factor_shifted(s);
   s->swept.step_context = s;

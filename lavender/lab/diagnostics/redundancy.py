@@ -25,7 +25,7 @@ from lavender.base.lazy_import import lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.problem.operators import analyze_panels, has_shifted_cholesky
+from lavender.problem.operators import analyse_symmetric, has_shifted_cholesky
 from lavender.problem.ordering import group_rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
@@ -341,18 +341,18 @@ def _find_dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> In
     Products with random z show in which rows S is not zero; their block of S is factored with pivoting.
     """
     n = a.shape[0]
-    panels, values = analyze_panels(a)
+    system, values = analyse_symmetric(a)
 
     def product(z: FloatArray) -> FloatArray:
         y = a @ z
-        x = panels.solve(y)
-        x += panels.solve(y - a @ x)
+        x = system.solve(y)
+        x += system.solve(y - a @ x)
         out: FloatArray = (y - a @ x)[left]
         return out
 
     for pivot in (*LEFT_OUT_PIVOTS, limit):
-        panels.factor(values, np.ones(n), 0.0, pivot)
-        left = panels.lost_rows()
+        system.factor(values, None, 0.0, pivot)
+        left = system.lost_rows()
         random, new = np.random.default_rng(0), np.zeros(len(left))
         for _ in range(N_PROBE_VECTORS if len(left) else 0):
             z = np.zeros(n)

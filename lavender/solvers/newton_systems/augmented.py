@@ -37,7 +37,7 @@ class Augmented:
         self.deadline: Deadline = NEVER
         self.seconds = 0.0  # Time [s] of the next factor: estimated for the first, then that of the last one.
 
-    def factor(self, _augmented: int, what: int, eps: float) -> bool:
+    def factor(self, what: int, eps: float) -> bool:
         """Factor (1) for the P of the last natural map with eps added to theta, or (2); return whether that succeeded.
 
         Raises
@@ -74,7 +74,7 @@ class Augmented:
         left_factor = s.v if s.bt is None else s.bt if what == SYSTEMS["barrier"] else s.pair
         return self._factor(self._block_matrix(left_factor), right, sp.eye_array(s.m))
 
-    def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
+    def solve(self, r: FloatArray) -> FloatArray:
         """Return dz or x for the right-hand side -F or Q r; NaN if there is no factor."""
         if self.lu is None:
             return np.full_like(r, np.nan)

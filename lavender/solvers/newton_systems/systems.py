@@ -1,24 +1,28 @@
 """H of the scaled problem and its Newton systems, in two forms.
 
 `VelocitySystem` does not form H (K K^T + theta with one small dense block for each body); `MatrixSystem` stores it
-(dense, or sparse panels). The equations and the methods that use them are in `lavender_ext/newton/`.
+(dense, or in compressed rows). The equations and the methods that use them are in `lavender_ext/newton/`.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lavender.base.arrays import IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import sparse as sp
+from lavender.base.lu import splu
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.costs import count_dense_work
 from lavender.solvers.factors import MAX_DENSE_ROWS, USE_WIDE_LANES
 from lavender.solvers.newton_systems.augmented import Augmented
-from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import graph
-from lavender_ext.newton.coupled import scaled_entries
+from lavender_ext.factor.linear import LinearSystem
+from lavender_ext.factor.sparse import is_mirrored
+from lavender_ext.newton.coupled import coupled_entries, coupled_rows, element_graph, scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
 
 MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse one.
@@ -118,10 +122,10 @@ class VelocitySystem(System):
 
 
 class MatrixSystem(System):
-    """H as a matrix: dense, or sparse panels."""
+    """H as a matrix: dense, or in compressed rows."""
 
     form = "impulse"
-    sparse: SparseRows  # Factorisation of a sparse H.
+    sparse: LinearSystem  # System of a sparse H in the pattern of its elements.
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem, Solve(problem.metric, problem.csr_data))
@@ -143,10 +147,36 @@ class MatrixSystem(System):
         else:
             values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
-            solve.over_entries(a.indptr, a.indices, values, self.symmetric)
-            self.sparse = SparseRows(solve, self.h, self.symmetric)
-            solve.set_external(self.sparse)
-            self.work = (1.0 if self.symmetric else 2.0) * self.sparse.panels.work()
+            self._bind_rows()
+            self.work = (1.0 if self.symmetric else 2.0) * self.sparse.cost
+
+    def _bind_rows(self) -> None:
+        """Give the kernel H in compressed rows, and in the pattern of its elements."""
+        solve, h = self.solve, self.h
+        to, other, indptr, indices, entries = h.indptr, h.indices, h.indptr, h.indices, h.data
+        if solve.has_friction or not (is_mirrored(to, other) and h.diagonal().all()):
+            to, other = _find_element_graph(solve, h)
+            indptr, indices = coupled_rows(solve.ptr, to, other)
+            entries = coupled_entries(h.indptr, h.indices, h.data, indptr, indices)
+        row = np.repeat(np.arange(solve.m, dtype=np.int32), np.diff(indptr))
+        diagonal = np.flatnonzero(row == indices).astype(np.int32)
+        self.sparse = LinearSystem((indptr, indices), USE_WIDE_LANES, splu)
+        solve.over_entries(
+            h.indptr, h.indices, h.data, self.sparse, to, other, entries, diagonal, self.symmetric
+        )
+
+
+def _find_element_graph(solve: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:
+    """Return (indptr, indices) of the symmetric graph of the elements that A couples, with all diagonal entries."""
+    n = len(solve.ptr) - 1
+    element = np.repeat(np.arange(n, dtype=np.int32), np.diff(solve.ptr))
+    to, other = element_graph(solve.ptr, element, a.indptr, a.indices)
+    graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))
+    graph.sort_indices()
+    if not (is_mirrored(graph.indptr, graph.indices) and graph.diagonal().all()):
+        graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
+        graph.sort_indices()
+    return graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
 
 
 def make_system(

@@ -6,8 +6,10 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lavender.base.lu import splu
 from lavender_ext.factor.graph import least_degree
-from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
+from lavender_ext.factor.linear import LinearSystem
+from lavender_ext.factor.sparse import free_part, is_mirrored
 
 EPS = np.finfo(float).eps
 
@@ -46,15 +48,18 @@ def test_a_full_factor_solves_and_counts_what_is_lost(n):
     rng = np.random.default_rng(n)
     half, b = rng.normal(size=(n, n)), rng.normal(size=n)
     a = half @ half.T + np.eye(n)
-    wide, narrow = (FullCholesky(a, 1e-13 * a.diagonal(), lanes) for lanes in (True, False))
-    assert wide.lost == narrow.lost == 0
+    wide, narrow = (LinearSystem(n, lanes) for lanes in (True, False))
+    assert wide.factor(a, a.diagonal(), 0.0, 1e-13) == narrow.factor(a, a.diagonal(), 0.0, 1e-13) == 0
+    np.testing.assert_allclose(
+        wide.multiply(b), a @ b, rtol=0, atol=n * EPS * np.abs(a).sum() * np.abs(b).max()
+    )
     np.testing.assert_array_equal(wide.solve(b), narrow.solve(b))
     x = wide.solve(b)
     assert np.linalg.norm(a @ x - b) <= n * EPS * np.linalg.norm(a, 2) * np.linalg.norm(x)
     rank = -(-n // 2)
     a = half[:, :rank] @ half[:, :rank].T
-    found = FullCholesky(a, 1e-13 * a.diagonal())
-    assert found.lost == n - rank
+    found = LinearSystem(n)
+    assert found.factor(a, a.diagonal(), 0.0, 1e-13) == n - rank
     x = found.solve(a @ b)
     pivots = np.linalg.eigvalsh(a)[-rank:]
     most = n * EPS * pivots[-1] / pivots[0]
@@ -76,7 +81,7 @@ def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
     order = least_degree(*raw(met - np.eye(n)))
     assert np.array_equal(np.sort(order), np.arange(n))
     of = np.repeat(np.arange(n), 1 + np.arange(n) % heavy)
-    panels = SparsePanels(*raw(met[of][:, of]), False)
+    panels = LinearSystem(raw(met[of][:, of]))
     assert np.array_equal(np.sort(panels.order), np.arange(len(of)))
 
 
@@ -86,7 +91,7 @@ def test_trees_and_stars_fill_nothing():
         parent = np.array([rng.integers(0, i) if n < 3000 else 0 for i in range(1, n)])  # the last: a star
         a = sp.csr_array((np.ones(n - 1), (parent, np.arange(1, n))), shape=(n, n))
         a = definite(sp.csr_array(a + a.T + sp.eye_array(n)))
-        f = SparsePanels(*raw(a), False)
+        f = LinearSystem(raw(a))
         assert f.factor(a.data, a.diagonal(), 0.0, 1e-13) == 0
         b = rng.normal(size=n)
         np.testing.assert_allclose(a @ f.solve(b), b, atol=1e-9)
@@ -102,7 +107,7 @@ def grid(side):
 def test_a_grid_fills_less_than_its_band():
     side = 40
     a = definite(sp.csr_array(grid(side) + sp.eye_array(side**2)))
-    assert SparsePanels(*raw(a), False).work < 0.3 * 0.5 * side**4
+    assert LinearSystem(raw(a)).cost < 0.3 * 0.5 * side**4
 
 
 def factor_of(matrix, order):
@@ -146,14 +151,16 @@ def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
     d, b = a.diagonal(), rng.normal(size=n)
     found = []
     for wide in (True, False):
-        f = SparsePanels(*raw(a), lu, wide)
+        f = LinearSystem(raw(a), wide)
         assert np.array_equal(np.sort(f.order), np.arange(n))
-        assert f.factor(a.data, abs(d), 0.0, 1e-13) == 0
+        assert f.factor(a.data, abs(d), 0.0, 1e-13, lu) == 0
         found.append(f.solve(b))
     assert found[0].tobytes() == found[1].tobytes()
-    again = SparsePanels(*raw(a), lu, True, SparsePanels(*raw(a), not lu))
-    assert again.work == f.work and again.factor(a.data, abs(d), 0.0, 1e-13) == 0
-    assert again.solve(b).tobytes() == found[0].tobytes()
+    f.factor(a.data, abs(d), 0.0, 1e-13, not lu)  # one analysis serves both factorisations
+    assert f.factor(a.data, abs(d), 0.0, 1e-13, lu) == 0
+    assert f.solve(b).tobytes() == found[0].tobytes()
+    product = abs(a) @ abs(b)
+    assert (np.abs(f.multiply(b) - a @ b) <= n * EPS * product).all()
     s = 1.0 / np.sqrt(abs(d))
     error = s * (a @ found[0] - b)
     assert np.abs(error).max() <= 1e-9 * np.abs(s * b).max()
@@ -168,7 +175,7 @@ def test_shifts_parts_and_lost_pivots():
     a = sp.csr_array(sp.diags_array(a.sum(axis=1)) - a)
     a.sort_indices()
     d = a.diagonal()
-    f = SparsePanels(*raw(a), False)
+    f = LinearSystem(raw(a))
     assert f.factor(a.data, d, 0.0, 1e-12) == 5
     assert f.factor(a.data, d, 1e-3, 1e-12) == 0
     b = rng.normal(size=n)
@@ -177,16 +184,38 @@ def test_shifts_parts_and_lost_pivots():
     place = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
     ptr, ind, val = free_part(*raw(a), a.data, place, int(free.sum()))
     np.testing.assert_array_equal(sp.csr_array((val, ind, ptr)).toarray(), a.toarray()[np.ix_(free, free)])
-    lost = SparsePanels(*raw(a), True).factor(np.full(a.nnz, np.nan), d, 0.0, 1e-13)
+    lost = LinearSystem(raw(a)).factor(np.full(a.nnz, np.nan), d, 0.0, 1e-13, True)
     assert lost > 0
     with pytest.raises(ValueError, match="entries of another matrix"):
         f.factor(a.data[1:], d, 0.0, 0.0)
     with pytest.raises(ValueError, match="of another size"):
         f.solve(b[1:])
     with pytest.raises(ValueError, match="before a factor"):
-        SparsePanels(*raw(a), False).solve(b)
-    with pytest.raises(ValueError, match="of another matrix"):
-        SparsePanels(np.zeros(2, np.int32), np.zeros(0, np.int32), False, True, f)
+        LinearSystem(raw(a)).solve(b)
+    with pytest.raises(ValueError, match="a metric of another matrix"):
+        f.factor(a.data, d[1:])
+
+
+@pytest.mark.parametrize(("diagonal", "loses_pivots"), [(1e-9, False), (1e-12, False), (1e-20, True)])
+def test_superlu_replaces_a_factor_without_pivots_or_digits(diagonal, loses_pivots):
+    """Pivots of a chain of small diagonal are its neighbours', in other supernodes: 1e-9 is refined, 1e-20 is lost."""
+    n = 200
+    chain = [np.full(n - 1, 1.0), np.full(n, diagonal), np.full(n - 1, -1.0)]
+    a = sp.csr_array(sp.diags_array(chain, offsets=[-1, 0, 1]))
+    a.sort_indices()
+    r = np.random.default_rng(0).normal(size=n)
+    alone, system = LinearSystem(raw(a)), LinearSystem(raw(a), True, splu)
+    assert (alone.factor(a.data, tiny=1e-13, lu=True) > 0) == loses_pivots
+    assert system.factor(a.data, tiny=1e-13, lu=True) == 0 and system.uses_fallback == loses_pivots
+    x = system.solve(r, True)
+    assert np.abs(a @ x - r).max() <= 1e-11 * np.abs(x).max()
+    assert system.uses_fallback == (alone.solve(r, True) is None)
+    with pytest.raises(KeyboardInterrupt):
+        LinearSystem(raw(a), True, interrupt).factor(np.full(a.nnz, -1.0))
+
+
+def interrupt(_):
+    raise KeyboardInterrupt
 
 
 def test_what_is_no_mirror_is_seen():

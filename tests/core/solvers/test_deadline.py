@@ -18,14 +18,16 @@ from lavender import registry
 from lavender.base.lazy_import import import_numerics
 from lavender.problem.derived import once
 from lavender.problem.operators import Operators
-from lavender.solvers import factors
+from lavender.solvers import admm
 from lavender.solvers.costs import (
     estimate_disk_cost,
     estimate_formation_cost,
     estimate_judge_setup_cost,
     estimate_result_cost,
 )
+from lavender.solvers.newton_systems import systems
 from lavender.solvers.small import AUTO
+from lavender_ext.factor.linear import LinearSystem
 
 
 def test_set_up_is_inside(clock, monkeypatch):
@@ -77,20 +79,25 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
 def panels(clock, monkeypatch):
     """Sparse factors whose parts take what is counted, by a clock that is played; what was done, in turn."""
     import_numerics()  # of SciPy, which is counted, too
-    done, made = SimpleNamespace(names=[], entry=9e-8, first=0.0, flop=0.0), factors.SparsePanels
+    done, made = SimpleNamespace(names=[], entry=9e-8, first=0.0, flop=0.0), LinearSystem
 
     class Played(made):
-        def __init__(self, indptr, indices, *more):
-            clock.now += done.entry * len(indices)
-            done.names.append("analysed")
-            super().__init__(indptr, indices, *more)
+        analysed = False
+
+        def analyse(self):
+            if not self.analysed:
+                clock.now += done.entry * len(self.indices)
+                done.names.append("analysed")
+                self.analysed = True
+            super().analyse()
 
         def factor(self, *of):
-            clock.now += done.first + done.flop * self.work
+            clock.now += done.first + done.flop * self.cost
             done.names.append("factored")
             return super().factor(*of)
 
-    monkeypatch.setattr(factors, "SparsePanels", Played)
+    for module in (admm, systems):
+        monkeypatch.setattr(module, "LinearSystem", Played)
     return done
 
 

@@ -18,7 +18,7 @@ import lavender as lv
 from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton, NewtonState
-from lavender.solvers.newton_systems import sparse, systems
+from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import find_bodies, make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.newton.solve import PHASES, Layout, Solve
@@ -313,46 +313,39 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     r = rng.normal(size=200)
     system.solve.p[:] = free
     assert system.solve.factor("natural", eps)
-    assert system.sparse.superlu_solve is None, "panels serve"
+    assert not system.sparse.uses_fallback
     expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
     np.testing.assert_allclose(
         system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
     )
 
 
-def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
-    problem = sparse_rows(2)
+class NoPivot(systems.LinearSystem):
+    """A system whose own factorisation loses every pivot."""
+
+    def lend(self, data, _tiny):
+        super().lend(data, 1e300)
+
+
+def test_superlu_factors_if_pivots_are_lost(monkeypatch):
+    problem, used = sparse_rows(2), []
     expected = lv.solve(problem, "newton", tol=1e-10)
     assert expected.success
-    for name, worse in (("factor_panels", lambda *_: False), ("solve_panels", lambda *_: None)):
-        with monkeypatch.context() as patch:
-            patch.setattr(sparse.SparseRows, name, worse)
-            solution = lv.solve(problem, "newton", tol=1e-10)
-        assert solution.success
-        np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
+    splu = systems.splu
+    monkeypatch.setattr(systems, "LinearSystem", NoPivot)
+    monkeypatch.setattr(systems, "splu", lambda system: used.append(system.n) or splu(system))
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    assert solution.success and used
+    np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
 
 
-def test_ctrl_c_within_the_first_factor_is_told_and_no_other_error(monkeypatch):
-    def stopped(_):
+def test_ctrl_c_within_the_fallback_is_reported_and_no_other_error(monkeypatch):
+    def stop(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sparse.SparseRows, "factor_panels", stopped)
+    monkeypatch.setattr(systems, "LinearSystem", NoPivot)
+    monkeypatch.setattr(systems, "splu", stop)
     assert lv.solve(sparse_rows(2), "newton", tol=1e-10).status is lv.Status.INTERRUPTED
-
-
-def test_pivots_inside_panels_are_refined_or_given_up():
-    """[[e, 1], [1, e]] of two panels has no stable LU without an exchange between them."""
-    problem = sparse_rows(3, even=False)
-    system = system_in(problem, "sparse")
-    system.solve.v[:] = np.inf
-    made = system.sparse
-    assert system.solve.factor("barrier") and made.lu
-    r = np.random.default_rng(0).normal(size=500)
-    x = made.solve_panels(r)
-    np.testing.assert_allclose(dense_h(problem) @ x, r, rtol=0, atol=1e-11)
-    made.rows.data[made.diagonal] = 1e-12
-    x = made.solve_panels(r) if made.factor_panels() else None
-    assert x is None or np.abs(made.rows @ x - r).max() <= 1e-10 * np.abs(r).max()
 
 
 @pytest.mark.parametrize("form", FORMS)

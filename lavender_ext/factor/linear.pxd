@@ -1,0 +1,115 @@
+"""One linear system A x = r, for every method that factors a matrix.
+
+    kind     matrix                                       factor                                              source
+    DENSE    full, row by row                             L L^T, or L U with row exchanges                    dense.pxd
+    BAND     lower diagonals of a symmetric matrix        L D L^T, with the number of negative pivots         band.pxd
+    ROWS     compressed rows of a symmetric pattern       L L^T, or L U with exchanges within supernodes      sparse.pxd
+    BLOCKS   square blocks of a symmetric pattern         the same                                            blocks.pxd
+    TREE     rows of kinematic trees                      L^T D L                                             core/tree.pxd
+
+    analyse     `analyse_dense`, ... set kind, order, pattern and cost; of ROWS and BLOCKS `LinearSystem` and `analyse_blocks`
+    factor      `linear_factor` factors A + shift D and returns the number of lost pivots                           (1)
+    solve       `linear_solve`; `linear_solve_checked` refines, and uses the fallback if (3) fails
+    multiply    `linear_multiply`                                                                                    (2)
+    cost        multiply-adds of a factorisation, known after the analysis; L U takes twice those of L L^T
+    sign        `linear_sign`, of det A
+
+D = diag(d), or the identity if d is NULL. A pivot is lost if it does not exceed tiny d. L U of DENSE and ROWS is that of
+D^-1/2 A D^-1/2. Exchanges within supernodes may lose digits that exchanges between all rows keep. A solution must satisfy
+
+    max |r - A x| <= BACKWARD_TOLERANCE (max |A_ij| max |x| + max |r|)                                              (3)
+
+The fallback is a factorisation by the caller: SuperLU of SciPy (`lavender/base/lu.py`), the only one.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.factor.band cimport pivots_t
+from lavender_ext.factor.blocks cimport block_matrix_t
+from lavender_ext.factor.sparse cimport sparse_t
+
+
+cdef enum:                      # kinds
+    DENSE = 0
+    BAND = 1
+    ROWS = 2
+    BLOCKS = 3
+    TREE = 4
+
+cdef enum:                      # factorisations
+    NO_FACTOR = 0
+    CHOLESKY = 1                # L L^T, L D L^T or L^T D L
+    LU = 2
+    CHOLESKY_OR_LU = 3          # of DENSE: L U if L L^T loses a pivot
+    FALLBACK = 4
+
+
+cdef struct fallback_t:         # factorisation by the caller
+    void* at
+    int32_t (*factor)(void* at) noexcept nogil              # factor the matrix; return whether that succeeded
+    void (*solve)(void* at, double* x) noexcept nogil       # in place
+
+
+cdef struct linear_t:
+    int32_t kind
+    int32_t n
+    int32_t by                  # the next factorisation: CHOLESKY, LU or CHOLESKY_OR_LU
+    int32_t wide                # four lanes are one instruction
+    double cost                 # multiply-adds of L L^T, L D L^T or L^T D L
+    const double* d             # (n) metric, or NULL
+    double shift
+    double tiny                 # A pivot of at most tiny d is lost.
+    # the last factorisation
+    int32_t factored            # CHOLESKY, LU, FALLBACK or NO_FACTOR
+    pivots_t pivots             # `small` are the lost ones
+    # DENSE, BAND, TREE
+    double* matrix              # (n, n), L U overwrites it; (n, width), overwritten; entries left of the diagonal, overwritten
+    double* lower               # DENSE: (`cholesky_workspace_size`) L L^T
+    double* scale               # (n) DENSE with d: D^-1/2 or smallest pivots; may be d itself. TREE: 1 / D
+    int32_t* swap               # (n) DENSE: row exchanges of L U
+    int32_t width               # BAND
+    double* ahead               # BAND: a right-hand side that the factorisation solves with L, for one solve; or NULL
+    double* diagonal            # (n) TREE: diagonal of A, then D
+    const int32_t* lptr         # (n + 1) TREE: rows of L
+    const int32_t* lidx
+    # ROWS, BLOCKS
+    sparse_t rows
+    block_matrix_t blocks
+    double largest              # max |A_ij| of the last L U of ROWS
+    const fallback_t* fallback  # or NULL
+
+
+cdef inline double backward_tolerance() noexcept nogil:
+    """Return the largest accepted backward error (3): thousands of roundings."""
+    return 1e-12
+
+
+cdef inline void analyse_dense(linear_t* f, int32_t n) noexcept nogil:
+    """Set the order of a full matrix."""
+    f.kind, f.n, f.cost = DENSE, n, <double>n * n * n / 6.0
+
+
+cdef inline void analyse_band(linear_t* f, int32_t n, int32_t width) noexcept nogil:
+    """Set the order of a symmetric matrix with `width` diagonals at and below the main one."""
+    f.kind, f.n, f.width, f.cost = BAND, n, width, 0.5 * n * width * width
+
+
+cdef int32_t linear_factor(linear_t* f) noexcept nogil
+cdef void linear_solve(linear_t* f, double* x) noexcept nogil
+cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil
+cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil
+cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcept nogil
+cdef int32_t linear_sign(const linear_t* f) noexcept nogil
+
+
+cdef class LinearSystem:
+    cdef linear_t f
+    cdef fallback_t calls
+    cdef readonly object indptr, indices                # pattern of ROWS
+    cdef readonly object data                           # (nnz) entries of the last factor of ROWS
+    cdef object analysis, numbers, upper, splu, other, error, held
+    cdef readonly int64_t entries                       # number of values of L
+
+    cpdef analyse(self)
+    cpdef lend(self, data, double tiny)
+    cdef int bind(self, bint lu) except -1
+    cdef int raise_error(self) except -1

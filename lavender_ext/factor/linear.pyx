@@ -1,0 +1,467 @@
+"""One linear system: the functions of `linear.pxd`, compiled once, and `LinearSystem`, which gives Python the same system."""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.factor.symbolic import analyse as analyse_pattern
+
+from lavender_ext.core.dot cimport dot
+from lavender_ext.core.tree cimport eliminate_rows
+from lavender_ext.core.tree cimport ldl_solve as tree_solve
+from lavender_ext.core.validate cimport norm_inf
+from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve, no_pivots
+from lavender_ext.factor.blocks cimport factor_blocks
+from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
+                                        dense_lu_sign, dense_lu_solve, dense_lu_solve_transposed)
+from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, analyse_dense,
+                                         backward_tolerance, fallback_t, linear_t)
+from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
+from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
+                                             supernodal_scratch_size, supernodal_t)
+from lavender_ext.factor.tiles cimport has_wide
+
+
+#: Largest accepted backward error (3) of `linear.pxd`.
+BACKWARD_TOLERANCE = backward_tolerance()
+
+
+cdef enum:
+    MAX_REFINEMENTS = 1         # Refinements of a solution with L U of ROWS before the fallback.
+
+
+# -- factor ------------------------------------------------------------------------------------------------------
+
+
+cdef inline void shift_dense(const linear_t* f) noexcept nogil:
+    """Add shift D to the diagonal."""
+    cdef int32_t i
+    if f.shift != 0.0:
+        for i in range(f.n):
+            f.matrix[i * (<int64_t>f.n + 1)] += f.shift * (f.d[i] if f.d != NULL else 1.0)
+
+
+cdef inline void scale_dense(const linear_t* f) noexcept nogil:
+    """Replace A by D^-1/2 A D^-1/2 + shift."""
+    cdef int32_t i, j
+    cdef double* row = f.matrix
+    for i in range(f.n):
+        f.scale[i] = 1.0 / sqrt(f.d[i])
+    for i in range(f.n):
+        for j in range(f.n):
+            if row[j] != 0.0:
+                row[j] = f.scale[i] * row[j] * f.scale[j]
+        row[i] += f.shift
+        row += f.n
+
+
+cdef inline void factor_dense(linear_t* f) noexcept nogil:
+    """Factor a full matrix: L L^T unless LU alone is allowed, L U if that is not allowed or loses a pivot."""
+    cdef int32_t i
+    cdef const double* min_pivot = NULL
+    if f.by & CHOLESKY:
+        shift_dense(f)
+        if f.d != NULL:
+            for i in range(f.n):
+                f.scale[i] = f.tiny * f.d[i]
+            min_pivot = f.scale
+        f.pivots.small = dense_cholesky(f.wide, f.n, f.matrix, min_pivot, f.lower)
+        f.factored = CHOLESKY if f.pivots.small == 0 or min_pivot != NULL else NO_FACTOR
+        if f.pivots.small == 0 or not f.by & LU:
+            return
+    elif f.d != NULL:
+        scale_dense(f)
+    else:
+        shift_dense(f)
+    f.pivots.small = dense_lu(f.wide, f.n, f.matrix, f.swap, f.tiny)
+    f.factored = LU if f.pivots.small == 0 else NO_FACTOR
+
+
+cdef inline void factor_band(linear_t* f) noexcept nogil:
+    """Factor a band, and begin the solve of `ahead`."""
+    cdef int32_t i
+    if f.shift != 0.0:
+        for i in range(f.n):
+            f.matrix[<int64_t>i * f.width] += f.shift * f.d[i]
+    ldl_factor(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots)
+    f.factored = CHOLESKY
+
+
+cdef inline void factor_rows(linear_t* f) noexcept nogil:
+    """Factor compressed rows; use the fallback if a pivot is lost."""
+    cdef int32_t i, negative = 0
+    cdef bint lu = f.by == LU
+    f.factored = LU if lu else CHOLESKY
+    f.largest = norm_inf(f.rows.data, f.rows.indptr[f.n]) if lu else 0.0
+    for i in range(f.n if f.d != NULL else 0):
+        negative += not f.d[i] > 0.0
+    f.pivots.small = negative if negative else factor_sparse(&f.rows, lu, f.d, f.shift, f.tiny)
+    if f.pivots.small and f.fallback != NULL:
+        use_fallback(f)
+
+
+cdef inline void use_fallback(linear_t* f) noexcept nogil:
+    """Factor by the fallback, if there is one."""
+    f.factored = NO_FACTOR
+    if f.fallback != NULL and f.fallback.factor(f.fallback.at):
+        f.factored, f.pivots.small = FALLBACK, 0
+
+
+cdef int32_t linear_factor(linear_t* f) noexcept nogil:
+    """Factor A + shift D; return the number of lost pivots. BAND also counts negative ones in `pivots`."""
+    cdef int32_t lost
+    no_pivots(&f.pivots)
+    if f.kind == DENSE:
+        factor_dense(f)
+    elif f.kind == BAND:
+        factor_band(f)
+    elif f.kind == ROWS:
+        factor_rows(f)
+    elif f.kind == BLOCKS:
+        f.factored = f.by
+        f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
+    else:
+        f.factored = CHOLESKY
+        lost = eliminate_rows(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
+        f.pivots.small, f.pivots.first_small = lost >= 0, lost
+    return f.pivots.small
+
+
+# -- solve, multiply, sign -----------------------------------------------------------------------------------------
+
+
+cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
+    """Overwrite x (n) with the solution for it by the last factor; infinite if there is none."""
+    cdef int32_t j
+    if f.factored == FALLBACK:
+        f.fallback.solve(f.fallback.at, x)
+    elif f.factored == NO_FACTOR:
+        for j in range(f.n):
+            x[j] = 1.0 / 0.0
+    elif f.kind == BAND and x == f.ahead:
+        f.ahead = NULL
+        ldl_back_all(f.n, f.width, f.matrix, x)
+    elif f.kind == BAND:
+        ldl_solve(f.n, f.width, f.matrix, x)
+    elif f.kind == ROWS:
+        solve_sparse(&f.rows, f.factored == LU, x)
+    elif f.kind == BLOCKS:
+        solve_supernodes(&f.blocks.factor, x, f.factored == LU)
+    elif f.kind == TREE:
+        tree_solve(f.n, f.lptr, f.lidx, f.matrix, f.scale, x)
+    elif f.factored == CHOLESKY:
+        dense_cholesky_solve(f.n, f.lower, x)
+    elif f.d == NULL:
+        dense_lu_solve(f.n, f.matrix, f.swap, x)
+    else:
+        for j in range(f.n):
+            x[j] *= f.scale[j]
+        dense_lu_solve(f.n, f.matrix, f.swap, x)
+        for j in range(f.n):
+            x[j] *= f.scale[j]
+
+
+cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil:
+    """Overwrite x (n) with A^-T x, after L U of a full matrix without d."""
+    dense_lu_solve_transposed(f.n, f.matrix, f.swap, x)
+
+
+cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcept nogil:
+    """Compute y = A x, without the shift; of ROWS, and of DENSE unless L U has overwritten it."""
+    cdef int32_t i, q
+    cdef double s
+    for i in range(f.n):
+        s = 0.0
+        if f.kind == DENSE:
+            s = dot(f.matrix + <int64_t>i * f.n, x, f.n)
+        else:
+            for q in range(f.rows.indptr[i], f.rows.indptr[i + 1]):
+                s += f.rows.data[q] * x[f.rows.indices[q]]
+        y[i] = s
+
+
+cdef inline bint has_backward_error(const linear_t* f, const double* r, const double* x, double* error) noexcept nogil:
+    """Compute error = r - A x; return whether it exceeds (3)."""
+    cdef int32_t i
+    linear_multiply(f, x, error)
+    for i in range(f.n):
+        error[i] = r[i] - error[i]
+        if f.shift != 0.0:
+            error[i] -= f.shift * x[i]
+    return not norm_inf(error, f.n) <= backward_tolerance() * ((f.largest + f.shift) * norm_inf(x, f.n) + norm_inf(r, f.n))
+
+
+cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil:
+    """Solve A x = r; refine L U of ROWS until (3) holds, by the fallback if it does not; return whether it holds.
+
+    scratch has n doubles; x must not be r.
+    """
+    cdef int32_t i, k
+    for i in range(f.n):
+        x[i] = r[i]
+    linear_solve(f, x)
+    if f.kind != ROWS or f.factored != LU:
+        return f.factored != NO_FACTOR
+    for k in range(MAX_REFINEMENTS + 1):
+        if not has_backward_error(f, r, x, scratch):
+            return True
+        if k < MAX_REFINEMENTS:
+            linear_solve(f, scratch)
+            for i in range(f.n):
+                x[i] += scratch[i]
+    use_fallback(f)
+    for i in range(f.n):
+        x[i] = r[i]
+    linear_solve(f, x)
+    return f.factored != NO_FACTOR
+
+
+cdef int32_t linear_sign(const linear_t* f) noexcept nogil:
+    """Return the sign of det A after a factorisation; 0 if it is not known."""
+    if f.factored == CHOLESKY:
+        return 1
+    if f.factored != LU:
+        return 0
+    if f.kind == DENSE:
+        return dense_lu_sign(f.n, f.matrix, f.swap)
+    return supernodal_lu_sign(&f.blocks.factor if f.kind == BLOCKS else &f.rows.factor)
+
+
+# -- for Python --------------------------------------------------------------------------------------------------
+
+
+cdef int32_t call_fallback(void* at) noexcept with gil:
+    cdef LinearSystem system = <LinearSystem>at
+    if system.error is not None:                        # The caller is about to raise it.
+        return 0
+    try:
+        system.other = system.splu(system)
+        return 1
+    except RuntimeError:                                # The matrix is singular.
+        return 0
+    except BaseException as error:
+        system.error = error
+        return 0
+
+
+cdef void solve_by_fallback(void* at, double* x) noexcept with gil:
+    cdef LinearSystem system = <LinearSystem>at
+    cdef double[::1] view = <double[:system.f.n]>x
+    cdef const double[::1] solution
+    try:
+        solution = system.other.solve(np.array(view))
+        view[:] = solution
+    except BaseException as error:
+        system.error = system.error or error
+        view[:] = np.nan
+
+
+cdef class LinearSystem:
+    """A linear system: a full matrix, or one in canonical compressed rows of a symmetric pattern.
+
+    Parameters
+    ----------
+    pattern : int or tuple
+        Order of a full matrix, n > 0; or (indptr (n + 1,), indices (nnz,)), int32.
+    wide : bool
+        Use four lanes if the processor has them; the bits are the same.
+    splu : callable, optional
+        Factor this system's matrix another way: called with the system if pivots are lost in compressed rows; it returns an
+        object with `solve(r)`, or raises RuntimeError if the matrix is singular.
+    """
+
+    def __init__(self, pattern, bint wide=True, splu=None):
+        self.f.wide, self.splu = wide and has_wide(), splu
+        if isinstance(pattern, int):
+            analyse_dense(&self.f, pattern)
+        else:
+            self.indptr, self.indices = pattern
+            self.f.kind, self.f.n = ROWS, <int32_t>len(self.indptr) - 1
+        if self.f.n < 1:
+            raise ValueError("a matrix of one row or more")
+        if splu is not None:
+            self.calls = fallback_t(<void*>self, call_fallback, solve_by_fallback)
+            self.f.fallback = &self.calls
+
+    cpdef analyse(self):
+        """Compute order, pattern and cost of the factor from the pattern alone; done at the first use."""
+        cdef int32_t n = self.f.n, k
+        cdef int32_t[::1] integers
+        cdef const int32_t[::1] index
+        cdef int64_t[::1] offsets
+        cdef supernodal_t* f = &self.f.rows.factor
+        cdef int32_t* p
+        if self.f.kind == DENSE or self.analysis is not None:
+            return
+        self.analysis = analyse_pattern(self.indptr, self.indices)
+        integers, offsets, self.f.cost = self.analysis
+        k = <int32_t>(offsets.shape[0] // 2 - 1)
+        p = &integers[0]                                # The layout is that of `symbolic.analyse`.
+        f.order, f.position, f.supernode_of, f.swap, f.local_row = p, p + n, p + 2 * n, p + 3 * n, p + 4 * n
+        f.first, f.row_ptr = p + 5 * n, p + 5 * n + k + 1
+        f.head = p + 5 * n + 2 * (k + 1)
+        f.link, f.next_row, f.row_indices = f.head + k, f.head + 2 * k, f.head + 3 * k
+        f.value_offset, f.upper_offset = &offsets[0], &offsets[0] + k + 1
+        f.n, f.supernodes, f.wide = n, k, self.f.wide
+        self.entries = f.value_offset[k]
+        index = self.indptr
+        self.f.rows.indptr = &index[0]
+        index = self.indices
+        self.f.rows.indices = &index[0] if index.shape[0] else NULL
+
+    cdef int bind(self, bint lu) except -1:
+        """Allocate what the next factorisation needs in addition to the last ones."""
+        cdef int32_t n = self.f.n
+        cdef int64_t size
+        cdef double[::1] x
+        cdef int32_t[::1] index
+        cdef supernodal_t* f = &self.f.rows.factor
+        if self.f.kind == DENSE:
+            if self.numbers is None:
+                x = self.numbers = np.empty(n)
+                self.f.scale = &x[0]
+            if not lu and self.f.lower == NULL:
+                self.held = x = np.empty(cholesky_workspace_size(n))
+                self.f.lower = &x[0]
+            if lu and self.f.swap == NULL:
+                self.upper = index = np.empty(n, np.int32)
+                self.f.swap = &index[0]
+            return 0
+        self.analyse()
+        if self.numbers is None:
+            x = self.numbers = np.empty(self.entries + 2 * n + 1)
+            f.values = &x[0]
+            self.f.rows.scale, self.f.rows.y = &x[self.entries], &x[self.entries + n]
+            x = self.held = np.empty(supernodal_scratch_size(f, True) + 1)
+            f.scratch = &x[0]
+        if lu and self.upper is None:
+            size = f.upper_offset[f.supernodes]
+            values, columns = np.empty(size + len(self.indices) + 1), np.empty(n + 2 + len(self.indices), np.int32)
+            self.upper = values, columns
+            x, index = values, columns
+            f.upper, self.f.rows.tdata = &x[0], &x[size]
+            self.f.rows.tptr, self.f.rows.tind = &index[0], &index[0] + n + 2
+        return 0
+
+    cdef int raise_error(self) except -1:
+        """Raise the error of the fallback, if any."""
+        error, self.error = self.error, None
+        if error is not None:
+            raise error
+        return 0
+
+    cpdef lend(self, data, double tiny):
+        """Let a kernel form the entries of compressed rows in `data` (nnz,) and factor them, by L L^T or L U."""
+        cdef double[::1] x = data
+        self.bind(True)
+        self.data = data
+        self.f.rows.data, self.f.tiny, self.f.shift = &x[0], tiny, 0.0
+
+    @property
+    def n(self):
+        """Number of rows."""
+        return self.f.n
+
+    @property
+    def cost(self):
+        """Multiply-adds of a factorisation L L^T, from the pattern; L U takes twice as many. inf if it cannot be stored."""
+        try:
+            self.analyse()
+        except OverflowError:
+            return np.inf
+        return self.f.cost
+
+    def factor(self, data, d=None, double shift=0.0, double tiny=0.0, bint lu=False):
+        """Factor A + shift D, L U or L L^T; return how many pivots do not exceed tiny d.
+
+        Parameters
+        ----------
+        data : (nnz,) or (n, n) float64
+            Entries of A. L L^T reads those at and after the diagonal in the order of elimination, or of each row of a full
+            matrix, whose diagonal receives the shift; L U overwrites a full matrix.
+        d : (n,) float64, optional
+            D > 0; default 1.
+        """
+        cdef const double[::1] metric
+        cdef const double[::1] x = data.reshape(-1)         # a view
+        cdef int32_t lost, n = self.f.n
+        self.bind(lu)
+        if x.shape[0] != (<int64_t>n * n if self.f.kind == DENSE else len(self.indices)):
+            raise ValueError("entries of another matrix")
+        self.data, self.other = data, None
+        if x.shape[0] == 0:
+            return n
+        self.f.d = NULL
+        if d is not None:
+            metric = np.ascontiguousarray(d)
+            if metric.shape[0] != n:
+                raise ValueError("a metric of another matrix")
+            self.f.d = &metric[0]
+        self.f.rows.data = self.f.matrix = <double*>&x[0]
+        self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
+        with nogil:
+            lost = linear_factor(&self.f)
+        self.raise_error()
+        return lost
+
+    def solve(self, const double[::1] r, bint checked=False):
+        """Solve with the last factor; return a new array (n,).
+
+        With `checked`, L U of compressed rows is refined, and replaced by the fallback if its backward error stays above (3) of
+        `linear.pxd`; without a solution that satisfies it, the result is None.
+        """
+        cdef int32_t n = self.f.n
+        out = np.array(r)
+        cdef double[::1] x = out, scratch
+        cdef bint is_good = True
+        if x.shape[0] != n or self.numbers is None:
+            raise ValueError("of another size, or before a factor")
+        if checked:
+            scratch = np.empty(n)
+            with nogil:
+                is_good = linear_solve_checked(&self.f, &r[0], &x[0], &scratch[0])
+        else:
+            with nogil:
+                linear_solve(&self.f, &x[0])
+        self.raise_error()
+        return out if is_good else None
+
+    def multiply(self, const double[::1] x):
+        """Return A x (n,) with the entries of the last factor; not after L U of a full matrix."""
+        out = np.empty(self.f.n)
+        cdef double[::1] y = out
+        if x.shape[0] != self.f.n or self.data is None:
+            raise ValueError("of another size, or before a factor")
+        linear_multiply(&self.f, &x[0], &y[0])
+        return out
+
+    @property
+    def sign(self):
+        """Sign of det A, 0 if the fallback has factored it or no factor exists."""
+        return linear_sign(&self.f)
+
+    @property
+    def uses_fallback(self):
+        """Whether the last factor is that of the fallback."""
+        return self.f.factored == FALLBACK
+
+    @property
+    def order(self):
+        """(n,) row eliminated first, second, ... of compressed rows."""
+        self.analyse()
+        return self.analysis[0][:self.f.n]
+
+    def lost_rows(self):
+        """Return the rows of compressed rows whose pivots the last L L^T rejected, ascending; their columns of L are 0."""
+        cdef const supernodal_t* f = &self.f.rows.factor
+        cdef int32_t i, k
+        cdef int64_t ld
+        if self.numbers is None:
+            raise ValueError("before a factor")
+        rows = []
+        for i in range(f.supernodes):
+            ld = panel_width(f, i) + rows_below(f, i)
+            for k in range(panel_width(f, i)):
+                if f.values[f.value_offset[i] + k * (ld + 1)] == 0.0:
+                    rows.append(f.order[f.first[i] + k])
+        return np.sort(np.array(rows, np.intp))
