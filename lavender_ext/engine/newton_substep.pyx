@@ -2,8 +2,8 @@
 
 Native builds run its first phase only, WebAssembly all of it. After `prepare` and `solve` without sweeps:
 
-    index_workspace_size    number of integers that `plan` needs
-    plan                    bands, elements, elimination order; number of doubles that `substep` needs
+    index_workspace_size    number of integers with which `plan` begins
+    plan                    bands, elements, elimination order; integers and doubles that the factor needs
     substep                 the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the
                             judge decides when to stop
 
@@ -25,68 +25,76 @@ from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport find_reference, score_slack
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.solve cimport bodies_start, max_bodies_index_size, system_step
+from lavender_ext.newton.solve cimport bodies_start, bodies_workspace_size, system_step
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, band_width,
                                              bind_warm_workspace, judge_impulse, measure_as_engine, warm_solve,
                                              warm_t, warm_workspace_size, zero_impulse_errors)
 
 
 cdef enum:
-    SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's integers
+    SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's, [2] needed
+    SCRATCH_TOO_SMALL = -2      # result of `plan`
     INDEX_LIMIT = 2147483647
-    MAX_SUBSTEP_BODIES = 1500   # The integer scratch is allocated before the analysis, as if the factor were full: 27 MB here.
     MAX_SUBSTEP_FACTORISATIONS = 200    # of a substep, since a frame waits for them
 
 
-cdef inline workspace_t method_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the workspace of Newton's method, with n_index = 0 if it does not accept the problem, or above MAX_SUBSTEP_BODIES."""
-    cdef view_t v = view_t(p[0], NULL, r, NULL)
-    return workspace_t(max_bodies_index_size(&v) if r.n_bodies <= MAX_SUBSTEP_BODIES else 0, 0, NULL, NULL, 0, 0, 0, 0.0)
+cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:
+    """Return the number of scratch integers in addition to those of Newton's method."""
+    return SCRATCH_HEADER + v.r.n_bodies + 2 * <int64_t>v.r.n_joints + 1 + islands_index(v)
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                           int32_t all_stages) noexcept nogil:
-    """Return the number of scratch integers for the prepared substep, -1 if too many; all_stages = 0: first phase only."""
+    """Return the number of scratch integers with which `lav_newton_plan` begins, -1 if too many; all_stages = 0: first phase."""
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t workspace
-    cdef blocks_t p
-    cdef rows_t r
-    cdef view_t v
-    bind(size, real, index, keys, &e, used)
-    view(&e, &p, &r)
-    v = view_t(p, NULL, &r, NULL)
-    workspace = SCRATCH_HEADER + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
-    if all_stages:
-        workspace += method_workspace_size(&p, &r).n_index
-    return <int32_t>workspace if workspace < INDEX_LIMIT else -1
-
-
-cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
-                                    int32_t* scratch) noexcept nogil:
-    """Fill scratch (8-byte aligned); return the number of doubles that the solve needs, -1 if too many for int32."""
-    cdef engine_t e
-    cdef int64_t used[3]
-    cdef int64_t workspace
+    cdef int64_t needed
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
     cdef workspace_t n
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    n = method_workspace_size(&p, &r)
-    scratch[1] = <int32_t>n.n_index if all_stages else 0
-    scratch[0] = band_width(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
-    workspace = warm_workspace_size(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
-    if scratch[1] > 0:
-        v = view_t(p, NULL, &r, NULL)
-        n.index = scratch + SCRATCH_HEADER
+    v = view_t(p, NULL, &r, NULL)
+    needed = own_index_size(&v)
+    if all_stages and bodies_workspace_size(&v, NULL, &n):
+        needed += n.n_index
+    return <int32_t>needed if needed < INDEX_LIMIT else -1
+
+
+cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
+                                    int32_t available, int32_t* scratch) noexcept nogil:
+    """Fill scratch (8-byte aligned); return the number of doubles that the solve needs, -1 if too many for int32.
+
+    `available` is the number of integers of scratch. If the factor needs more, the result is SCRATCH_TOO_SMALL: the host allocates
+    scratch[2] integers and calls again.
+    """
+    cdef engine_t e
+    cdef int64_t used[3]
+    cdef int64_t needed
+    cdef blocks_t p
+    cdef rows_t r
+    cdef view_t v
+    cdef workspace_t n
+    bind(size, real, index, keys, &e, used)
+    view(&e, &p, &r)
+    v = view_t(p, NULL, &r, NULL)
+    scratch[1] = 0
+    needed = 0
+    if all_stages and bodies_workspace_size(&v, NULL, &n):
+        scratch[1] = <int32_t>(available - own_index_size(&v))
+        n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
         bodies_start(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
         if n.is_bound:
-            workspace += n.n_real
+            needed = n.n_real
+        elif scratch[1] < n.n_index < INDEX_LIMIT - own_index_size(&v):
+            scratch[2] = <int32_t>(n.n_index + own_index_size(&v))
+            return SCRATCH_TOO_SMALL
         else:
             scratch[1] = 0                              # The factor has too many entries: only the first phase runs.
-    return <int32_t>workspace if workspace < INDEX_LIMIT else -1
+    scratch[0] = band_width(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
+    needed += warm_workspace_size(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
+    return <int32_t>needed if needed < INDEX_LIMIT else -1
 
 
 cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
@@ -210,25 +218,30 @@ cdef class Substep:
         self.scratch, self.workspace = np.empty(1), np.empty(1)
         self.noted = np.zeros((MAX_TRACED_SCORES if all_stages else 0, 3))
 
-    cdef int _make_scratch(self) except -1:
-        """Allocate the scratch integers."""
-        cdef int32_t n = lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
-                                                         self.all_stages)
+    cdef int _make_scratch(self, int32_t n) except -1:
+        """Allocate at least n scratch integers."""
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if 2 * self.scratch.shape[0] < n:
-            self.scratch = np.empty(n)
+            self.scratch = np.empty(n // 2 + n // 8 + 1)
         return 0
+
+    cdef int32_t _plan(self) noexcept:
+        return lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.all_stages,
+                               <int32_t>min(2 * self.scratch.shape[0], INDEX_LIMIT), <int32_t*>&self.scratch[0])
 
     def solve(self, double tol):
         """Solve after `prepare` and `solve(False)`; return (result code, sweeps, factorisations, relative residual)."""
         cdef int32_t result, n
         cdef double* trace = NULL
-        self._make_scratch()
+        self._make_scratch(lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
+                                                           self.all_stages))
         if self.all_stages:
             trace = &self.noted[0, 0]
-        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.all_stages,
-                            <int32_t*>&self.scratch[0])
+        n = self._plan()
+        if n == SCRATCH_TOO_SMALL:
+            self._make_scratch((<int32_t*>&self.scratch[0])[2])
+            n = self._plan()
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if self.workspace.shape[0] < n:

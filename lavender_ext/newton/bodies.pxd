@@ -35,12 +35,6 @@ cdef inline int64_t factor_index_size(int64_t n, int64_t blocks, int64_t below) 
     return block_pattern_index_size(n, 6, blocks, below) + block_factor_index_size(n, 6)
 
 
-cdef inline int64_t max_index_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the number of int32 for all bodies and rows, as if L were full; 0 if the method does not apply."""
-    cdef int64_t size = index_workspace_size(p, r), n = r.n_bodies, pairs = n * (n - 1) // 2
-    return size + 1 + factor_index_size(n, n + min(pairs, <int64_t>p.n_rows), pairs) if size > 0 else 0
-
-
 cdef inline int64_t order_index_size(int64_t n, int64_t k) noexcept nogil:
     """Return the part of it for the order of n bodies and k elements."""
     # Scratch of the order, four vectors of bodies, the pattern of N, elements.

@@ -23,7 +23,7 @@ from lavender_ext.factor.linear cimport NO_FACTOR, LinearSystem, analyse_dense
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
                                          body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
-                                         index_workspace_size, max_index_size, order_bodies, order_elements,
+                                         index_workspace_size, order_bodies, order_elements,
                                          order_index_size, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
@@ -152,12 +152,6 @@ cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspac
     cdef int64_t size = index_workspace_size(&v.p, v.r)
     r.n_index, r.n_real = head() + size, 0
     return size > 0
-
-
-cdef int64_t max_bodies_index_size(const view_t* v) noexcept nogil:
-    """Return integers that always suffice, for a host that cannot enlarge them; 0 if the method does not apply."""
-    cdef int64_t size = max_index_size(&v.p, v.r)
-    return head() + size if size > 0 else 0
 
 
 cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:

@@ -4,6 +4,7 @@
 
 const SIZES = 10; // Entries of size[], as in lavender_ext/engine/arrays.pxd.
 const MOST_SWEEPS = 64;
+const SCRATCH_TOO_SMALL = -2; // Result of lav_newton_plan, as in lavender_ext/engine/newton_substep.pyx.
 const MOST_TRACED = 256; // Largest number of checks of one solve by Newton's method, as in lavender_ext/newton/warm_start.pxd.
 export const TOL = 1e-6; // Relative residual at which Newton's method ends, as in Python.
 const OK = 0;
@@ -92,8 +93,13 @@ export class Newton {
   // Return { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, and the
   // relative residual; for each check, the work until then, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
-    const whole = this.#scratch(0, this.f.lav_newton_index_workspace_size(...buffers, 1));
-    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, 1, whole));
+    let whole = this.#scratch(0, this.f.lav_newton_index_workspace_size(...buffers, 1));
+    let numbers = this.f.lav_newton_plan(...buffers, 1, this.workspace[0], whole);
+    if (numbers === SCRATCH_TOO_SMALL) {
+      whole = this.#scratch(0, this.k.i32(whole, 3)[2]);
+      numbers = this.f.lav_newton_plan(...buffers, 1, this.workspace[0], whole);
+    }
+    const real = this.#scratch(1, numbers);
     const how = this.f.lav_newton_substep(...buffers, tol, 1, whole, real, this.trace, this.said);
     const [sweeps, steps, relative, n] = this.k.f64(this.said, 4);
     const scores = this.k.f64(this.trace, 3 * n);
