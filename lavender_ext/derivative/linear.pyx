@@ -25,9 +25,9 @@ from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, form_scaled_csr,
-                                              form_scaled_generalized, form_system_rows, linear_t, linearise_blocks,
+                                              form_scaled_generalized, form_system_rows, linearised_t, linearise_blocks,
                                               multiply_blocks, natural_t, number_system_rows)
-from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve, dense_lu_solve_transposed
+from lavender_ext.factor.linear cimport LU, analyse_dense, linear_factor, linear_solve, linear_solve_transposed
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score, score_t
@@ -50,7 +50,7 @@ cdef void times_jac_transpose(const view_t* v, const double* lam, double* f) noe
         rows_wrench(&v.p, v.r, lam, f)
 
 
-cdef void times_jac_minv(const linear_t* a, double* f, double* out) noexcept nogil:
+cdef void times_jac_minv(const linearised_t* a, double* f, double* out) noexcept nogil:
     """Compute out = J M^-1 f on the rows of G (with bodies: on all rows); f (n) is overwritten.
 
     With M = L^T D L the result is Y D^-1/2 L^-T f.
@@ -82,7 +82,7 @@ cdef void add_matrix_transpose_times(const view_t* v, const double* x, double* o
             out[v.a.indices[k]] += v.a.data[k] * x[i]
 
 
-cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c, const double* x, double* q, double* s,
+cdef public void lav_adjoint(const linearised_t* a, const double* y, const double* c, const double* x, double* q, double* s,
                              double* f) noexcept nogil:
     """Compute q, s and f of (1) or (2), with q = 0 on rows outside G; y (n), c (m) and x (m) may be NULL, for 0."""
     cdef const view_t* v = &a.v
@@ -107,7 +107,7 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
     for i in range(m):
         if a.system_row[i] >= 0:
             s[a.system_row[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
-    dense_lu_solve_transposed(a.rows, a.lu, a.swap, s)
+    linear_solve_transposed(&a.g, s)
     for i in range(m):
         q[i] = s[a.system_row[i]] if a.system_row[i] >= 0 else 0.0
     multiply_blocks(&a.x, &v.p, a.x.p, q, True, s)
@@ -136,7 +136,7 @@ cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to
     return True
 
 
-cdef void form_system(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
+cdef void form_system(const linearised_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
     """Compute G of H + shift, for A of J and M or in compressed rows; h (rows, rows + n) is scratch."""
     cdef int32_t i, n = a.rows
     if v.g != NULL:
@@ -163,7 +163,7 @@ cdef ssize_t linear_workspace_size(const blocks_t* b, ssize_t values) noexcept n
     return 5 * <ssize_t>b.n_rows + 2 * values + (5 * <ssize_t>b.n_rows + 4 * <ssize_t>b.n_blocks + 11) // 8
 
 
-cdef void linearise(linear_t* a, const double* lam, double energy, double velocity, double* at, double* scratch) noexcept nogil:
+cdef void linearise(linearised_t* a, const double* lam, double energy, double velocity, double* at, double* scratch) noexcept nogil:
     """Judge and linearise the impulse lam (m) of a.v; energy and velocity are the references of the zero impulse.
 
     at (`linear_workspace_size`) is stored, scratch (m + `scratch_of`) is not.
@@ -197,7 +197,7 @@ cdef ssize_t scratch_of_factor(int32_t n, const view_t* v) noexcept nogil:
     return n * width
 
 
-cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
+cdef bint factorise(linearised_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
     """Factor G of H + shift, with A of v; return whether it is regular.
 
     at (`factor_workspace_size`) is stored, scratch (`scratch_of_factor`) is not.
@@ -207,11 +207,12 @@ cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, doub
     a.tried = a.regular = True
     if n == 0:
         return True
-    a.lu, a.swap = at, <int32_t*>(at + <ssize_t>n * n)
-    form_system(a, v, shift, a.lu, scratch)
-    if dense_lu(has_wide(), n, a.lu, a.swap, 0.0) == 0:
+    analyse_dense(&a.g, n)
+    a.g.by, a.g.wide, a.g.matrix, a.g.swap = LU, has_wide(), at, <int32_t*>(at + <ssize_t>n * n)
+    form_system(a, v, shift, at, scratch)
+    if linear_factor(&a.g) == 0:
         for i in range(n):
-            x = 1.0 / fabs(a.lu[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
+            x = 1.0 / fabs(at[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
             smallest = x if x < smallest else smallest
             norm_inf = x if x > norm_inf else norm_inf
     a.regular = smallest > MIN_PIVOT_RATIO * norm_inf and norm_inf > 0.0
@@ -227,7 +228,7 @@ cdef bint is_prepared(Data p):
     return first_invalid(p.blocks.d, p.blocks.n_rows) < 0
 
 
-cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out):
+cdef bint adjoint_into(const linearised_t* a, velocity, impulse, slack, double* out):
     """Write `Linear.adjoint` to out (3 m + n); return False if an argument is invalid or all are None."""
     cdef int32_t m = a.v.p.n_rows, i
     cdef const double* y
@@ -266,7 +267,7 @@ cdef object copy_to_array(const void* x, Py_ssize_t n, dtype):
 
 cdef class Linear:
     """One item of `Linears`. `solve` and `adjoint` use the last factor."""
-    cdef linear_t at
+    cdef linearised_t at
     cdef Data judge, data                               # data: the problem whose A is in G
     cdef Workspace workspace, factor
 
@@ -344,9 +345,9 @@ cdef class Linear:
         out_ = r.copy()
         cdef double[::1] out = out_
         if self.at.rows and transpose:
-            dense_lu_solve_transposed(self.at.rows, self.at.lu, self.at.swap, &out[0])
+            linear_solve_transposed(&self.at.g, &out[0])
         elif self.at.rows:
-            dense_lu_solve(self.at.rows, self.at.lu, self.at.swap, &out[0])
+            linear_solve(&self.at.g, &out[0])
         return out_
 
     def times(self, v_, bint transpose=False, bint edge=False):
@@ -408,13 +409,13 @@ cdef class Linears:
     """
     cdef Workspace table, workspace, factors
     cdef list data
-    cdef linear_t* at
+    cdef linearised_t* at
     cdef readonly Py_ssize_t n, size                    # number of impulses; length of the result of `adjoint`
 
     def __init__(self, list data, impulses, int32_t max_rows=0):
         cdef Py_ssize_t i, n = len(data), size = 0, scratch = 1, more = 0
         cdef Data p
-        cdef linear_t* a
+        cdef linearised_t* a
         cdef const double* lam
         cdef Py_buffer view
         cdef double* to
@@ -426,9 +427,9 @@ cdef class Linears:
         if each is None:
             flat, first, sizes = impulses
         self.data, self.n = data, n
-        self.table = allocate_workspace(n * sizeof(linear_t))
-        self.at = <linear_t*>self.table.at
-        memset(self.at, 0, n * sizeof(linear_t))
+        self.table = allocate_workspace(n * sizeof(linearised_t))
+        self.at = <linearised_t*>self.table.at
+        memset(self.at, 0, n * sizeof(linearised_t))
         for i in range(n):
             p = data[i]
             a = self.at + i
@@ -484,7 +485,7 @@ cdef class Linears:
     def skip_unsolvable(self, double max_residual):
         """Skip items without a regular factor or with a residual above max_residual; return the indices of all skipped items."""
         cdef Py_ssize_t i
-        cdef linear_t* a
+        cdef linearised_t* a
         cdef list skipped = []
         self.size = 0
         for i in range(self.n):
@@ -513,7 +514,7 @@ cdef class Linears:
 
     def result_slice(self, Py_ssize_t i):
         """Return the slice of item i in the result of `adjoint`."""
-        cdef linear_t* a = self.at + i
+        cdef linearised_t* a = self.at + i
         return slice(a.first, a.first + 3 * a.v.p.n_rows + a.n)
 
     def result_indices(self, bint velocities):

@@ -18,6 +18,7 @@ from lavender_ext.core.block_projection cimport active_bound, differentiate_by_c
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
+from lavender_ext.factor.linear cimport linear_t
 
 
 cdef enum:                      # case of a row
@@ -40,7 +41,7 @@ cdef struct natural_t:          # natural map of all blocks
     double* edge                # dPi/de, e_g the friction coefficient of component g, in the first column of g
 
 
-cdef struct linear_t:           # a judged and linearised solution
+cdef struct linearised_t:           # a judged and linearised solution
     view_t v                    # problem for the judge
     natural_t x
     int32_t n                   # number of velocities, 0 for a matrix
@@ -51,8 +52,7 @@ cdef struct linear_t:           # a judged and linearised solution
     double* lam                 # (m) N s
     double* w                   # (m) m/s
     int32_t* system_row         # (m) row of G of each row, -1 without one
-    double* lu                  # (rows, rows) P G^T = L U
-    int32_t* swap               # (rows)
+    linear_t g                  # G, factored
     double relative, above_floor        # results of the judge
     ssize_t first               # first index of the item in the results of `Linears.adjoint`
 

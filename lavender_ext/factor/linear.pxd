@@ -93,6 +93,12 @@ cdef inline void analyse_band(linear_t* f, int32_t n, int32_t width) noexcept no
     f.kind, f.n, f.width, f.cost = BAND, n, width, 0.5 * n * width * width
 
 
+cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const int32_t* lidx, double* values,
+                              double* diagonal) noexcept nogil:
+    """Set the pattern of L^T D L, with the entries of A left of the diagonal and on it; `scale` also has the diagonal."""
+    f.kind, f.n, f.lptr, f.lidx, f.matrix, f.diagonal = TREE, n, lptr, lidx, values, diagonal
+
+
 cdef int32_t linear_factor(linear_t* f) noexcept nogil
 cdef void linear_solve(linear_t* f, double* x) noexcept nogil
 cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil

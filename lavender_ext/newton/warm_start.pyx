@@ -11,7 +11,7 @@ from lavender_ext.core.rows cimport dot6
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
+from lavender_ext.factor.linear cimport analyse_band, linear_factor, linear_solve, linear_t
 from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.judge.slack cimport rows_slack
@@ -156,22 +156,23 @@ cdef double judge_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const d
 cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                  double* lam, double* v) noexcept nogil:
     """Solve the joints by (3)."""
-    cdef pivots_t pivot
+    cdef linear_t band
     cdef int32_t j, attempt
     fill_band(p, r, s)
     s.factorisations = 1
-    ldl_factor(p.n_rows, s.width, s.band, p.d, 1e-13, NULL, &pivot)
-    if pivot.small or pivot.negative:
+    analyse_band(&band, p.n_rows, s.width)
+    band.matrix, band.d, band.tiny, band.shift, band.ahead = s.band, p.d, 1e-13, 0.0, NULL
+    if linear_factor(&band) or band.pivots.negative:
         return UNDECIDED
     for j in range(p.n_rows):
         lam[j] = p.b[j]
-    ldl_solve(p.n_rows, s.width, s.band, lam)
+    linear_solve(&band, lam)
     for attempt in range(2):
         s.relative = judge_impulse(p, r, s, lam, v, e0, v0)
         if s.relative <= tol:
             return SOLVED
         if attempt == 0:                                   # Refine: lam <- lam - A^-1 w.
-            ldl_solve(p.n_rows, s.width, s.band, s.slack)
+            linear_solve(&band, s.slack)
             for j in range(p.n_rows):
                 lam[j] -= s.slack[j]
     return UNDECIDED

@@ -1,6 +1,6 @@
 """The method of `direct`, step by step, for hosts with or without Python (states in direct.pyx).
 
-    t.v, t.e0, t.v0, t.least, t.sweeps, t.linear, t.symmetric, and a, p, band, order, tiny of t.s are set
+    t.v, t.e0, t.v0, t.least, t.sweeps, t.linear, t.symmetric, and a, p, band, order, linear.tiny of t.s are set
     bind_direct_workspace(&t, real, integers)       arrays of `direct_workspace_doubles` and `direct_workspace_integers` entries
     begin_direct(&t, start), or begin_exchanges(&t) from the bounds in t.s.at
     step_direct(&t, max_rounds)                     until t.is_over

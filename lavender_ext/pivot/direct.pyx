@@ -31,6 +31,7 @@ import numpy as np
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
+from lavender_ext.factor.linear cimport CHOLESKY, LU
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport is_at_floor, new_score, score_t
 from lavender_ext.pivot.direct cimport (CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED,
@@ -71,7 +72,7 @@ cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexc
     t.side = index + 3 * m
     bind_pivoting_workspace(&t.s, t.scratch + scratch_of(&t.v), index)
     if not t.symmetric:
-        t.s.swap = index + 2 * m
+        t.s.linear.swap, t.s.linear.by = index + 2 * m, LU
     reset_direct(t)
 
 
@@ -154,7 +155,7 @@ cdef inline int32_t judge_rounds(direct_t* t, int32_t code) noexcept nogil:
     if code == SMALL_PIVOT or code == INDEFINITE:
         return code
     judge_iterate(t)
-    if code != SOLVED or t.s.shift != 0.0:
+    if code != SOLVED or t.s.linear.shift != 0.0:
         return code
     t.solved = 1
     if is_good(t):
@@ -169,11 +170,11 @@ cdef inline int32_t factor_linear(direct_t* t) noexcept nogil:
     """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
     if not t.s.is_factored:
         factor_all_rows(&t.s)
-    if t.s.pivots.negative > 0:
+    if t.s.linear.pivots.negative > 0:
         return INDEFINITE
-    if t.s.pivots.small == 0:
+    if t.s.linear.pivots.small == 0:
         return SOLVED
-    t.rank = t.s.n - t.s.pivots.small
+    t.rank = t.s.n - t.s.linear.pivots.small
     return SMALL_PIVOT
 
 
@@ -272,9 +273,9 @@ cdef inline int32_t step_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
         clip_rows(t, t.s.center, t.s.x)
         return STUCK
     if code != SOLVED:
-        if t.s.shift >= path_shift(0):
+        if t.s.linear.shift >= path_shift(0):
             return INDEFINITE
-        t.larger_shift = 100.0 * t.s.shift
+        t.larger_shift = 100.0 * t.s.linear.shift
         t.next_shift = N_SHIFTS
         memcpy(t.s.x, t.s.center, t.s.n * sizeof(double))
         return SMALL_PIVOT
@@ -363,9 +364,9 @@ cdef inline int32_t descend(direct_t* t, int32_t max_steps) noexcept nogil:
             factor_free_rows(s, NULL)
             if s.late:
                 break
-            if s.pivots.negative > 0 or s.pivots.small > 0:
+            if s.linear.pivots.negative > 0 or s.linear.pivots.small > 0:
                 s.n_rounds += 1
-                return INDEFINITE if s.pivots.negative > 0 else SMALL_PIVOT
+                return INDEFINITE if s.linear.pivots.negative > 0 else SMALL_PIVOT
         s.n_rounds += 1
         correct_free_rows(s)
         for i in range(s.n):
@@ -482,7 +483,7 @@ cdef class Pivoting:
         self.t.e0, self.t.v0 = self.judged.reference_energy, self.judged.reference_velocity
         self.t.least = 1e-13
         self.t.linear, self.t.symmetric = linear, symmetric
-        self.t.s.a, self.t.s.p, self.t.s.band, self.t.s.order, self.t.s.tiny = &p.csr, &p.blocks, band, NULL, tiny
+        self.t.s.a, self.t.s.p, self.t.s.band, self.t.s.order, self.t.s.linear.tiny = &p.csr, &p.blocks, band, NULL, tiny
         if order is not None:
             row_order = order
             if row_order.shape[0] != m:
@@ -495,7 +496,7 @@ cdef class Pivoting:
         reals, ints = self.reals, self.ints
         bind_direct_workspace(&self.t, &reals[0], &ints[0])
         if outside is not None:
-            self.t.s.swap = NULL
+            self.t.s.linear.by = CHOLESKY
             self.t.s.outside = <void*>self
             self.t.s.factor_outside = factor_outside
             self.t.s.solve_outside = solve_outside
@@ -593,4 +594,4 @@ cdef class Pivoting:
         """Return the rows whose pivots were small in the last factorisation, in order of elimination."""
         cdef pivoting_t* s = &self.t.s
         rows = self.order if self.order is not None else range(s.n)
-        return [i for i in rows if s.place[i] >= 0 and s.c[<int64_t>s.place[i] * s.width] == 0.0]
+        return [i for i in rows if s.place[i] >= 0 and s.linear.matrix[<int64_t>s.place[i] * s.linear.width] == 0.0]

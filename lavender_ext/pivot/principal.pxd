@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.band cimport pivots_t
+from lavender_ext.factor.linear cimport linear_t
 
 
 cpdef enum:                     # results of rounds
@@ -29,10 +29,9 @@ cdef struct pivoting_t:
     const blocks_t* p           # b, d, lower, upper
     int32_t band                # half bandwidth in the order of elimination; -1: no compiled factor
     const int32_t* order        # (n) row that is eliminated first, second, ...; NULL: 0, 1, ...
-    double tiny                 # Pivots below tiny d are small.
     int32_t n
     int32_t natural             # The order is 0, 1, ...
-    int32_t* swap               # (n) row exchanges of LU; NULL: LDL^T, for a symmetric A
+    linear_t linear             # A_FF + s D_FF: L D L^T, or L U if A is not symmetric; the caller sets `tiny`
     int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
     int32_t* place              # (n) place among the free rows, or -1
     double* x                   # (n) N s
@@ -40,14 +39,9 @@ cdef struct pivoting_t:
     double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
     double* center              # (n) N s
     double* y                   # (n) scratch
-    double* size                # (n) d of the free rows, by place; for LU d^-1/2
-    double* c                   # (n (band + 1)) factor; for LU (n_free, n_free)
-    double shift                # s
+    double* size                # (n) d of the free rows, by place
     int32_t n_free
-    int32_t width
     int32_t is_factored         # The factor belongs to the present free rows and shift.
-    int32_t is_half_solved      # x holds the result of the forward substitution of b, which the factorisation did.
-    pivots_t pivots             # of the last factor
     int32_t min_infeasible      # smallest number of infeasible rows so far
     int32_t patience            # exchanges left without a smaller number
     int32_t exchanged           # rows that changed between free and a bound so far

@@ -10,14 +10,14 @@ s > 0 is the proximal shift of a singular matrix. Free rows are numbered compact
 bandwidth of A never grows; a dense matrix is a band of full width. A linear system is the case in which all rows are free. LU
 factors D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with row exchanges for the largest pivot.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_row
 from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
-from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve
+from lavender_ext.factor.band cimport no_pivots
+from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_band, analyse_dense, linear_factor, linear_solve
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.score cimport unit_roundoff
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, pivoting_t
@@ -27,71 +27,50 @@ cdef enum:
     MAX_PATIENCE = 8            # exchanges without a smaller number of infeasible rows, after which rounds are stuck
 
 
-cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
-    """Factor the scaled matrix of the free rows by LU."""
-    cdef int32_t i, j, k = s.n_free, q, at, to
+cdef inline void factor_by_owner(pivoting_t* s) noexcept nogil:
+    """Call the outside factor."""
+    cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.linear.shift)
+    s.late = small < 0
+    if s.late:
+        return
+    no_pivots(&s.linear.pivots)
+    s.linear.pivots.small = small
+    s.factorisations += 1
+    s.is_factored = 1
+
+
+cdef inline void fill_rows(pivoting_t* s) noexcept nogil:
+    """Copy A_FF to the full matrix of L U."""
+    cdef int32_t i, j, q, at, to
     cdef const csr_t* a = s.a
     cdef double* row
-    no_pivots(&s.pivots)
-    for j in range(k):
-        s.size[j] = 1.0 / sqrt(s.size[j])
+    analyse_dense(&s.linear, s.n_free)
     for i in range(s.n):
         at = s.place[i]
         if at < 0:
             continue
-        row = s.c + <int64_t>at * k
-        for j in range(k):
+        row = s.linear.matrix + <int64_t>at * s.n_free
+        for j in range(s.n_free):
             row[j] = 0.0
         for q in range(a.indptr[i], a.indptr[i + 1]):
             to = s.place[a.indices[q]]
             if to >= 0:
-                row[to] = s.size[at] * a.data[q] * s.size[to]
-        row[at] += s.shift
-    s.pivots.small = dense_lu(has_wide(), k, s.c, s.swap, s.tiny)
-    s.factorisations += 1
-    s.is_factored = 1
+                row[to] = a.data[q]
 
 
-cdef inline void factor_by_owner(pivoting_t* s) noexcept nogil:
-    """Call the outside factor."""
-    cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.shift)
-    s.late = small < 0
-    if s.late:
-        return
-    no_pivots(&s.pivots)
-    s.pivots.small = small
-    s.factorisations += 1
-    s.is_factored = 1
-
-
-cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
-    """Factor A_FF + s D_FF of (1). Forward substitution of x (n_free) is done on the way, unless x is NULL."""
-    cdef int32_t i, j, k = 0, q, r, at, to, in_place
+cdef inline void fill_band(pivoting_t* s) noexcept nogil:
+    """Copy A_FF to the columns of its band."""
+    cdef int32_t i, j, q, at, to
+    cdef bint in_place = s.natural and s.n_free == s.n
     cdef const csr_t* a = s.a
     cdef double* col
-    s.is_half_solved = 0
-    for r in range(s.n):
-        i = r if s.natural else s.order[r]
-        s.place[i] = -1
-        if s.at[i] == FREE:
-            s.place[i] = k
-            s.size[k] = s.p.d[i]
-            k += 1
-    s.n_free = k
-    if s.factor_outside != NULL:
-        factor_by_owner(s)
-        return
-    if s.swap != NULL:
-        factor_lu(s)
-        return
-    s.width = s.band + 1 if s.band < k else k
-    in_place = s.natural and k == s.n
+    analyse_band(&s.linear, s.n_free, s.band + 1 if s.band < s.n_free else s.n_free)
     for i in range(s.n):
         at = s.place[i]
         if at < 0:
             continue
-        col = s.c + <int64_t>at * s.width
-        for j in range(s.width):
+        col = s.linear.matrix + <int64_t>at * s.linear.width
+        for j in range(s.linear.width):
             col[j] = 0.0
         col -= at
         q = a.indptr[i]
@@ -105,60 +84,47 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
                 to = s.place[a.indices[q]]
                 if to >= at:
                     col[to] = a.data[q]
-        col[at] += s.shift * s.p.d[i]
-    ldl_factor(k, s.width, s.c, s.size, s.tiny, x, &s.pivots)
+
+
+cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
+    """Factor A_FF + s D_FF of (1). L D L^T begins the solve of x (n_free) on the way, unless x is NULL."""
+    cdef int32_t i, k = 0, r
+    for r in range(s.n):
+        i = r if s.natural else s.order[r]
+        s.place[i] = -1
+        if s.at[i] == FREE:
+            s.place[i] = k
+            s.size[k] = s.p.d[i]
+            k += 1
+    s.n_free = k
+    s.linear.ahead = x
+    if s.factor_outside != NULL:
+        factor_by_owner(s)
+        return
+    if s.linear.by == LU:
+        fill_rows(s)
+    else:
+        fill_band(s)
+    linear_factor(&s.linear)
     s.factorisations += 1
     s.is_factored = 1
 
 
-cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
+cdef inline void solve_factored(pivoting_t* s, double* y) noexcept nogil:
     """Compute y (n_free) <- (A_FF + s D_FF)^-1 y."""
-    cdef int32_t j
     if s.solve_outside != NULL:
         s.solve_outside(s.outside, s.n_free, y)
-        return
-    if s.swap == NULL:
-        ldl_solve(s.n_free, s.width, s.c, y)
-        return
-    for j in range(s.n_free):
-        y[j] *= s.size[j]
-    dense_lu_solve(s.n_free, s.c, s.swap, y)
-    for j in range(s.n_free):
-        y[j] *= s.size[j]
+    else:
+        linear_solve(&s.linear, y)
 
 
 cdef void factor_all_rows(pivoting_t* s) noexcept nogil:
-    """Factor A with all rows free and no shift; LDL^T in natural order also does the forward substitution of x = A^-1 b."""
-    cdef int32_t i, q, end, half
-    cdef const csr_t* a = s.a
-    if s.swap != NULL or not (s.natural and s.band == 1 and s.n > 1):
-        for i in range(s.n):
-            s.at[i] = FREE
-            s.x[i] = s.p.b[i]
-        half = s.natural and s.swap == NULL and s.factor_outside == NULL
-        factor_free_rows(s, s.x if half else NULL)
-        s.is_half_solved = half
-        return
-    s.is_half_solved = 1
-    s.n_free = s.n
-    s.width = 2
+    """Factor A with all rows free and no shift; L D L^T in natural order begins the solve of x = A^-1 b."""
+    cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE
-        s.place[i] = i
-        s.size[i] = s.p.d[i]
         s.x[i] = s.p.b[i]
-        s.c[2 * i] = 0.0
-        s.c[2 * i + 1] = 0.0
-        end = a.indptr[i + 1]
-        q = end - 2 if end - 2 > a.indptr[i] else a.indptr[i]
-        while q < end:                                  # The last two entries contain the upper half.
-            if a.indices[q] >= i:
-                s.c[i + a.indices[q]] = a.data[q]
-            q += 1
-    no_pivots(&s.pivots)
-    ldl_factor_2(s.n, s.c, s.size, s.tiny, s.x, &s.pivots)
-    s.factorisations += 1
-    s.is_factored = 1
+    factor_free_rows(s, s.x if s.natural and s.linear.by != LU and s.factor_outside == NULL else NULL)
 
 
 cdef void correct_free_rows(pivoting_t* s) noexcept nogil:
@@ -200,8 +166,8 @@ cdef void compute_slack(pivoting_t* s) noexcept nogil:
             f0 += fabs(t)
         s.w[i] = (s0 + s1) - s.p.b[i]
         s.f[i] = unit_roundoff() * ((f0 + f1) + fabs(s.p.b[i]))
-        if s.shift > 0.0:
-            s.w[i] += s.shift * s.p.d[i] * (s.x[i] - s.center[i])
+        if s.linear.shift > 0.0:
+            s.w[i] += s.linear.shift * s.p.d[i] * (s.x[i] - s.center[i])
 
 
 cdef inline int32_t exchanged_side(const pivoting_t* s, int32_t i) noexcept nogil:
@@ -290,9 +256,8 @@ cdef void solve_all_rows(pivoting_t* s) noexcept nogil:
     """Compute x = A^-1 b with all rows free and factored; w is unchanged."""
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
-    if s.is_half_solved:
-        s.is_half_solved = 0
-        ldl_back_all(s.n, s.width, s.c, s.x)
+    if s.linear.ahead != NULL:
+        linear_solve(&s.linear, s.x)
         return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
@@ -309,7 +274,7 @@ cdef inline bint try_all_free(pivoting_t* s) noexcept nogil:
         if s.p.lower[i] == s.p.upper[i]:
             return False
     factor_all_rows(s)
-    if s.pivots.negative > 0 or s.pivots.small > 0:
+    if s.linear.pivots.negative > 0 or s.linear.pivots.small > 0:
         s.is_factored = 0
         return False
     solve_all_rows(s)
@@ -332,9 +297,9 @@ cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
         if s.late:
             s.n_rounds -= 1
             return ROUNDS_USED
-        if s.pivots.negative > 0:
+        if s.linear.pivots.negative > 0:
             return INDEFINITE
-        if s.pivots.small > 0 and (s.shift == 0.0 or s.swap != NULL or s.factor_outside != NULL):
+        if s.linear.pivots.small > 0 and (s.linear.shift == 0.0 or s.linear.by == LU or s.factor_outside != NULL):
             return SMALL_PIVOT
         correct_free_rows(s)
         compute_slack(s)
@@ -374,7 +339,7 @@ cdef void reset_patience(pivoting_t* s) noexcept nogil:
 
 cdef void set_shift(pivoting_t* s, double shift) noexcept nogil:
     """Set the shift, which makes the factor invalid and exchanges begin anew."""
-    s.shift = shift
+    s.linear.shift = shift
     s.is_factored = 0
     reset_patience(s)
 
@@ -384,8 +349,8 @@ cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
     cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE
-    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = s.late = 0
-    no_pivots(&s.pivots)
+    s.exchanged = s.factorisations = s.n_rounds = s.late = 0
+    no_pivots(&s.linear.pivots)
     set_shift(s, 0.0)
 
 
@@ -397,9 +362,10 @@ cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) n
         for i in range(n):
             s.natural &= s.order[i] == i
     s.x, s.w, s.f, s.center = real, real + n, real + 2 * n, real + 3 * n
-    s.y, s.size, s.c = real + 4 * n, real + 5 * n, real + 6 * n
+    s.y, s.size, s.linear.matrix = real + 4 * n, real + 5 * n, real + 6 * n
     s.at, s.place = index, index + n
-    s.swap = NULL
+    s.linear.by, s.linear.wide = CHOLESKY, has_wide()
+    s.linear.d = s.linear.scale = s.size
     s.outside = NULL
     s.factor_outside = NULL
     s.solve_outside = NULL

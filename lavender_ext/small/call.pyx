@@ -195,7 +195,7 @@ cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint fo
         return False
     t.v, t.e0, t.v0, t.least = s.v, s.zero_residual[0], s.zero_residual[1], 1e-13
     t.linear, t.symmetric, t.sweeps = s.linear, s.symmetric, ACTIVE_SET_SWEEPS
-    t.s.a, t.s.p, t.s.band, t.s.order, t.s.tiny = s.over.a, &s.over.p, s.band, NULL, 1e-13
+    t.s.a, t.s.p, t.s.band, t.s.order, t.s.linear.tiny = s.over.a, &s.over.p, s.band, NULL, 1e-13
     bind_direct_workspace(&t, workspaces.work.real, workspaces.work.index)
     # exchanges, then Lemke's paths
     ended = run_exchanges(&t, own, tol, follows, remaining_cost[0] / each)

@@ -19,6 +19,7 @@ from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.generalized cimport panel_times, panel_transpose_add
 from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_rows
 from lavender_ext.core.view cimport generalized_t
+from lavender_ext.factor.linear cimport linear_t
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t
 
@@ -91,11 +92,10 @@ cdef struct flow_t:
     double* factored_v          # V in `normal`
     double* normal              # N of the present island in the pattern of L; under Coulomb's law a full matrix
     double* factor              # its factor
-    double* inv                 # (s) 1 / D
+    linear_t linear             # N, S or I + A V
     double* weighted_y          # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
-    int32_t* pivots             # (s)
     int32_t n_free              # rows of S: rows with V != 0
     int32_t rows                # rows of an island over rows, rounded up to a multiple of four; padding is 0
     int32_t wide                # as in `core/method.pxd`

@@ -212,7 +212,7 @@ cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_
     at += panels
     measure_panels(f, need)
     find_islands(f, w, w + n, need)
-    f.pivots = w                                        # The scratch of `find_islands` is free again.
+    f.linear.swap = w                                     # The scratch of `find_islands` is free again.
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
@@ -283,7 +283,7 @@ cdef inline void bind_real_workspace(flow_t* f, const requirements_t* need, doub
     f.normal = x
     f.factor = x + values
     x += 2 * values
-    f.inv = x
+    f.linear.scale = x
     f.local_rhs = x + size
     f.weighted_y = x + 2 * size
     f.line = x + 2 * size + need.panel_values

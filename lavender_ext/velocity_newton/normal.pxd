@@ -15,9 +15,8 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport eliminate_rows, ldl_solve
 from lavender_ext.core.block_types cimport is_rows
-from lavender_ext.factor.dense cimport dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
+from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_dense, analyse_tree, linear_factor, linear_solve, linear_t
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.velocity_newton.flow cimport block_end, block_from, form_column, flow_t, apply_y
 
@@ -246,18 +245,16 @@ cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
     f.n_free = n
 
 
-cdef inline void solve_row_step(const flow_t* f) noexcept nogil:
+cdef inline void solve_row_step(flow_t* f) noexcept nogil:
     """Compute pi and q of (2) or (3)."""
     cdef int32_t a, k
     cdef double* z = f.local_rhs
     cdef double* x = z
     for a in range(f.n_free):
         z[a] = f.grad[f.unknowns[f.places[a]]]
-    if f.bounded_rows_only:
-        dense_cholesky_solve(f.n_free, f.normal, z)
-    else:
+    linear_solve(&f.linear, z)
+    if not f.bounded_rows_only:
         x = f.sum + f.rows
-        dense_lu_solve(f.n_free, f.factor, f.pivots, z)
         visit_free_blocks(f, z, x)
     combine_rows(f.wide, f.rows, f.n_free, f.a, f.columns, x, f.sum)
     for a in range(f.n_unknowns):
@@ -313,22 +310,26 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
     """Factor N, or the matrix over rows; return whether no pivot was lost."""
     cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island], values
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
+    cdef linear_t* n = &f.linear
     f.factorisations += 1
-    if f.is_over_rows and f.bounded_rows_only:
-        return dense_cholesky(f.wide, f.n_free, f.factor, NULL, f.normal) == 0
+    n.wide, n.d, n.shift, n.tiny, n.matrix = f.wide, NULL, 0.0, 0.0, f.factor
     if f.is_over_rows:
-        return dense_lu(f.wide, f.n_free, f.factor, f.pivots, 0.0) == 0
-    if square:
+        analyse_dense(n, f.n_free)
+        n.by, n.lower = CHOLESKY if f.bounded_rows_only else LU, f.normal
+    elif square:
+        analyse_dense(n, size)
+        n.by = LU
         memcpy(f.factor, f.normal, <ssize_t>size * size * sizeof(double))
-        return dense_lu(f.wide, size, f.factor, f.pivots, 0.0) == 0
-    values = lptr[size] - lptr[0]
-    memcpy(f.factor, f.normal, (values + size) * sizeof(double))
-    for a in range(size):
-        f.inv[a] = f.factor[values + a]
-    return eliminate_rows(size, lptr, f.lidx, f.factor - lptr[0], f.factor + values, f.inv, 0.0) < 0
+    else:
+        values = lptr[size] - lptr[0]
+        memcpy(f.factor, f.normal, (values + size) * sizeof(double))
+        analyse_tree(n, size, lptr, f.lidx, f.factor - lptr[0], f.factor + values)
+        for a in range(size):
+            n.scale[a] = n.diagonal[a]
+    return linear_factor(n) == 0
 
 
-cdef inline void solve_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
+cdef inline void solve_step(flow_t* f, int32_t island, bint square) noexcept nogil:
     """Solve for p of (1), and compute q = Y p."""
     cdef int32_t a, c0 = f.cptr[island], size = f.cptr[island + 1] - c0
     if f.is_over_rows:
@@ -337,13 +338,13 @@ cdef inline void solve_step(const flow_t* f, int32_t island, bint square) noexce
     if square:
         for a in range(size):
             f.local_rhs[size - 1 - a] = -f.grad[f.icols[c0 + a]]
-        dense_lu_solve(size, f.factor, f.pivots, f.local_rhs)
+        linear_solve(&f.linear, f.local_rhs)
         for a in range(size):
             f.step[f.icols[c0 + a]] = f.local_rhs[size - 1 - a]
     else:
         for a in range(size):
             f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
-        ldl_solve(size, f.lptr + c0, f.lidx, f.factor - f.lptr[c0], f.inv, f.local_rhs)
+        linear_solve(&f.linear, f.local_rhs)
         for a in range(size):
             f.step[f.icols[c0 + a]] = f.local_rhs[a]
     apply_y(f, island, f.step, f.q)

@@ -35,7 +35,7 @@ static int32_t start_pivots(lav_solver *s) {
   t->s.p = &s->q;
   t->s.band = band;
   t->s.order = NULL;
-  t->s.tiny = TINY_PIVOT;
+  t->s.linear.tiny = TINY_PIVOT;
   pivot_direct_bind_direct_workspace(t, real, index);
   if (whole) pivot_lemke_bind_lemke_workspace(&s->lemke, t, s->table, whole);
   return LAV_OK;
