@@ -31,6 +31,7 @@ format:  ## format Python files as CI requires
 
 types:  ## run mypy
 	$(BIN)mypy
+	$(BIN)mypy --config-file .ci/mypy_scripts.ini
 
 coverage:  ## measure the tests' line coverage of the Python files, in build/coverage/index.html
 	test -x $(PYTHON) || python3 -m venv .venv

@@ -79,7 +79,9 @@ def field_comments(cls):
     source = textwrap.dedent(inspect.getsource(cls))
     lines = source.split("\n")
     found = {}
-    for node in ast.parse(source).body[0].body:
+    definition = ast.parse(source).body[0]
+    assert isinstance(definition, ast.ClassDef)
+    for node in definition.body:
         if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
             continue
         if node.target.id.startswith("_"):

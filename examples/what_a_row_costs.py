@@ -38,18 +38,16 @@ def measure():
     scenes = {
         name: lv.Scene("stack", n=BOXES, solver_iterations=SWEEPS, **more) for name, more in DECLARED.items()
     }
-    found = {
-        name: {"rows": lv.Simulation(scene).constraint_problem().m, "times": []}
-        for name, scene in scenes.items()
-    }
+    rows = {name: lv.Simulation(scene).constraint_problem().m for name, scene in scenes.items()}
+    times = {name: [] for name in scenes}
     for _ in range(ROUNDS):
         for name, scene in scenes.items():
             simulation = lv.Simulation(scene)
             for _ in range(STEPS):
                 start = perf_counter()
                 simulation.step()
-                found[name]["times"].append(perf_counter() - start)
-    return found
+                times[name].append(perf_counter() - start)
+    return {name: {"rows": rows[name], "times": times[name]} for name in scenes}
 
 
 def get_shortest_times(found):
