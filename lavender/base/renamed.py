@@ -23,15 +23,22 @@ INSTEAD = {
     "Solution": {
         "contradicted": "status_conflict",
         "impulses": "impulse",
+        "converged": "success",
         "iters": "iterations",
         "lam": "impulse",
         "lambda_": "impulse",
         "turns": "stages",
+        "velocity": "residual.velocity (error of a row), or RowBuilder.velocity_after (velocities of bodies)",
         "x": "impulse",
     },
+    "RowBuilder": dict.fromkeys(("contacts", "add_contact"), "contact")
+    | dict.fromkeys(("hinges", "add_hinge", "joint", "revolute"), "hinge")
+    | dict.fromkeys(("build", "solve"), "problem")
+    | {"fixed": "weld", "prismatic": "slider", "rod": "distance", "spherical": "ball"},
     "Residual": {
         "energy_start": "energy_at_zero",
         "floor": "roundoff_floor",
+        "rel": "relative",
         "velocity_start": "velocity_at_zero",
     },
 }
@@ -50,10 +57,20 @@ ARGUMENT_HINTS = {
     ),
     **dict.fromkeys(("accuracy", "eps", "rtol", "tolerance"), ("tol",)),
     **dict.fromkeys(("time_budget", "timeout"), ("time_limit",)),
+    **dict.fromkeys(("algorithm", "method", "name"), ("solver",)),
+    **dict.fromkeys(("coefficient", "friction", "friction_coefficient"), ("mu",)),
+    **dict.fromkeys(("distance_to_surface", "separation"), ("gap",)),
+    **dict.fromkeys(("max_motor_torque", "torque"), ("max_torque",)),
+    **dict.fromkeys(("force", "max_motor_force"), ("max_force",)),
+    **dict.fromkeys(("pivot", "pos", "position"), ("anchor", "point", "anchor_a")),
+    **dict.fromkeys(("c", "damper"), ("damping",)),
+    **dict.fromkeys(("k", "spring_constant"), ("stiffness",)),
+    **dict.fromkeys(("rest_length", "l0"), ("length",)),
+    **dict.fromkeys(("motor_speed", "target_velocity", "velocity"), ("speed",)),
 }
 
 #: Solver name that users try -> name to suggest; others get the most similar names.
-SOLVER_HINTS = {"lcp": "lemke", "qp": "osqp"}
+SOLVER_HINTS = {"lcp": "lemke", "none": "auto", "qp": "osqp"}
 
 
 def suggest_argument(name: str, valid: Collection[str]) -> str:

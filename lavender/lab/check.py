@@ -280,7 +280,11 @@ def _solve_reference(
 ) -> tuple[Solution | None, str | None, str]:
     """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
     if problem.law == "coulomb":
-        return None, None, "Coulomb friction is not the optimality condition of a QP"
+        return (
+            None,
+            None,
+            "Coulomb friction is not the optimality condition of a QP; solution.motion_error() measures its motion",
+        )
     if not (problem.has_singular_program or problem.is_symmetric):
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
     if not (problem.has_singular_program or problem.is_semidefinite):

@@ -120,6 +120,11 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
+        if self.friction in ("box", "pyramid", "pyramidal"):
+            raise InputError(
+                f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed: shape='box' bounds each tangent "
+                "separately"
+            )
         put(self, "friction", check_choice("friction", self.friction, FRICTION_LAWS))
         if self.precision is None or (isinstance(self.precision, str) and not self.precision):
             put(self, "precision", getattr(self.rows, "precision", "float64"))
@@ -246,6 +251,11 @@ class ProblemData:
             copied = impulse.copy()
             if measure.all_finite(copied):
                 return copied
+        if hasattr(impulse, "impulse"):
+            raise InputError(
+                f"{name} is a {type(impulse).__name__}; an array (m,) in N s is needed: give its .impulse, or "
+                "problem.carry(solution) if the problem has keys"
+            )
         array = as_array(name, impulse, (self.m,), finite=False, unit="N s")
         check_finite(f"{name} [N s]", array)
         return array.copy()
@@ -359,6 +369,8 @@ def check_problem(problem: Any) -> None:
         advice = "make one by Problem.lcp(A, b, lower, upper), linear, contact, from_rows or from_jacobian"
         if isinstance(getattr(problem, "problem", None), ProblemData):  # a case, or a file that was read
             advice = "give its .problem"
+        elif callable(getattr(problem, "velocity_after", None)):  # a `RowBuilder`, which is not imported here
+            advice = "give the result of its .problem()"
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
 
 

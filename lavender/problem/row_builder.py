@@ -17,8 +17,10 @@ its remaining distance within the step, but not more.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from math import hypot, inf
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -32,6 +34,7 @@ from lavender.base.arrays import (
     get_shape,
 )
 from lavender.base.errors import InputError
+from lavender.base.renamed import build_attribute_error, suggest_argument
 from lavender.problem.problem import Problem
 from lavender.problem.rows import Rows, check_inertia
 from lavender_ext.core.checks import MIN_MAGNITUDE
@@ -52,6 +55,27 @@ PLANAR_VELOCITIES = (
     1,
     5,
 )  # Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
+
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def check_arguments(method: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Decorate a method to raise an InputError that suggests an argument if one has an unknown name."""
+    code = method.__code__
+    valid = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
+
+    @wraps(method)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        for name in kwargs:
+            if name not in valid:
+                successor = suggest_argument(name, valid)
+                words = f"use {successor}=" if successor else f"it takes {', '.join(f'{v}=' for v in valid)}"
+                raise InputError(f"RowBuilder.{method.__name__} has no argument {name}=; {words}")
+        return method(*args, **kwargs)
+
+    return call
 
 
 class Row(NamedTuple):
@@ -114,8 +138,8 @@ class RowBuilder:
     position : array-like (n, 2) or (n, 3), m
         Centres of mass in world coordinates. The number of columns is the number of dimensions.
     baumgarte : float, 0 to 1, default 0.2
-        Fraction of the error of joints and of the penetration of contacts that a step removes (eq. 1). 0 removes none;
-        1 removes all of it and turns it into kinetic energy. Bullet and Box2D use 0.2.
+        Fraction of the error of joints and of the penetration of contacts that a step removes (eq. 1). 0 removes none,
+        so that joints drift apart; 1 removes all of it and turns it into kinetic energy. Bullet and Box2D use 0.2.
     slop : float, m, default 0
         Penetration of contacts that is not corrected, so that resting contacts stay closed. Box2D uses 0.005.
 
@@ -187,13 +211,19 @@ class RowBuilder:
         self._dt = check_float("dt", dt, above=0.0)
         self._baumgarte = check_float("baumgarte", baumgarte, low=0.0, high=1.0)
         self._slop = check_float("slop", slop, low=0.0)
-        self._joints: list[Block] = []
-        self._contacts: list[Contact] = []
+        self._joint_blocks: list[Block] = []
+        self._contact_blocks: list[Contact] = []
         self._keys: set[int] = set()
         self._next_feature: dict[tuple[str, int, int], int] = {}
 
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            raise build_attribute_error("RowBuilder", "'RowBuilder'", name)
+
     # -- joints --------------------------------------------------------------------------------------------------
 
+    @check_arguments
     def ball(
         self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
         *, feature: int | None = None, name: str = "",
@@ -223,6 +253,7 @@ class RowBuilder:
         rows = self._make_point_rows(pair, *self._get_anchors(anchor, anchor_b))
         return self._add_joint("ball", pair, rows, feature, name)
 
+    @check_arguments
     def hinge(
         self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike | None = None,
         anchor_b: ArrayLike | None = None, axis_b: ArrayLike | None = None,
@@ -257,6 +288,7 @@ class RowBuilder:
                 rows.append(self._make_angular_row(pair, side, side, _dot(side, error)))
         return self._add_joint("hinge", pair, rows, feature, name)
 
+    @check_arguments
     def weld(
         self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
         *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
@@ -282,6 +314,7 @@ class RowBuilder:
         ) + self._make_orientation_rows(pair, angle_error)
         return self._add_joint("weld", pair, rows, feature, name)
 
+    @check_arguments
     def slider(
         self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike, anchor_b: ArrayLike | None = None,
         *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
@@ -315,6 +348,7 @@ class RowBuilder:
             "slider", pair, rows + self._make_orientation_rows(pair, angle_error), feature, name
         )
 
+    @check_arguments
     def distance(
         self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float | None = None,
         *, feature: int | None = None, name: str = "",
@@ -341,6 +375,7 @@ class RowBuilder:
         row = self._make_linear_row(pair, direction, point_a, point_b, present - wanted)
         return self._add_joint("distance", pair, [row], feature, name)
 
+    @check_arguments
     def spring(
         self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float,
         *, stiffness: float, damping: float = 0.0, feature: int | None = None, name: str = "",
@@ -380,6 +415,7 @@ class RowBuilder:
         )
         return self._add_joint("spring", pair, [row], feature, name)
 
+    @check_arguments
     def motor(
         self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, speed: float,
         max_torque: float | None = None, max_force: float | None = None, anchor: ArrayLike | None = None,
@@ -421,6 +457,7 @@ class RowBuilder:
         row = row._replace(target=wanted, lower=-bound, upper=bound)
         return self._add_joint("motor", pair, [row], feature, name)
 
+    @check_arguments
     def limit(
         self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, value: float, lower: float = -inf,
         upper: float = inf, anchor: ArrayLike | None = None, feature: int | None = None, name: str = "",
@@ -462,6 +499,7 @@ class RowBuilder:
             )
         return self._add_joint("limit", pair, rows, feature, name)
 
+    @check_arguments
     def gear(
         self, a: int | None, b: int | None, axis_a: ArrayLike | None = None, axis_b: ArrayLike | None = None,
         *, ratio: float, angle_error: float = 0.0, feature: int | None = None, name: str = "",
@@ -497,6 +535,7 @@ class RowBuilder:
 
     # -- contacts ------------------------------------------------------------------------------------------------
 
+    @check_arguments
     def contact(
         self, a: int | None, b: int | None, point: ArrayLike, normal: ArrayLike, *, gap: float = 0.0, mu: float = 0.0,
         restitution: float = 0.0, restitution_threshold: float = 1.0, tangent: ArrayLike | None = None,
@@ -549,7 +588,7 @@ class RowBuilder:
         side = self._choose_tangent(along, tangent)
         arm_a, arm_b = self._compute_arm(pair[0], at), self._compute_arm(pair[1], at)
         key, label = self._reserve_key("contact", pair, feature, name)
-        self._contacts.append(
+        self._contact_blocks.append(
             Contact(
                 name=label,
                 key=key,
@@ -568,6 +607,7 @@ class RowBuilder:
 
     # -- results -------------------------------------------------------------------------------------------------
 
+    @check_arguments
     def problem(self, friction: str = "coulomb", *, shape: str = "disk", name: str = "") -> Problem:
         """Return the problem of the blocks added so far, with keys for warm starts and names for reports.
 
@@ -585,7 +625,7 @@ class RowBuilder:
         Problem
             `lv.solve(problem, impulse=problem.carry(previous))` starts from the solution of the step before.
         """
-        joints, contacts = self._joints, self._contacts
+        joints, contacts = self._joint_blocks, self._contact_blocks
         rows = [row for block in joints for row in block.rows]
         tangents = np.array([self._dimensions - 1 if x.mu > 0.0 else 0 for x in contacts], np.int32)
         data = Rows(
@@ -636,11 +676,11 @@ class RowBuilder:
             impulse is followed by the tangential ones. Call it after all blocks were added: contacts follow joints.
         """
         wanted, start = check_int("key", key, high=2**64 - 1), 0
-        for joint in self._joints:
+        for joint in self._joint_blocks:
             if joint.key == wanted:
                 return slice(start, start + len(joint.rows))
             start += len(joint.rows)
-        for contact in self._contacts:
+        for contact in self._contact_blocks:
             size = self._dimensions if contact.mu > 0.0 else 1
             if contact.key == wanted:
                 return slice(start, start + size)
@@ -777,7 +817,7 @@ class RowBuilder:
     ) -> int:
         """Add a joint and return its key."""
         key, label = self._reserve_key(block_type, pair, feature, name)
-        self._joints.append(Block(label, key, pair, rows))
+        self._joint_blocks.append(Block(label, key, pair, rows))
         return key
 
     # -- rows ----------------------------------------------------------------------------------------------------

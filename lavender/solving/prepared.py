@@ -142,7 +142,7 @@ class Prepared:
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"
                     )
-                valid = {*spec.accepts, *SOLVE_ARGUMENTS}
+                valid = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
                 kind = f"option of solver {spec.name!r}"
                 raise UnknownName(kind, name, valid, suggest_argument(name, valid))
         self.spec = spec

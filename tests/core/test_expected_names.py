@@ -105,3 +105,62 @@ def test_former_names_of_fields_suggest_the_present_one(owner, name, successor):
 
 def test_no_former_name_is_its_own_successor():
     assert not [name for names in INSTEAD.values() for name, successor in names.items() if name == successor]
+
+
+def make_builder():
+    return lv.RowBuilder([1.0, 1.0], [1.0, 1.0], np.zeros((2, 3)), 0.01, [(0.0, 0.0), (1.0, 0.0)])
+
+
+@pytest.mark.parametrize(
+    ("method", "keywords", "words"),
+    [
+        (
+            "contact",
+            {"point": (0.0, 0.0), "normal": (0.0, 1.0), "friction": 0.5},
+            "no argument friction=; use mu=",
+        ),
+        ("motor", {"speed": 1.0, "torque": 2.0}, "no argument torque=; use max_torque="),
+        ("hinge", {"pivot": (0.0, 0.0)}, "no argument pivot=; use anchor="),
+        ("spring", {"k": 2.0}, "no argument k=; use stiffness="),
+        ("hinge", {"nonsense": 1}, "no argument nonsense=; it takes a=, b=, anchor=, axis="),
+    ],
+)
+def test_arguments_of_row_builders_suggest_ours(method, keywords, words):
+    with pytest.raises(lv.InputError, match=words):
+        getattr(make_builder(), method)(-1, 0, **keywords)
+
+
+def test_mistakes_with_a_builder_name_the_call_to_use():
+    builder = make_builder()
+    builder.contact(-1, 0, (0.0, 0.0), normal=(0.0, 1.0), mu=0.5)
+    problem = builder.problem()
+    solution = lv.solve(problem)
+    with pytest.raises(lv.InputError, match=r"is a RowBuilder; .* give the result of its \.problem\(\)"):
+        lv.solve(builder)
+    with pytest.raises(
+        lv.InputError, match=r"impulse is a Solution; .* \.impulse, or problem\.carry\(solution\)"
+    ):
+        lv.solve(problem, impulse=solution)
+    with pytest.raises(lv.InputError, match=r"give its \.impulse"):
+        builder.velocity_after(problem, solution)
+    with pytest.raises(AttributeError, match="no attribute 'contacts'; use contact"):
+        builder.contacts  # noqa: B018
+    with pytest.raises(lv.InputError, match="shape='box' bounds each tangent"):
+        builder.problem("pyramid")
+
+
+@pytest.mark.parametrize("name", ["method", "sovler", "algorithm"])
+def test_other_names_of_the_solver_argument_suggest_it(name):
+    with pytest.raises(lv.UnknownName, match="did you mean 'solver'"):
+        lv.solve(LCP, **{name: "pgs"})
+
+
+def test_no_solver_suggests_auto():
+    with pytest.raises(lv.UnknownName, match="did you mean 'auto'"):
+        lv.solve(LCP, None)
+
+
+@pytest.mark.parametrize(("name", "instead"), [("converged", "success"), ("velocity", "residual.velocity")])
+def test_other_names_of_results_suggest_ours(name, instead):
+    with pytest.raises(AttributeError, match=f"use {instead}"):
+        getattr(lv.solve(LCP), name)

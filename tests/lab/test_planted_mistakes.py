@@ -196,3 +196,14 @@ def test_a_conveyor_and_speeds_in_another_unit_are_not_reported(scenes):
     for length, expected in ((1.0, {"v_free"}), (1e6, set())):  # m, micrometres
         at_rest = replace(wrong, target=0.0 * wrong.target, v_free=length * wrong.v_free)
         assert kinds(at_rest.problem) == expected
+
+
+@pytest.mark.parametrize(
+    ("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])]
+)  # m, at 60 steps per second
+def test_anchors_in_a_wrong_frame_are_reported(offset, kinds):
+    builder = lv.RowBuilder([1.0], np.eye(3)[None], np.zeros((1, 6)), 1 / 60, [(1.0, 0.0, 0.0)])
+    builder.hinge(-1, 0, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), anchor_b=(0.0, 0.0, offset))
+    found = lv.diagnose(builder.problem())
+    assert [diagnostic.kind for diagnostic in found] == kinds
+    assert all(repr(diagnostic) == f"<Diagnostic {diagnostic}>" for diagnostic in found)

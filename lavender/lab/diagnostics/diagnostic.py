@@ -38,6 +38,10 @@ class Diagnostic:
         names = ", ".join(self.names[:3]) + (f", {len(self.names) - 3} more" if len(self.names) > 3 else "")
         return f"{self.kind}: {self.reason}" + (f" ({names})" if names else "")
 
+    def __repr__(self) -> str:
+        """Return the line in angle brackets, so that the tuple that `diagnose` returns can be read."""
+        return f"<{type(self).__name__} {self}>"
+
 
 def make_diagnostic(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Diagnostic:
     """Build a diagnostic of these blocks (empty: of the whole problem), with their names."""

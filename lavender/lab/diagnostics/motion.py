@@ -44,6 +44,29 @@ def get_motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     return u, target, v
 
 
+def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if rows that connect points of two bodies have targets far above usual speeds."""
+    motion = get_motion(p)
+    if p.rows is None or motion is None or not len(p.rows.jac):
+        return
+    jac, count = np.asarray(p.rows.jac), len(p.rows.jac)
+    is_linear = np.any(jac[:, 0:3] != 0.0, axis=1) | np.any(jac[:, 6:9] != 0.0, axis=1)
+    is_rigid = (p.cones.lower[:count] == -np.inf) & (p.cones.upper[:count] == np.inf)
+    if p.compliance is not None:
+        is_rigid &= p.compliance[:count] == 0.0
+    target = motion[1][:count]
+    rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target) > MAX_SEPARATION_TARGET))
+    if len(rows):
+        largest = float(target[rows[np.argmax(np.abs(target[rows]))]])
+        reason = (
+            f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies in "
+            "world coordinates, and is the error of the joint divided by dt once?"
+        )
+        yield make_diagnostic(
+            p, "joint targets", reason, np.searchsorted(p.cones.ptr, rows, side="right") - 1, target=largest
+        )
+
+
 def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about implausible targets of contacts."""
     c = p.cones
@@ -110,7 +133,8 @@ def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
     if slowest < toward.max() < fastest:
         i = int(np.argmax(toward))
         reason = (
-            f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack dt?"
+            f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack dt, or is dt "
+            "in ms?"
         )
         yield make_diagnostic(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
 
@@ -223,4 +247,4 @@ def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool
     return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
 
 
-CHECKS = (diagnose_targets, diagnose_free_velocities, diagnose_flipped_normals)
+CHECKS = (diagnose_joint_targets, diagnose_targets, diagnose_free_velocities, diagnose_flipped_normals)
