@@ -120,7 +120,7 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
-        if self.friction in ("box", "pyramid", "pyramidal"):
+        if isinstance(self.friction, str) and self.friction in ("box", "pyramid", "pyramidal"):
             raise InputError(
                 f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed: shape='box' bounds each tangent "
                 "separately"
