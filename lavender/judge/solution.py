@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class Status(str, Enum):
-    """The solver's claim about how a solve ended; the value describes it."""
+    """The solver's claim about how a solve ended; the value describes it.
+
+    Compare a status with a member, or its `name` with a text: `solution.status == "STALLED"` is always false.
+    """
 
     CONVERGED = "the solver's own test at tol was met"
     ROUNDOFF_LIMIT = "above tol, but within twice the error of rounding to float64"
