@@ -22,10 +22,10 @@ Without the scaling and with the normal row first, this is the problem of this p
 Bodies that cannot move (inverse mass and inertia 0) keep their velocity: their columns of J are zero, and their motion
 is part of the target.
 
-The matrix that the engine factorised, D, is compared with the one of J, M and the compliance. This proves that the
+The matrix that the engine built, D, is compared with the one of J, M and the compliance. This proves that the
 attributes of this version mean what is written here. The comparison runs for the first step of a solver, again
-if its layout changes, and with `verify=True`. Supported is PADMM over the dense Jacobian (the defaults). Other
-configurations are rejected by name.
+if its layout changes, and with `verify=True`. Supported are PADMM and DVI, over a dense or sparse Jacobian. LOX solves
+another problem, and sparse dynamics never form D: both are rejected by name.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ NORMAL_FIRST = np.array([2, 0, 1])
 # Entries of the lower triangle of a body's M that can differ from 0: mass three times, inertia.
 BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2, 3, 3, 4, 3, 4, 5])
 BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
-RESIDUAL_NAMES = ("r_p", "r_d", "r_c")  # compared with its tolerances by the engine; see its PADMMStatus
+# Compared with its tolerances by the engine; see its PADMMStatus and DVIStatus.
+RESIDUAL_NAMES = ("r_p", "r_d", "r_c", "r_b")
+DYNAMICS_SOLVERS = ("padmm", "dvi")
 KAMINO_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
 
 
@@ -68,7 +70,7 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     Parameters
     ----------
     solver : newton.solvers.SolverKamino
-        After `step`, and before the next step or reset. Configured with PADMM and the dense Jacobian.
+        After `step`, and before the next step or reset. Configured with PADMM or DVI, and without sparse dynamics.
     verify : bool, default False
         Compare the engine's matrix of every world with the one of J, M and the compliance, not only at the first step.
 
@@ -84,9 +86,8 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     InputError
         `solver` is not a SolverKamino, or has no constraints.
     CapabilityError
-        Another configuration (DVI, LOX, a sparse Jacobian or sparse dynamics); attributes of this version of newton are
-        missing; a body's inverse inertia is singular; or the engine's matrix differs from the one of J, M and the
-        compliance.
+        Another configuration (LOX or sparse dynamics); attributes of this version of newton are missing; a body's
+        inverse inertia is singular; or the engine's matrix differs from the one of J, M and the compliance.
     """
     verify = check_bool("verify", verify)
     engine = getattr(solver, "_solver_kamino", None)
@@ -106,19 +107,21 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
 
 
 def _check_configuration(engine: Any) -> None:
-    """Raise an error unless the engine solves by PADMM over a dense Jacobian and has constraints."""
+    """Raise an error unless the engine solves the dual problem, forms its matrix and has constraints."""
     config = engine._config
-    for needed, name, value in (
-        ("padmm", "dynamics_solver", config.dynamics_solver),
-        (False, "sparse_jacobian", config.sparse_jacobian),
-        (False, "sparse_dynamics", config.sparse_dynamics),
+    if config.dynamics_solver not in DYNAMICS_SOLVERS:
+        raise CapabilityError(
+            f"dynamics_solver={config.dynamics_solver!r} solves another problem; dynamics_solver="
+            f"{' or '.join(map(repr, DYNAMICS_SOLVERS))} of SolverKamino.Config is supported"
+        )
+    if config.sparse_dynamics:
+        raise CapabilityError(
+            "sparse_dynamics=True never forms the matrix with which the importer proves that it reads the right arrays; "
+            "sparse_dynamics=False of SolverKamino.Config is supported"
+        )
+    if engine.problem_fd is None or (
+        not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
-        if value != needed:
-            raise CapabilityError(
-                f"{name}={value!r} stores the problem in another form; {name}={needed!r} of SolverKamino.Config is "
-                "supported"
-            )
-    if engine.problem_fd is None or engine._jacobians.data.J_cts_data is None:
         raise InputError(
             "this model has no joints, limits or contacts: there is no constraint problem to convert"
         )
@@ -165,6 +168,22 @@ class _Worlds:
         self.begins_contact[self.is_contact_row] = rank == 0
         self.position = _as_int(problem.vio)[self.world] + self.source  # in vectors of all rows
         self.velocity_world = np.repeat(np.arange(n), self.columns)
+        self.jacobian_values, self.jacobian_start = self._read_jacobian()
+
+    def _read_jacobian(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all entries of J, world after world with rows in the engine's order, and each world's first entry."""
+        if not self.engine._config.sparse_jacobian:
+            data = self.engine._jacobians.data
+            return data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
+        blocks = self.engine._jacobians._J_cts.bsm  # of one row and the six columns of a body
+        count, start = _as_int(blocks.num_nzb), _pointers(self.rows * self.columns)
+        world = np.repeat(np.arange(self.n), count)
+        block = _as_int(blocks.nzb_start)[world] + np.arange(len(world)) - _pointers(count)[world]
+        row, column = _as_int(blocks.nzb_coords)[block].T
+        first = start[world] + row * self.columns[world] + column
+        values = np.zeros(start[-1], np.float32)
+        values[first[:, None] + np.arange(COLUMNS_PER_BODY)] = blocks.nzb_values.numpy()[block]
+        return values, start[:-1]
 
     def convert(self) -> tuple[Batch, FloatArray]:
         """Build the batch and the impulses."""
@@ -214,8 +233,7 @@ class _Worlds:
 
     def _jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Return J and J v*: (rows, nv) if worlds have equal numbers of bodies, else one array of all entries."""
-        data = self.engine._jacobians.data
-        values, start = data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
+        values, start = self.jacobian_values, self.jacobian_start
         first = start[self.world] + self.source * self.columns[self.world]  # of each row
         if self.has_equal_bodies:
             nv = int(self.columns[0])
@@ -384,9 +402,8 @@ class _Worlds:
         sigma = float(self.engine.solver_fd.data.state.sigma.numpy()[i][0])
         first = int(_as_int(self.problem.vio)[i])
         scale = _floats(self.problem.P[first : first + size])
-        data, nv = self.engine._jacobians.data, int(self.columns[i])
-        begin = int(_as_int(data.J_cts_offsets)[i])
-        jac = _floats(data.J_cts_data[begin : begin + size * nv]).reshape(size, nv)
+        nv, begin = int(self.columns[i]), int(self.jacobian_start[i])
+        jac = self.jacobian_values[begin : begin + size * nv].astype(float).reshape(size, nv)
         blocks = jac.reshape(size, -1, 2, 3)
         inv_mass, inv_inertia = (
             _floats(x[bodies]) for x in (self.engine._model.bodies.inv_m_i, self.engine.data.bodies.inv_I_i)

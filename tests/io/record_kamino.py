@@ -3,10 +3,10 @@
     pip install newton==1.8.0 warp-lang==1.19.0
     python tests/io/record_kamino.py tests/io/kamino_1.8.0.npz
 
-Two models are stepped: worlds of different sizes (a stack, a cart and pole, a nunchaku, a four-bar linkage with an
-implicit spring), and eight stacks, of which one has a NaN velocity. The file holds the arrays under their attribute
-names, the velocities of the bodies after the step, and the versions. `test_io_kamino.py` converts them without the
-engine.
+Three models are stepped: worlds of different sizes (a stack, a cart and pole, a nunchaku, a four-bar linkage with an
+implicit spring), by PADMM over a dense Jacobian and by DVI over a sparse one; and eight stacks, of which one has a NaN
+velocity. The file holds the arrays under their attribute names, the velocities of the bodies after the step, and the
+versions. `test_io_kamino.py` converts them without the engine.
 """
 
 import sys
@@ -34,12 +34,14 @@ PATHS = (
     "_solver_kamino.data.bodies.inv_I_i",
     "_solver_kamino.data.joints.inv_m_j",
     "_solver_kamino.data.joints.inv_m_a",
-    "_solver_kamino._jacobians.data.J_cts_data",
-    "_solver_kamino._jacobians.data.J_cts_offsets",
     "_solver_kamino.solver_fd.data.solution.lambdas",
     "_solver_kamino.solver_fd.data.state.sigma",
     *(f"_contacts_kamino.data.{name}" for name in CONTACTS),
     "status",
+)
+DENSE_JACOBIAN = ("_solver_kamino._jacobians.data.J_cts_data", "_solver_kamino._jacobians.data.J_cts_offsets")
+SPARSE_JACOBIAN = tuple(
+    f"_solver_kamino._jacobians._J_cts.bsm.{name}" for name in ("num_nzb", "nzb_start", "nzb_coords", "nzb_values")
 )
 LABELS = ("_solver_kamino._model.joints.label", "_solver_kamino._model.bodies.label")
 
@@ -51,7 +53,7 @@ def read(root, path):
     return root
 
 
-def step_worlds(parts, is_diverged):
+def step_worlds(parts, is_diverged, **config):
     """Step worlds made of `parts`; return the solver and the velocities of all bodies after the last step."""
     import newton
     from newton.solvers import SolverKamino
@@ -61,7 +63,7 @@ def step_worlds(parts, is_diverged):
     for part in parts:
         builder.add_world(part)
     model = builder.finalize(device="cpu")
-    solver = SolverKamino(model)
+    solver = SolverKamino(model, config=SolverKamino.Config(**config))
     before, after, control = model.state(), model.state(), model.control()
     pipeline = newton.CollisionPipeline(model)
     contacts = pipeline.contacts()
@@ -86,9 +88,14 @@ def main(out):
         basics.build_boxes_fourbar(dynamic_joints=True, implicit_pd=True),
     ]
     arrays = {"versions": np.array([f"{name} {version(name)}" for name in ("newton", "warp-lang")])}
-    for model, parts in (("mixed", mixed), ("stacks", [basics.build_boxes_stacked_on_plane()] * 8)):
-        solver, velocity = step_worlds(parts, model == "stacks")
-        for path in PATHS:
+    stacks = [basics.build_boxes_stacked_on_plane()] * 8
+    for model, parts, config in (
+        ("mixed", mixed, {}),
+        ("stacks", stacks, {}),
+        ("dvi", mixed, {"dynamics_solver": "dvi", "sparse_jacobian": True}),
+    ):
+        solver, velocity = step_worlds(parts, model == "stacks", **config)
+        for path in (*PATHS, *(SPARSE_JACOBIAN if model == "dvi" else DENSE_JACOBIAN)):
             arrays[f"{model}/{path}"] = read(solver, path).numpy()
         for path in LABELS:
             arrays[f"{model}/{path}"] = np.array(list(read(solver, path)))

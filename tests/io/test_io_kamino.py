@@ -49,7 +49,10 @@ def load(model, **changes):
                 at = getattr(at, name)
             setattr(at, path[-1], list(array) if path[-1] == "label" else Recorded(array))
     engine = solver._solver_kamino
-    engine._config = SimpleNamespace(dynamics_solver="padmm", sparse_jacobian=False, sparse_dynamics=False)
+    is_dvi = model == "dvi"
+    engine._config = SimpleNamespace(
+        dynamics_solver="dvi" if is_dvi else "padmm", sparse_jacobian=is_dvi, sparse_dynamics=False
+    )
     engine.problem_fd.data.compliance = None
     return solver, velocity
 
@@ -73,7 +76,7 @@ def normals_first(joints, bounded, limits, contacts):
     return [*range(before), *(before + 3 * k + j for k in range(contacts) for j in (2, 0, 1))]
 
 
-@pytest.mark.parametrize("model", ["mixed", "stacks"])
+@pytest.mark.parametrize("model", ["mixed", "stacks", "dvi"])
 def test_problems_are_the_engines(model):
     solver, _ = load(model)
     step = lv.io.from_kamino(solver, verify=True)
@@ -99,9 +102,10 @@ def test_problems_are_the_engines(model):
         assert len(problem.names) == problem.cones.n_blocks
 
 
-def test_verdicts_agree_with_own_arithmetic():
+@pytest.mark.parametrize("model", ["mixed", "dvi"])
+def test_verdicts_agree_with_own_arithmetic(model):
     """The judge's velocity error against complementarity, cone and momentum computed here from the engine's D."""
-    solver, _ = load("mixed")
+    solver, _ = load(model)
     step = lv.io.from_kamino(solver)
     judged = lv.residual_many(step.batch, step.impulse).velocity_error
     for i in range(len(step.batch)):
@@ -121,8 +125,9 @@ def test_verdicts_agree_with_own_arithmetic():
         assert 0.5 * judged[i] - 1e-6 <= worst <= 2.0 * judged[i] + 1e-6, (i, worst, judged[i])
 
 
-def test_velocity_after_the_step_is_the_engines():
-    solver, after = load("mixed")
+@pytest.mark.parametrize("model", ["mixed", "dvi"])
+def test_velocity_after_the_step_is_the_engines(model):
+    solver, after = load(model)
     step = lv.io.from_kamino(solver)
     start = 0
     for i in range(len(step.batch)):
@@ -166,7 +171,7 @@ def test_matrix_is_compared_once_or_on_request():
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("dynamics_solver", "dvi"), ("sparse_jacobian", True), ("sparse_dynamics", True)]
+    ("option", "value"), [("dynamics_solver", "lox"), ("sparse_dynamics", True)]
 )
 def test_other_configurations_are_rejected_by_name(option, value):
     solver, _ = load("mixed")
@@ -219,14 +224,24 @@ def test_immovable_bodies_keep_their_velocity():
     assert np.abs(pushed[:6] - free[:6]).max() > 0.1
 
 
-def test_engine_itself():
-    """The recorded arrays are those of the engine that is installed."""
+def test_wrong_blocks_of_a_sparse_jacobian_are_rejected():
+    with pytest.raises(lv.CapabilityError, match=r"world \d: the engine's matrix differs"):
+        lv.io.from_kamino(load("dvi", nzb_coords=lambda x: x[:, ::-1])[0])
+
+
+@pytest.mark.parametrize("config", [
+    {}, {"sparse_jacobian": True}, {"dynamics_solver": "dvi"},
+    {"dynamics_solver": "dvi", "sparse_jacobian": False},
+])  # fmt: skip
+def test_engine_itself(config):
+    """The installed engine has the recorded attributes, and its matrix is the one of J, M and the compliance."""
     pytest.importorskip("newton")
     from record_kamino import step_worlds
 
     from newton.tests.utils import basics  # isort: skip
 
-    solver, after = step_worlds([basics.build_boxes_hinged()] * 2, False)
+    solver, after = step_worlds([basics.build_boxes_hinged()] * 2, False, **config)
     step = lv.io.from_kamino(solver, verify=True)
     assert (lv.residual_many(step.batch, step.impulse).velocity_error < 1e-4).all()
-    assert len(after) == 4
+    velocity = np.concatenate([step.batch[i].velocity(step.impulse[step.batch.rows_of(i)]) for i in range(2)])
+    assert np.abs(velocity - after.ravel()).max() <= VELOCITY_TOLERANCE
