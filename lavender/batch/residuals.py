@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.base.array_libraries import find_converter
 from lavender.base.arrays import (
     FloatArray,
     as_array,
@@ -42,7 +43,9 @@ NO_MORE_WORLDS = -1  # return value of the methods of `Worker`
 
 
 class Many:
-    """n worlds and their judged numbers; all arrays are read-only.
+    """n worlds and their judged numbers.
+
+    All arrays are read-only, or copies in the library of `like`.
 
     Parameters
     ----------
@@ -51,9 +54,12 @@ class Many:
         Flat impulses [N s] of the batch, or (m,) or None for each problem.
     cold : bool
         Whether all worlds start from the zero impulse.
+    like : array, optional
+        An array of the library of the results.
     """
 
-    def __init__(self, problems: Any, starts: Any, cold: bool) -> None:
+    def __init__(self, problems: Any, starts: Any, cold: bool, like: Any = None) -> None:
+        self._convert = find_converter(like)
         self.problems: Sequence[Problem] = problems
         self.faults: dict[int, LavenderError] = {}
         self._invalid_starts: dict[int, LavenderError] = {}  # These worlds start from the zero impulse.
@@ -75,38 +81,42 @@ class Many:
     @property
     def relative(self) -> FloatArray:
         """Relative residual (n,) [-]; NaN for an invalid world."""
-        return self._get_column("relative")
+        return self._export(self._get_column("relative"))
 
     @property
     def energy(self) -> FloatArray:
         """Energy norm of the error (n,) [sqrt J]."""
-        return self._get_column("energy")
+        return self._export(self._get_column("energy"))
 
     @property
     def velocity_error(self) -> FloatArray:
         """Velocity error of the worst row (n,) [m/s]."""
-        return self._get_column("speed")
+        return self._export(self._get_column("speed"))
 
     @property
     def velocity_at_zero(self) -> FloatArray:
         """Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."""
-        return self._get_column("reference_speed")
+        return self._export(self._get_column("reference_speed"))
 
     @property
     def impulse_error(self) -> FloatArray:
         """Impulse error of the worst row (n,) [N s]."""
-        return self._get_column("push")
+        return self._export(self._get_column("push"))
 
     @property
     def roundoff_floor(self) -> FloatArray:
         """Relative residual that rounding alone can cause (n,) [-]."""
-        return self._get_column("roundoff_floor")
+        return self._export(self._get_column("roundoff_floor"))
 
     @property
     def worst_row(self) -> np.ndarray:
         """Row of the largest velocity error (n,), as an index in its world; -1 for a world without rows."""
         self._judge_late_worlds()
-        return mark_read_only(self._worlds.worst[:-1])
+        return self._export(self._worlds.worst[:-1])
+
+    def _export(self, array: np.ndarray) -> Any:
+        """Return an array as callers receive it: read-only, or a copy in the library of `like`."""
+        return mark_read_only(array) if self._convert is None else self._convert(array)
 
     def _get_column(self, which: str) -> FloatArray:
         self._judge_late_worlds()
@@ -132,10 +142,10 @@ class Many:
         self._worlds.worst[i] = residual.worst_row
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the results without the data of the compiled loop."""
+        """Return the results, in NumPy arrays, without the data of the compiled loop."""
         loop = self._worlds
         results = SimpleNamespace(numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code)
-        return vars(self) | {"_worlds": results, "_data": None}
+        return vars(self) | {"_worlds": results, "_data": None, "_convert": None}
 
     def __len__(self) -> int:
         return len(self.problems)
@@ -215,8 +225,10 @@ class Residuals(Many):
         Errors of invalid worlds, by their indices.
     """
 
-    def __init__(self, problems: Any, starts: Any, precision: Sequence[str], threshold: float) -> None:
-        super().__init__(problems, starts, False)
+    def __init__(
+        self, problems: Any, starts: Any, precision: Sequence[str], threshold: float, like: Any = None
+    ) -> None:
+        super().__init__(problems, starts, False, like)
         self.precision, self.threshold = precision, threshold
         if not isinstance(problems, Batch):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
@@ -246,7 +258,8 @@ class Residuals(Many):
     def excess(self) -> FloatArray:
         """Relative residual divided by its floor (n,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.relative == 0.0, 0.0, self.relative / self.roundoff_floor)
+            relative, floor = self._get_column("relative"), self._get_column("roundoff_floor")
+            return self._export(np.where(relative == 0.0, 0.0, relative / floor))
 
     def store_residual(self, i: int, residual: Residual) -> None:
         """Store the residual of a world that a single call processed."""
@@ -271,6 +284,7 @@ def residual_many(
     threshold: float = DEFAULT_THRESHOLD,
     threads: int = 1,
     errors: str = "raise",
+    like: Any = None,
 ) -> Residuals:
     """Judge impulses of many worlds: compute an error and a verdict for each.
 
@@ -286,6 +300,8 @@ def residual_many(
     threads : int
     errors : {"raise", "status"}
         As for `solve_many`; the verdict of an invalid world is empty.
+    like : array, optional
+        As for `solve_many`.
 
     Returns
     -------
@@ -323,7 +339,7 @@ def residual_many(
                     f"impulses of world {i} is None, and the problem has no guess; (m,) is needed"
                 )
         precisions = [p.precision if precision is None else precision for p in worlds]
-    residuals = Residuals(worlds, starts, precisions, threshold)
+    residuals = Residuals(worlds, starts, precisions, threshold, like)
     is_single_precision = isinstance(worlds, Batch) and "float32" in precisions
 
     def judge_single(i: int) -> None:

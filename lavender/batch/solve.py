@@ -56,7 +56,9 @@ INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
 
 class Solutions(Many, Sequence[Solution]):
-    """Results of `solve_many`, in read-only arrays; `many[i]` is the `Solution` of world i.
+    """Results of `solve_many`, in arrays; `many[i]` is the `Solution` of world i, in NumPy arrays.
+
+    Arrays are read-only NumPy arrays, or copies in the library of `like`, except `status` and `ptr`.
 
     `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of solutions. Access to a world with the status
     INVALID_PROBLEM raises its error.
@@ -89,8 +91,9 @@ class Solutions(Many, Sequence[Solution]):
         spec: SolverSpec,
         options: dict[str, Any],
         errors: str,
+        like: Any = None,
     ) -> None:
-        super().__init__(problems, starts, cold)
+        super().__init__(problems, starts, cold, like)
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
@@ -109,11 +112,15 @@ class Solutions(Many, Sequence[Solution]):
     def impulse(self) -> FloatArray:
         """Impulses [N s], see the class."""
         shape = self.problems.shape if isinstance(self.problems, Batch) else self._impulse.shape
-        return mark_read_only(self._impulse.reshape(shape))
+        return self._export(self._impulse.reshape(shape))
 
-    @cached_property
+    @property
     def velocity(self) -> FloatArray:
         """v+ [m/s, rad/s]: (n, nv) for a stacked batch, else concatenated; problems given as a matrix have none."""
+        return self._export(self._velocities)
+
+    @cached_property
+    def _velocities(self) -> FloatArray:
         if isinstance(self.problems, Batch):
             self._judge_late_worlds()
             return mark_read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
@@ -140,14 +147,18 @@ class Solutions(Many, Sequence[Solution]):
     @property
     def iterations(self) -> np.ndarray:
         """Iterations (n,) in the solver's own unit."""
-        return mark_read_only(self._worlds.counts[:-1, 0])
+        return self._export(self._worlds.counts[:-1, 0])
 
     @property
     def success(self) -> np.ndarray:
         """Whether each world (n,) has a relative residual up to `tol`, or a velocity error up to `velocity_tol`."""
+        return self._export(self._is_solved)
+
+    @property
+    def _is_solved(self) -> np.ndarray:
         if self.velocity_tol is not None:
-            return self.velocity_error <= self.velocity_tol
-        return self.relative <= self.tol
+            return self._get_column("speed") <= self.velocity_tol
+        return self._get_column("relative") <= self.tol
 
     @property
     def ptr(self) -> np.ndarray:
@@ -292,7 +303,7 @@ class Solutions(Many, Sequence[Solution]):
         return counts if problem.generalized is None else counts[:4]
 
     def __repr__(self) -> str:
-        return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self.success.sum())} to {self.tol:g}>"
+        return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self._is_solved.sum())} to {self.tol:g}>"
 
 
 def solve_many(
@@ -307,6 +318,7 @@ def solve_many(
     max_iter: int | None = None,
     time_limit: float | None = None,
     errors: str = "raise",
+    like: Any = None,
     **options: Unpack[ManyOptions],
 ) -> Solutions:
     """Solve many problems, with results that are bit-identical to `solve` for any number of threads.
@@ -333,6 +345,9 @@ def solve_many(
     errors : {"raise", "status"}
         For worlds with invalid data or an invalid start (NaN, an M that is not definite, a negative mu): raise the
         error of the first one, or give them the status INVALID_PROBLEM and store the errors in `Solutions.faults`.
+    like : array, optional
+        An array of PyTorch, JAX, CuPy, Warp or another library with DLPack. Arrays of the result are copies in its
+        library and on its device; floats have its floating dtype. Default: NumPy.
 
     Returns
     -------
@@ -342,7 +357,8 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, starts do not fit the problems, or as for `solve`.
+        `threads` is not a whole number from 1, starts do not fit the problems, `like` is no array of such a library,
+        or as for `solve`.
     UnknownName, CapabilityError, SolverUnavailable
         As for `solve`, for the first world that is not accepted.
     KeyboardInterrupt
@@ -357,7 +373,7 @@ def solve_many(
     check_budget(spec, tol, max_iter)
     starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
-    solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors)
+    solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     if deadline.is_set:
         deadline.reserve(1e-9 * solutions._estimate_late_judging_cost())

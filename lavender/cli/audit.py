@@ -70,11 +70,10 @@ def audit(
             if is_option_set(context, name):
                 raise InputError(f"--{name} needs --engine mujoco: leave it out")
     if options["engine"] in CLAIM_ENGINES:
-        for name in ("spread", "controls", "seed", "states"):
-            if is_option_set(context, name) or is_option_set(context, name.removesuffix("s")):
-                raise InputError(
-                    f"--{name} is for models of MuJoCo; the scene of {options['engine']} sets its own"
-                )
+        if is_option_set(context, "control"):
+            raise InputError(
+                f"--controls is for models of MuJoCo; the scene of {options['engine']} sets its own"
+            )
         _audit_claims(context, model, out, max_velocity_error, options)
         return
     context.with_resource(lock_output(out, folder=True))
@@ -99,7 +98,8 @@ def _audit_claims(
     from lavender.lab.engine_scenes import step_scene
 
     worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
-    stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps)
+    starts = {name: options[name] for name in ("states", "spread", "seed")}
+    stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps, **starts)
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with show_progress() as watch:

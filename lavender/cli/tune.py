@@ -13,7 +13,14 @@ from lavender.io.stored import lock_output
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=FILE)
+@click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
+@click.option(
+    "--engine",
+    default="mujoco",
+    show_default=True,
+    metavar="mujoco|mujoco_warp|kamino",
+    help="Engine whose settings are measured.",
+)
 @add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
@@ -22,12 +29,14 @@ from lavender.io.stored import lock_output
               show_default=True, help="Folder of the page.")  # fmt: skip
 @click.pass_context
 def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> None:
-    """Find faster or more accurate MuJoCo settings for a model.
+    """Find faster or more accurate settings of an engine for a model.
 
-    MODEL.xml is an MJCF file. The time and the error of a step are measured with many settings on worlds of the model.
-    Two <option> lines are printed: one that is faster and as accurate as the present setting, and one that is more
-    accurate and as fast. Both are chosen on half of the worlds and validated on the other half. No line is printed if
-    fewer than 20 % of the steps have contact: then start from states with contact (--states).
+    MODEL.xml is an MJCF file. For kamino, SCENE.py is a Python file whose function build() returns a
+    newton.ModelBuilder of one world, or the name of a builder in newton.tests.utils.basics. The time and the error of a
+    step are measured with many settings on worlds of the model. Two lines with options are printed: one that is faster
+    and as accurate as the present setting, and one that is more accurate and as fast. Both are chosen on half of the
+    worlds and validated on the other half. No line is printed if fewer than 20 % of the steps have contact: then start
+    from states with contact (--states).
 
     Exit code 130: stopped by Ctrl-C; the page shows the completed part.
     """

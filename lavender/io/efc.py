@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lavender.base.array_libraries import find_converter
 from lavender.base.arrays import (
     FloatArray,
     as_array,
@@ -84,6 +85,7 @@ def from_efc(
     efc_force: Any = None,
     qfrc_smooth: Any = None,
     friction: str = "cone",
+    like: Any = None,
 ) -> Imported:
     """Build constraint problems from stacked arrays of n worlds with at most m rows each, in float32 or float64.
 
@@ -113,6 +115,8 @@ def from_efc(
     friction : {"cone", "coulomb"}, default "cone"
         Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
         Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.
+    like : array, optional
+        The impulses are a copy in the library of this array, as for `solve_many`. Default: NumPy.
 
     Returns
     -------
@@ -129,6 +133,7 @@ def from_efc(
         contact with torsional or rolling friction, or with different coefficients of its tangents.
     """
     friction = check_choice("friction", friction, FRICTION_LAWS)
+    convert = find_converter(like)
     jac, before = as_float_array("efc_J", efc_J), as_float_array("qvel", qvel)
     # MJX and Warp store the time step as an array of one number.
     is_one = np.prod(get_shape("timestep", timestep)) == 1
@@ -182,7 +187,8 @@ def from_efc(
     if efc_force is None:
         return Imported(batch, None)
     lam = np.where(used_rows, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
-    return Imported(batch, lam if scale is None else lam / scale)
+    lam = lam if scale is None else lam / scale
+    return Imported(batch, lam if convert is None else convert(lam))
 
 
 def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str = "raise") -> Imported:

@@ -36,8 +36,12 @@ class EngineStep(NamedTuple):
     impulse : array of the batch's shape, N s
         The engine's answer in the rows of the batch.
     claims : Claims
+    state : dict of (n, ...) arrays, optional
+        State before the step by the engine's names. Importers, which read the state after the step, leave it empty;
+        `lavender.lab.engine_scenes` fills it.
     """
 
     batch: Batch
     impulse: FloatArray
     claims: Claims
+    state: dict[str, FloatArray] | None = None

@@ -116,7 +116,7 @@ def _check_configuration(engine: Any) -> None:
         )
     if config.sparse_dynamics:
         raise CapabilityError(
-            "sparse_dynamics=True never forms the matrix with which the importer proves that it reads the right arrays; "
+            "sparse_dynamics=True never forms the matrix that proves which arrays the importer reads; "
             "sparse_dynamics=False of SolverKamino.Config is supported"
         )
     if engine.problem_fd is None or (
@@ -220,6 +220,7 @@ class _Worlds:
         )  # fmt: skip
         batch.precision = "float32"
         batch.names_of = self._block_names(first)
+        batch.contact_counts = self.contacts
         return batch, _floats(self.engine.solver_fd.data.solution.lambdas)[self.position]
 
     def _worlds_of_rows(self, rows: np.ndarray) -> np.ndarray:

@@ -168,7 +168,8 @@ class Recorder:
             written. Worlds that cannot be judged raise no error; their first step has a line with the reason.
         """
         if isinstance(problems, EngineStep):
-            problems, impulse, claims = problems
+            state = problems.state if state is None else state
+            problems, impulse, claims = problems[:3]
         elif isinstance(problems, tuple):
             problems, impulse = problems
         if impulse is None:

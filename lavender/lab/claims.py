@@ -23,7 +23,8 @@ from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
 from lavender.io.engine_step import EngineStep
-from lavender.io.recorder import Recorder
+from lavender.io.recorder import STATES_FOLDER, Recorder, read_recorded_state
+from lavender.io.stored import write_arrays
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.summary_page import PageSection, SummaryPage
@@ -40,6 +41,7 @@ OUTCOMES = (
     "not claimed, not finite",
 )
 RIGHT_OUTCOMES, WRONG_OUTCOMES = (0, 2), (1, 3)
+STATES_FILE = "states.npz"
 N_KEPT_PROBLEMS = 8  # The worst answers are written to files.
 NUMBER_PATTERN = re.compile(
     r"\b\d+\b"
@@ -54,7 +56,8 @@ MASS_NOTE = (
     "velocity errors of light bodies."
 )
 WORST_FILES_NOTE = (
-    "Problems with the engine's impulses and claims, in the folder worst: lavender check reads it."
+    "Problems with the engine's impulses and claims, in the folder worst: lavender check reads it. states.npz holds "
+    "the states before these steps (--states starts from them again)."
 )
 
 
@@ -209,7 +212,8 @@ def compare_claims(
         Name in the tables.
     threshold : float, default 1e-4 m/s
     folder : path, optional
-        The worst answers are recorded in its folder `worst` (`lavender.io.Recorder`).
+        The worst answers are recorded in its folder `worst` (`lavender.io.Recorder`), and the states before them, if
+        the steps have states, in its file `states.npz`.
     total : int, optional
         Number of steps, for the progress.
     watch : callable, optional
@@ -264,11 +268,26 @@ def compare_claims(
     finally:
         if recorder is not None:
             recorder.close()
+            _write_states(recorder)
     if not outcomes:
         raise InputError("there are no steps to judge")
     result.outcome, result.velocity = np.array(outcomes), np.array(velocities)
     result.iterations = np.array(iterations)
     return result
+
+
+def _write_states(recorder: Recorder) -> None:
+    """Write `states.npz` next to the recorder's folder: the states before the recorded steps, from which to start."""
+    labels = [NUMBER_PATTERN.findall(file.replace("_", " ")) for file in recorder.files]
+    folder = recorder.folder / STATES_FOLDER
+    found = [
+        (file, label) for file, label in zip(recorder.files, labels, strict=True) if (folder / file).is_file()
+    ]
+    states = [read_recorded_state(recorder.folder, file) for file, _ in found]
+    arrays = {name: np.array([state[name] for state in states]) for name in (states[0] if states else ())}
+    if arrays:
+        step, world = np.array([label for _, label in found], int).T
+        write_arrays(recorder.folder.parent / STATES_FILE, arrays | {"step": step, "world": world})
 
 
 def _judge(step: EngineStep, result: ClaimComparison) -> tuple[Any, FloatArray]:

@@ -14,7 +14,7 @@ worlds at once, in float32.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -315,29 +315,46 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
     names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
     start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
     try:
-        step = {"mjx": _make_mjx_stepper, "mujoco_warp": _make_warp_stepper}[engine](mj, model, start_arrays)
+        step = {"mjx": _make_mjx_stepper, "mujoco_warp": WarpWorlds}[engine](mj, model, start_arrays)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
     except (NotImplementedError, ValueError) as error:
         raise InputError(f"engine {engine!r} does not accept {runs.model}: {error}") from None
-    dt = float(model.opt.timestep)
     for k in range(runs.steps):
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
-        state, efc, mass, contact, extra = step(ctrl)
-        world_of, address, dim, friction, _ = contact
-        problem_arrays = {f"efc_{name}": x for name, x in efc.items()} | extra
-        triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
-        problem_arrays |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
-        problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
-        problems.batch.names_of = _make_block_namer(mj, model, problems.batch, efc["type"], contact)
-        assert problems.impulse is not None
-        yield Frame(
-            problems.batch,
-            problems.impulse,
-            state,
-            *_count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address),
-        )
+        yield make_frame(mj, model, *step(ctrl))
+
+
+def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any) -> Frame:
+    """Build the frame of a step of all worlds from the engine's arrays.
+
+    Parameters
+    ----------
+    state : dict of (worlds, ...)
+    efc : dict
+        Arrays of constraint rows, without the prefix `efc_`.
+    mass : array
+        M, or its lower triangles in compressed rows.
+    contact : tuple
+        World, first row, dim, friction and geoms of the contacts.
+    extra : dict
+        Further arguments of `from_efc`.
+    """
+    world_of, address, dim, friction, _ = contact
+    problem_arrays = {f"efc_{name}": x for name, x in efc.items()} | extra
+    triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+    problem_arrays |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
+    dt = float(model.opt.timestep)
+    problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
+    problems.batch.names_of = _make_block_namer(mj, model, problems.batch, efc["type"], contact)
+    assert problems.impulse is not None
+    return Frame(
+        problems.batch,
+        problems.impulse,
+        state,
+        *_count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address),
+    )
 
 
 def _count_rows_and_contacts(
@@ -394,44 +411,81 @@ def _concatenate_worlds(x: Any, n: int, size: int, *each: int) -> Any:
     return np.broadcast_to(np.asarray(x), (n, size, *each)).reshape(n * size, *each)
 
 
-def _make_warp_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
-    """Return the function that steps all worlds with MuJoCo Warp and returns the data of the step."""
-    import mujoco_warp as mjw
-    import warp as wp
+class WarpWorlds:
+    """Worlds of a model in MuJoCo Warp.
 
-    wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
-    first = mj.MjData(model)
-    mj.mj_forward(model, first)
-    rows = max(MIN_WARP_ROWS, 2 * int(first.nefc))
-    device_model, n = mjw.put_model(model), len(start_arrays["qpos"])
-    data = mjw.put_data(model, first, nworld=n, njmax=rows, nconmax=rows)
-    for name, x in start_arrays.items():
-        if x.size:
-            getattr(data, name).assign(x)
+    Parameters
+    ----------
+    mj : module
+        MuJoCo.
+    model : mujoco.MjModel
+        With a dense Jacobian.
+    start_arrays : dict of (worlds, ...)
+        State in which the worlds start, by the names of MjData.
+    """
 
-    def step(ctrl: Any) -> Any:
+    def __init__(self, mj: Any, model: Any, start_arrays: dict[str, Any]) -> None:
+        import mujoco_warp as mjw
+        import warp as wp
+
+        wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
+        self.mjw, self.wp, self.nv = mjw, wp, model.nv
+        first = mj.MjData(model)
+        mj.mj_forward(model, first)
+        self.rows = max(MIN_WARP_ROWS, 2 * int(first.nefc))
+        self.n = len(start_arrays["qpos"])
+        self.data = mjw.put_data(model, first, nworld=self.n, njmax=self.rows, nconmax=self.rows)
+        self.configure(model)
+        self.start(start_arrays)
+
+    def configure(self, model: Any) -> None:
+        """Use the options of a model that is otherwise equal."""
+        self.device_model = self.mjw.put_model(model)
+        if hasattr(self.device_model.opt, "warn_overflow"):
+            self.device_model.opt.warn_overflow = 0  # Do not print a line for each solve that uses up its iterations.
+
+    def start(self, start_arrays: dict[str, Any]) -> None:
+        """Continue from a state of all worlds."""
+        for name, x in start_arrays.items():
+            if x.size:
+                getattr(self.data, name).assign(x)
+
+    def read_state(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return copies of some arrays of the state."""
+        return {name: getattr(self.data, name).numpy().copy() for name in names}
+
+    def advance(self, ctrl: Any) -> None:
+        """Step all worlds with these controls, and wait until the step is complete."""
+        self.data.ctrl.assign(ctrl)
+        self.mjw.step(self.device_model, self.data)
+        self.wp.synchronize()
+
+    def compute_body_positions(self) -> Any:
+        """Return the positions of all bodies (worlds, bodies, 3) [m] in the present state."""
+        self.mjw.kinematics(self.device_model, self.data)
+        return self.data.xpos.numpy().astype(float)
+
+    def __call__(self, ctrl: Any) -> Any:
         """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
+        data, rows = self.data, self.rows
         data.ctrl.assign(ctrl)
-        state = {name: getattr(data, name).numpy().copy() for name in STEP_FIELDS}
-        mjw.forward(device_model, data)
-        if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > n * rows:
+        state = self.read_state(STEP_FIELDS)
+        self.mjw.forward(self.device_model, data)
+        if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > self.n * rows:
             raise CapabilityError(
                 f"a world has more rows or contacts than the {rows} for which memory was allocated"
             )
-        e, c, nv = data.efc, data.contact, model.nv
+        e, c = data.efc, data.contact
         efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
                ("D", "aref", "type", "frictionloss", "force")}  # fmt: skip
-        efc["J"] = e.J.numpy()[:, :rows, :nv].copy()
+        efc["J"] = e.J.numpy()[:, :rows, : self.nv].copy()
         k = int(data.nacon.numpy()[0])
         parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
         world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
-        extra = {name: getattr(data, name).numpy().copy() for name in ("qacc_smooth", "qfrc_smooth")}
+        extra = self.read_state(("qacc_smooth", "qfrc_smooth", "nefc"))
         step_data = state, efc, data.M.numpy().copy(), (world_of, address[:, 0], dim, friction, geom)
-        extra["nefc"] = data.nefc.numpy().copy()
-        mjw.step(device_model, data)
+        self.mjw.step(self.device_model, data)
         return *step_data, extra
-
-    return step
 
 
 def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact: Any) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from calls import EARLY_BOXES as EARLY
 
-from lavender.lab import tune as tuning
+from lavender.lab.tune import mujoco_settings as tuning
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 

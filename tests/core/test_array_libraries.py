@@ -1,4 +1,9 @@
-"""Batches take arrays of other libraries: views of host memory, one copy from a device, an error for the rest."""
+"""Batches take arrays of other libraries: views of host memory, one copy from a device, an error for the rest.
+
+Results return in the caller's library with `like=`.
+"""
+
+import pickle
 
 import numpy as np
 import pytest
@@ -106,3 +111,90 @@ def test_tensors_of_pytorch():
             lv.Batch(*ARRAYS.values(), cones=CONES),
             torch.zeros((3, 2), dtype=torch.float64, requires_grad=True),
         )
+
+
+class StandardArray(HostArray):
+    """An array of a library with the array API standard, which results can return to."""
+
+    def __array_namespace__(self):
+        return StandardArray
+
+    @staticmethod
+    def from_dlpack(array):
+        return StandardArray(np.from_dlpack(array))
+
+
+RESIDUAL_ARRAYS = (
+    "relative", "energy", "velocity_error", "velocity_at_zero", "impulse_error", "roundoff_floor", "worst_row",
+)  # fmt: skip
+SOLUTION_ARRAYS = (*RESIDUAL_ARRAYS, "impulse", "velocity", "iterations", "success")
+
+
+def check_results(like, to_numpy, rtol=0.0):
+    """Compare all arrays of results in the library of `like` with those in NumPy."""
+    batch = lv.Batch(*ARRAYS.values(), cones=CONES)
+    impulse = np.full((3, 2), 0.25)
+    for expected, results, names in (
+        (lv.solve_many(batch, tol=1e-9), lv.solve_many(batch, tol=1e-9, like=like), SOLUTION_ARRAYS),
+        (
+            lv.residual_many(batch, impulse),
+            lv.residual_many(batch, impulse, like=like),
+            (*RESIDUAL_ARRAYS, "excess"),
+        ),
+    ):
+        for name in names:
+            array, own = getattr(results, name), getattr(expected, name)
+            assert type(array) is type(like), name
+            np.testing.assert_allclose(to_numpy(array), own, rtol=rtol, err_msg=name)
+        assert results[1].__class__ is expected[1].__class__
+        np.testing.assert_array_equal(pickle.loads(pickle.dumps(results)).relative, expected.relative)
+    return lv.solve_many(batch, tol=1e-9, like=like)
+
+
+def test_results_return_in_the_callers_library():
+    many = check_results(StandardArray(np.zeros(1)), lambda x: x.array)
+    assert "3 to 1e-09" in repr(many)
+    assert isinstance(
+        lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray
+    )
+    batch = lv.Batch(*ARRAYS.values(), cones=CONES)
+    with pytest.raises(lv.InputError, match="like is a list"):
+        lv.solve_many(batch, like=[0.0])
+
+
+def test_impulses_of_from_efc_return_in_the_callers_library():
+    efc = {
+        "efc_J": np.eye(2)[None], "efc_D": np.ones((1, 2)), "efc_aref": np.zeros((1, 2)), "efc_type": [3, 3],
+        "M": np.eye(2)[None], "qvel": np.zeros((1, 2)), "qacc_smooth": -np.ones((1, 2)), "timestep": 0.01,
+        "efc_force": np.ones((1, 2)),
+    }  # fmt: skip
+    impulse = lv.io.from_efc(**efc, like=StandardArray(np.zeros(1))).impulse
+    assert isinstance(impulse, StandardArray)
+    np.testing.assert_array_equal(impulse.array, lv.io.from_efc(**efc).impulse)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_results_return_as_tensors_of_pytorch(dtype):
+    torch = pytest.importorskip("torch")
+    like = torch.zeros(1, dtype=getattr(torch, dtype), requires_grad=True)
+    many = check_results(like, lambda x: x.numpy(), 0.0 if dtype == "float64" else 1e-6)
+    assert many.impulse.dtype == like.dtype and many.iterations.dtype == torch.int32
+    many.impulse[0, 0] = 7.0  # a copy
+    assert many.impulse[0, 0] != 7.0
+    with pytest.raises(lv.InputError, match="device meta"):
+        _ = lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=torch.zeros(1, device="meta")).impulse
+    with pytest.raises(lv.InputError, match="J is a Tensor on device meta that cannot be read"):
+        solve(lambda x: torch.zeros(x.shape, device="meta", dtype=torch.float64))
+
+
+def test_results_return_as_arrays_of_jax():
+    jax = pytest.importorskip("jax")
+    like = jax.numpy.zeros(1)
+    check_results(like, np.asarray, 1e-6)
+    with pytest.raises(lv.InputError, match="abstract array"):
+        jax.jit(lambda x: lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=x).impulse)(like)
+
+
+def test_results_return_as_arrays_of_warp():
+    warp = pytest.importorskip("warp")
+    check_results(warp.zeros(1, dtype=warp.float32, device="cpu"), lambda x: x.numpy(), 1e-6)

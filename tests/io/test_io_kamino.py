@@ -170,9 +170,7 @@ def test_matrix_is_compared_once_or_on_request():
         lv.io.from_kamino(solver, verify=True)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("dynamics_solver", "lox"), ("sparse_dynamics", True)]
-)
+@pytest.mark.parametrize(("option", "value"), [("dynamics_solver", "lox"), ("sparse_dynamics", True)])
 def test_other_configurations_are_rejected_by_name(option, value):
     solver, _ = load("mixed")
     setattr(solver._solver_kamino._config, option, value)

@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.lab.claims import OUTCOMES, compare_claims
-from lavender.lab.engine_scenes import step_scene
+from lavender.lab.engine_scenes import NEWTON_STATE, read_engine_states, step_scene
 
 CONES = lv.Cones.contacts(0.5, tangents=1)
 
@@ -85,3 +85,53 @@ def test_scenes_are_checked(tmp_path):
         step_scene(tmp_path / "scene.py", "kamino")
     with pytest.raises(lv.InputError, match="a Python file"):
         step_scene("boxes", "genesis")
+
+
+def test_states_before_the_worst_answers_are_written(tmp_path):
+    steps = [
+        step_of([0.0, 0.2, 0.0], [1, 1, 0])._replace(state={"joint_q": np.array([[0.0], [1.0], [2.0]])}),
+        step_of([0.0, 0.0, 0.3], [1, 1, 0])._replace(state={"joint_q": np.array([[3.0], [4.0], [5.0]])}),
+    ]
+    compare_claims(steps, threshold=1e-4, folder=tmp_path)
+    with np.load(tmp_path / "states.npz") as file:
+        found = {(s, w): q[0] for s, w, q in zip(file["step"], file["world"], file["joint_q"], strict=True)}
+    assert found[0, 1] == 1.0 and found[1, 2] == 5.0
+    states = read_engine_states(tmp_path / "states.npz", NEWTON_STATE)
+    assert list(states) == ["joint_q"] and states["joint_q"].shape == (len(found), 1)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({"qpos": np.zeros((2, 7))}, "'qpos' is no part of a state; known are body_q"),
+        ({"joint_q": np.zeros((2, 7)), "joint_qd": np.zeros((3, 6))}, "2 of joint_q, 3 of joint_qd"),
+        ({"joint_q": np.zeros((0, 7))}, "0 of joint_q"),
+        ({"joint_q": np.full((1, 7), np.nan)}, "joint_q"),
+        ({}, "no arrays"),
+    ],
+)
+def test_states_that_do_not_fit_are_rejected(tmp_path, arrays, words):
+    np.savez(tmp_path / "states.npz", **arrays)
+    with pytest.raises(lv.InputError, match=words):
+        read_engine_states(tmp_path / "states.npz", NEWTON_STATE)
+
+
+def test_scenes_of_newton_start_from_states(tmp_path):
+    """The worst answers of an audit occur again when it starts from the states that it wrote."""
+    pytest.importorskip("newton")
+    scene = "boxes_stacked_on_plane"
+    first = compare_claims(step_scene(scene, "kamino", worlds=3, steps=4, spread=0.1), folder=tmp_path)
+    states = read_engine_states(tmp_path / "states.npz", NEWTON_STATE)
+    n = len(states["body_q"])
+    running = list(step_scene(scene, "kamino", worlds=n, steps=1, states=tmp_path / "states.npz"))
+    again = running[0].state
+    for name in NEWTON_STATE:
+        np.testing.assert_allclose(again[name], states[name], atol=1e-6)
+    assert first.outcome.shape == (4, 3) and len(running[0].batch) == n
+    with pytest.raises(lv.InputError, match="body_q has"):
+        step_scene(
+            scene, "kamino", worlds=1, states={"body_q": np.zeros((1, 3, 7)), "body_qd": np.zeros((1, 3, 6))}
+        )
+    noisy = next(step_scene(scene, "kamino", worlds=3, steps=1, spread=0.1)).state
+    assert np.ptp(noisy["body_qd"], axis=0).max() > 0.01
+    assert not noisy["body_qd"][0].any()

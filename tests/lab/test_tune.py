@@ -8,17 +8,20 @@ from calls import BOXES
 from calls import EARLY_BOXES as EARLY
 
 import lavender as lv
-from lavender.lab import tune as module
 from lavender.lab.audit import audit
 from lavender.lab.simulated_worlds import Runs, StepSizes
-from lavender.lab.tune import Measured, Setting, Stage, Tuning, list_first_settings, tune
+from lavender.lab.tune import Measured, Tuning, mujoco_settings, sweep, tune
+from lavender.lab.tune.measured import Schedule
+from lavender.lab.tune.mujoco_settings import MujocoSetting as Setting
+from lavender.lab.tune.mujoco_settings import MujocoStage as Stage
+from lavender.lab.tune.mujoco_settings import list_first_settings
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
 
 def fewer(monkeypatch):
-    monkeypatch.setattr(module, "TOLERANCES", (1e-6, 1e-12))
-    monkeypatch.setattr(module, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
+    monkeypatch.setattr(mujoco_settings, "TOLERANCES", (1e-6, 1e-12))
+    monkeypatch.setattr(mujoco_settings, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
 
 
 def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, monkeypatch):
@@ -46,7 +49,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
     handle, made = runs.load_model()
     stage = Stage.from_runs(handle, made, runs, [0], 10)
-    same = stage.judge_setting(Setting.from_options(handle, made, **module.CONVERGED_OPTIONS))
+    same = stage.judge_setting(Setting.from_options(handle, made, **mujoco_settings.CONVERGED_OPTIONS))
     assert same.motion.max() == 0.0 and same.worst_error < 1e-9
 
 
@@ -62,8 +65,8 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
         now += 1e-6 + (rng.random() < 0.05)  # one time in twenty somebody else has a second
         return now
 
-    monkeypatch.setattr(module, "perf_counter", busy)
-    stage.time_settings(found, 6, module.Schedule(None))
+    monkeypatch.setattr(mujoco_settings, "perf_counter", busy)
+    stage.time_settings(found, 6, Schedule(None))
     for m in found:
         assert m.mean_step_time == pytest.approx(
             1e-6, abs=1e-9
@@ -73,13 +76,13 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
 def test_a_line_means_in_a_model_what_was_measured(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
-    for setting in [*list_first_settings(mj, plain), *module.list_variants(mj, plain, Setting())]:
+    for setting in [*list_first_settings(mj, plain), *mujoco_settings.list_variants(mj, plain, Setting())]:
         text = setting.option_line.removeprefix("<option").removesuffix("/>")
         names = {name for name, _ in setting.options}
         kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
         copied = mj.MjModel.from_xml_string(BOXES.format(options=f"{kept} {text}")).opt
         tried = setting.apply_to(mj, plain).opt
-        for name in (*module.OPTIONS, *module.PROBLEM_OPTIONS):
+        for name in (*mujoco_settings.OPTIONS, *mujoco_settings.PROBLEM_OPTIONS):
             assert getattr(copied, name) == getattr(tried, name), setting
     assert Setting.from_options(mj, plain, iterations=int(plain.opt.iterations)).option_line == ""
 
@@ -91,7 +94,7 @@ def measured(time, error, **options):
 
 
 def chosen(*some, held=(), threshold=1e-6):
-    return Tuning(Runs("m.xml", 2, 10), 10, list(some), list(held), threshold)
+    return Tuning("m.xml", 10, list(some), list(held), threshold)
 
 
 @pytest.mark.parametrize(("with_contact", "is_enough"), [(19, False), (20, True)])
@@ -172,12 +175,12 @@ def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
 
 def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
     fewer(monkeypatch)
-    cores = module.os.cpu_count()
-    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: cores + 2.0)
+    cores = sweep.os.cpu_count()
+    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: cores + 2.0)
     page = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).summary_page
     assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in page.warning
     assert "The times are invalid" in page.warning and page.warning in page.render_html()
-    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: 1.0)
+    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: 1.0)
     assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
 
 
@@ -220,3 +223,33 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
     monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
+
+
+def test_settings_of_mujoco_warp_are_measured(boxes, monkeypatch):
+    pytest.importorskip("mujoco_warp")
+    from lavender.lab.tune import warp_settings
+
+    monkeypatch.setattr(warp_settings, "WARP_TOLERANCES", (1e-2,))
+    monkeypatch.setattr(warp_settings, "WARP_ITERATIONS", {"Newton": (1, 20)})
+    monkeypatch.setattr(warp_settings, "WARP_LINE_SEARCHES", (20,))
+    found = tune(boxes(EARLY), engine="mujoco_warp", worlds=2, steps=10, repeats=1)
+    by = {m.setting.option_line: m for m in found.measured}
+    one, twenty = (by[f'<option solver="Newton" iterations="{n}"/>'] for n in (1, 20))
+    assert twenty.worst_error < 0.1 * one.worst_error
+    assert all(0.0 < m.mean_step_time < np.inf and len(m.error) == 10 for m in found.measured)
+
+
+def test_settings_of_kamino_are_measured(monkeypatch):
+    pytest.importorskip("newton")
+    from lavender.lab.tune import kamino_settings
+
+    monkeypatch.setattr(kamino_settings, "KAMINO_TOLERANCES", (1e-3,))
+    monkeypatch.setattr(kamino_settings, "KAMINO_ITERATIONS", (2, 400))
+    monkeypatch.setattr(kamino_settings, "KAMINO_PENALTIES", (10.0,))
+    found = tune("boxes_stacked_on_plane", engine="kamino", worlds=2, steps=10, repeats=1)
+    by = {m.setting.option_line: m for m in found.measured}
+    few, many = (by[f"config.padmm.max_iterations = {n}"] for n in (2, 400))
+    assert many.worst_error < 0.1 * few.worst_error and many.worst_motion < few.worst_motion
+    assert "config.padmm.rho_0 = 10.0" in by
+    with pytest.raises(lv.InputError, match="sets its own"):
+        tune("boxes_stacked_on_plane", engine="kamino", control="zero")

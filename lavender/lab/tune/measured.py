@@ -1,0 +1,199 @@
+"""Settings of an engine, their results, and the timing in which settings alternate.
+
+A `Stage` holds worlds of one engine and measures settings on them. Each world is cut into stretches of `horizon` steps
+of a run with the present setting. From the start of each stretch, a setting makes its own steps:
+
+    time    of a step of one world [s]; of each step the minimum of several repeats, in which settings alternate
+    error   of the engine's answer to the problem of each step, by the judge [m/s]
+    motion  largest distance of a body, after `horizon` steps, from its position in the converged run [m]
+"""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from statistics import fmean
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.lab.bench import machine
+from lavender.lab.bench.running.runner import Event
+
+ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error.
+# A setting is timed no further if it takes longer than this multiple of the present setting.
+MAX_TIME_RATIO = 2.0
+#: Kinds of measurements: the error of a setting, and the times of its steps.
+MEASUREMENTS = ("judging", "timing")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Options of an engine that differ from the present ones; a derived class writes them in the engine's syntax."""
+
+    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the problem.
+    comment: ClassVar[str] = "# {}"  # Comment behind the line.
+    merge_note: ClassVar[str] = ""  # Note on where to put the line.
+
+    options: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def option_line(self) -> str:
+        """Line to copy; empty if no option differs."""
+        raise NotImplementedError
+
+    @property
+    def name(self) -> str:
+        """The line, or "the model's own setting"."""
+        return self.option_line or "the model's own setting"
+
+    @property
+    def changes_problem(self) -> bool:
+        """Whether the setting defines another problem than the present one."""
+        return any(name in self.problem_options for name, _ in self.options)
+
+
+@dataclass(eq=False)
+class Measured:
+    """Results of one setting on some worlds.
+
+    Parameters
+    ----------
+    setting : Setting
+    solver : str
+    error : (steps,) m/s
+    motion : (stretches,) m
+    times : (steps,) s
+        Each the minimum of all repeats, which removes interruptions.
+    rows, contacts : (steps,) int
+    """
+
+    setting: Setting
+    solver: str
+    error: FloatArray = field(repr=False)
+    motion: FloatArray = field(repr=False)
+    times: FloatArray = field(repr=False)
+    rows: Any = field(default=(), repr=False)
+    contacts: Any = field(default=(), repr=False)
+
+    @property
+    def mean_step_time(self) -> float:
+        """Mean time of a step [s]; infinite if it was not timed."""
+        return float(self.times.mean())
+
+    @property
+    def worst_error(self) -> float:
+        """Error that one step in a hundred exceeds [m/s]."""
+        return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
+
+    @property
+    def worst_motion(self) -> float:
+        """Distance that one stretch in a hundred exceeds [m]."""
+        return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
+
+
+class Schedule:
+    """Measurements that are done and expected, for the progress and the remaining time.
+
+    Parameters
+    ----------
+    watch : callable, optional
+        Called with an `Event` at the begin of each measurement.
+    """
+
+    def __init__(self, watch: Callable[[Event], None] | None) -> None:
+        self.watch = watch
+        self.done = 0
+        self.loads: list[float | None] = []  # number of runnable processes at each timing
+        self._expected = dict.fromkeys(MEASUREMENTS, 0)
+        self._reserved = dict.fromkeys(MEASUREMENTS, 0)
+        self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
+
+    def reserve(self, kind: str, count: int) -> None:
+        """Set the estimate of later measurements that are not announced yet."""
+        self._reserved[kind] = count
+
+    def expect(self, kind: str, count: int) -> None:
+        """Announce measurements; they replace reserved ones."""
+        self._expected[kind] += count
+        self._reserved[kind] = max(0, self._reserved[kind] - count)
+
+    def skip(self, kind: str) -> None:
+        """Count an announced measurement as unnecessary."""
+        self._expected[kind] -= 1
+
+    @property
+    def remaining(self) -> float | None:
+        """Estimate of the remaining time [s]: the mean durations so far; None at the beginning."""
+        total = 0.0
+        every = [t for durations in self._durations.values() for t in durations]
+        for kind in MEASUREMENTS:
+            mean = fmean(self._durations[kind] or every or [0.0])
+            total += mean * (self._expected[kind] + self._reserved[kind])
+        return total if every else None
+
+    @contextlib.contextmanager
+    def measure(self, kind: str, text: str) -> Iterator[None]:
+        """Show the progress, then run and time the block, which is one measurement."""
+        if self.watch is not None:
+            count = sum(self._expected.values()) + sum(self._reserved.values())
+            self.watch(Event(self.done, self.done + count, f"{kind}: {text}", "", remaining=self.remaining))
+        if kind == "timing":
+            self.loads.append(machine.count_runnable_processes())
+        begin = perf_counter()
+        yield
+        self._durations[kind].append(perf_counter() - begin)
+        self._expected[kind] -= 1
+        self.done += 1
+
+
+class Stage(ABC):
+    """Worlds of one engine, on which settings are measured."""
+
+    @property
+    @abstractmethod
+    def own_setting(self) -> Setting:
+        """The present setting."""
+
+    @abstractmethod
+    def list_first_settings(self) -> list[Setting]:
+        """List the settings that are tried first; the present one is the first of them."""
+
+    @abstractmethod
+    def list_variants(self, setting: Setting) -> list[Setting]:
+        """List variants of a setting, which are tried if it is near the front of time and error."""
+
+    @abstractmethod
+    def judge_setting(self, setting: Setting) -> Measured:
+        """Judge a setting without timing it; its errors are infinite if a world diverges."""
+
+    @abstractmethod
+    def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
+        """Return a function that runs all stretches with a setting and returns the times of the steps [s]."""
+
+    def time_settings(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
+        """Time the steps of several rounds in which all settings alternate; the first is the present one.
+
+        A setting with which a world diverges is not timed.
+        """
+        settings = [m for m in settings if np.isfinite(m.error).all()]
+        runs = [self.prepare_timing(m.setting) for m in settings]
+        schedule.expect("timing", len(settings) * repeats)
+        for round_index in range(repeats):
+            for m, run in zip(settings, runs, strict=True):
+                # Medians: a step that is interrupted in the first round does not exclude a setting.
+                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
+                    schedule.skip("timing")
+                    continue
+                with schedule.measure("timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"):
+                    m.times = np.minimum(m.times, run())
+
+
+def make_unmeasured(setting: Setting, solver: str) -> Measured:
+    """Build the result of a setting with which a world diverges: its error, motion and times are infinite."""
+    never = np.full(1, np.inf)
+    return Measured(setting, solver, never, never, never)

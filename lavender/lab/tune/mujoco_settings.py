@@ -1,0 +1,228 @@
+"""Settings of MuJoCo, and stretches of simulated worlds on which they are measured.
+
+From the start of each stretch, a setting makes its own steps, warm-started from its own answers. A cone, impratio or
+noslip other than the model's defines another problem: its error is measured on its own problem, its motion shows how
+far it deviates, and no line recommends it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.batch.residuals import residual_many
+from lavender.io.efc import from_mujoco_many
+from lavender.lab.audit import MAX_PROBLEMS_IN_MEMORY
+from lavender.lab.simulated_worlds import Runs, has_diverged, simulate_world
+from lavender.lab.tune.measured import Measured, Setting, Stage, make_unmeasured
+
+TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
+ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
+MERGE_NOTE = (
+    "Add the line next to the model's own <option>: MuJoCo merges both. If it replaces the model's own <option>, "
+    "its integrator and time step are lost."
+)
+# Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
+ENUMS = {
+    "solver": "mjSOL_",
+    "cone": "mjCONE_",
+    "jacobian": "mjJAC_",
+}
+OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
+PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that change the problem.
+CONVERGED_OPTIONS = {
+    "solver": "Newton",
+    "iterations": 300,
+    "tolerance": 0.0,
+    "ls_iterations": 100,
+    "ls_tolerance": 1e-4,
+}
+
+
+@dataclass(frozen=True)
+class MujocoSetting(Setting):
+    """Attributes of `<option>` that differ from the model's."""
+
+    problem_options: ClassVar[tuple[str, ...]] = PROBLEM_OPTIONS
+    comment: ClassVar[str] = "<!-- {} -->"
+    merge_note: ClassVar[str] = MERGE_NOTE
+
+    @classmethod
+    def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:
+        """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
+        has = {name: get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
+        return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
+
+    def apply_to(self, mj: Any, model: Any) -> Any:
+        """Return a copy of the model with these options."""
+        configured = copy.copy(model)
+        for name, x in self.options:
+            kind = ENUMS.get(name)
+            setattr(configured.opt, name, x if kind is None else _map_keywords_to_values(mj, name)[x])
+        return configured
+
+    @property
+    def option_line(self) -> str:
+        """`<option>` line to copy into the model; empty if no option differs."""
+        texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
+        return f"<option {' '.join(texts)}/>" if self.options else ""
+
+
+def _map_keywords_to_values(mj: Any, name: str) -> dict[str, Any]:
+    """Return {MJCF keyword: MuJoCo's value} of an enumerated option."""
+    members = getattr(mj, f"mjt{name.capitalize()}").__members__
+    keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
+    short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
+    return {keywords.get(key, key.lower()): value for key, value in short}
+
+
+def get_option_value(mj: Any, model: Any, name: str) -> Any:
+    """Return the model's value of an option as MJCF writes it."""
+    x = getattr(model.opt, name)
+    if name not in ENUMS:
+        return float(x) if isinstance(x, float) else int(x)
+    return next(word for word, value in _map_keywords_to_values(mj, name).items() if int(value) == int(x))
+
+
+@dataclass(eq=False)
+class MujocoStage(Stage):
+    """Worlds of a MuJoCo model on which settings are measured.
+
+    Parameters
+    ----------
+    mj, model
+        The module mujoco and the model with its own setting.
+    starts : (n, size)
+        State at the start of each stretch.
+    controls : (n, horizon, nu)
+    ends : (n, bodies, 3) m
+        Positions of the bodies after each stretch of the converged run.
+    """
+
+    mj: Any
+    model: Any
+    starts: FloatArray
+    controls: FloatArray
+    ends: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def from_runs(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> MujocoStage:
+        """Cut worlds that run with the model's own setting into stretches."""
+        starts, controls = [], []
+        for world in worlds:
+            drive = runs.make_controller(model, world)
+            world_controls = np.array([drive(None, step) for step in range(runs.steps)])
+            ctrl = world_controls.reshape(runs.steps // horizon, horizon, model.nu)
+            starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
+            controls.append(ctrl)
+        configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
+        try:
+            configured.ends = configured.run_stretches(
+                MujocoSetting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
+            )[1]
+        except mj.FatalError as error:
+            raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
+        return configured
+
+    def run_stretches(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Run all stretches.
+
+        Returns (seconds of each step, positions of bodies after each stretch (n, bodies, 3) [m]), and stores the state
+        before each step in `states`.
+        """
+        mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
+        data = mj.MjData(model)
+        n, horizon, _ = self.controls.shape
+        step_times = np.empty(n * horizon)
+        ends = np.empty((n, model.nbody, 3))
+        for i in range(n):
+            mj.mj_setState(model, data, self.starts[i], kind)
+            for k in range(horizon):
+                data.ctrl[:] = self.controls[i, k]
+                if states is not None:
+                    mj.mj_getState(model, data, states[horizon * i + k], kind)
+                begin = perf_counter()
+                mj.mj_step(model, data)
+                step_times[horizon * i + k] = perf_counter() - begin
+            mj.mj_kinematics(model, data)
+            ends[i] = np.nan if has_diverged(mj, data) else data.xpos
+        return step_times, ends
+
+    def judge_setting(self, setting: Setting) -> Measured:
+        """Judge a setting without timing it; its errors are infinite if a world diverges."""
+        assert isinstance(setting, MujocoSetting)
+        mj, model = self.mj, setting.apply_to(self.mj, self.model)
+        result = make_unmeasured(setting, str(get_option_value(mj, model, "solver")))
+        states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
+        judge = copy.copy(model)
+        judge.opt.noslip_iterations = 0
+        errors: list[FloatArray] = []
+        rows: list[Any] = []
+        contacts: list[Any] = []
+        try:
+            ends = self.run_stretches(model, states)[1]
+            for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
+                batch, impulse = from_mujoco_many(
+                    judge, states[i : i + MAX_PROBLEMS_IN_MEMORY], errors="status"
+                )
+                errors.append(residual_many(batch, impulse, errors="status").velocity_error)
+                rows.append(batch.row_counts)
+                contacts.append(batch.contact_counts)
+        except (mj.FatalError, InputError):  # A step or a forward pass failed.
+            return result
+        distance = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
+        if np.isnan(distance).any():
+            return result
+        sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
+        return replace(
+            result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
+        )
+
+    @property
+    def own_setting(self) -> Setting:
+        """The model's own setting."""
+        return MujocoSetting()
+
+    def list_first_settings(self) -> list[Setting]:
+        """List the first settings."""
+        return [*list_first_settings(self.mj, self.model)]
+
+    def list_variants(self, setting: Setting) -> list[Setting]:
+        """List variants of a setting."""
+        return [*list_variants(self.mj, self.model, setting)]
+
+    def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
+        """Return a function that runs all stretches and returns the time of each step."""
+        assert isinstance(setting, MujocoSetting)
+        model = setting.apply_to(self.mj, self.model)
+        return lambda: self.run_stretches(model)[0]
+
+
+def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
+    """List the first settings: each solver with each tolerance and number of iterations; then other problems."""
+    enough = max(100, int(model.opt.iterations))
+    tried: list[dict[str, Any]] = [{}]
+    for solver, budgets in ITERATIONS.items():
+        tried += [{"solver": solver, "iterations": enough, "tolerance": t} for t in TOLERANCES]
+        tried += [{"solver": solver, "iterations": n} for n in budgets]
+    tried += [{"cone": "pyramidal"}, {"cone": "elliptic"}, {"impratio": 1.0}, {"impratio": 10.0}]
+    tried += [{"noslip_iterations": n} for n in (0, 3, 10)]
+    return list(dict.fromkeys(MujocoSetting.from_options(mj, model, **x) for x in tried))
+
+
+def list_variants(mj: Any, model: Any, setting: Setting) -> list[MujocoSetting]:
+    """List variants of a setting: other line searches, and dense instead of sparse J or the reverse."""
+    options = dict(setting.options)
+    stored = "dense" if mj.mj_isSparse(model) else "sparse"
+    tried: list[dict[str, Any]] = [{"jacobian": stored}]
+    if options.get("solver", get_option_value(mj, model, "solver")) != "PGS":
+        tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [{"ls_iterations": n} for n in (5, 15, 50)]
+        tried += [{"jacobian": stored, "ls_tolerance": x} for x in (0.1, 1e-3)]
+    return [MujocoSetting.from_options(mj, model, **options | x) for x in tried]

@@ -1,0 +1,245 @@
+"""Choose settings from measurements: the front of time and error, lines to copy, and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender.base.deadline import format_seconds
+from lavender.lab.report.figures import Curve, Figure
+from lavender.lab.report.summary_page import PageSection, SummaryPage
+from lavender.lab.report.table import Cell, Table
+from lavender.lab.report.text import format_ratio, format_size
+from lavender.lab.simulated_worlds import StepSizes
+from lavender.lab.tune.measured import Measured
+from lavender.problem.derived import cached_property
+
+# Times that differ by at most this fraction count as equal: noise is a few per cent.
+TIME_NOISE_FRACTION = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """Result of `tune`; the first of `measured` and of `held` is the model's own setting.
+
+    Parameters
+    ----------
+    model : str
+        Name of the model or scene, or its file.
+    horizon : int
+        Number of steps of a stretch.
+    measured : list of Measured
+        Results on the worlds with even numbers.
+    held : list of Measured
+        Results of the model's own setting and those chosen on the worlds with odd numbers; empty if Ctrl-C came before.
+    threshold : float, m/s, m
+        Smaller errors and distances count as accurate enough.
+    stopped : bool
+        The measurement was stopped by Ctrl-C.
+    sizes : StepSizes, optional
+        Rows and contacts of the steps of all worlds with the model's own setting.
+    busy : str
+        A warning if other processes used the processors during the timing; else empty.
+    """
+
+    model: str
+    horizon: int
+    measured: list[Measured]
+    held: list[Measured]
+    threshold: float
+    stopped: bool = False
+    sizes: StepSizes | None = None
+    busy: str = ""
+
+    @property
+    def present_result(self) -> Measured:
+        """Result of the model's own setting."""
+        return self.measured[0]
+
+    @property
+    def _same_problem(self) -> list[Measured]:
+        """Timed settings that do not change the problem."""
+        return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
+
+    def _is_accurate_enough(self, m: Measured) -> bool:
+        """Whether worst error and motion are at most the present setting's, or within the threshold."""
+        now, threshold = self.present_result, self.threshold
+        pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
+        return all(x <= max(own, threshold) for x, own in pairs)
+
+    @cached_property
+    def faster(self) -> Measured | None:
+        """Fastest setting that is at least as accurate as the present one, or within the threshold; None if none is."""
+        now = self.present_result
+        good = [
+            m
+            for m in self._same_problem
+            if m.worst_error <= max(now.worst_error, self.threshold) and self._is_accurate_enough(m)
+        ]
+        best = min(good, key=lambda m: m.mean_step_time)
+        return best if best.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time else None
+
+    @cached_property
+    def closer(self) -> Measured | None:
+        """Most accurate setting that is as fast as the present one; None if that is within the threshold."""
+        now = self.present_result
+        good = [
+            m
+            for m in self._same_problem
+            if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+            and self._is_accurate_enough(m)
+        ]
+        best = min(good, key=lambda m: m.worst_error)
+        return best if best.worst_error < now.worst_error > self.threshold else None
+
+    @property
+    def pareto_front(self) -> list[Measured]:
+        """Settings that no other setting beats in both time and error, fastest first."""
+        front: list[Measured] = []
+        for m in sorted(self._same_problem, key=lambda m: (m.mean_step_time, m.worst_error)):
+            if not front or m.worst_error < front[-1].worst_error:
+                front.append(m)
+        return front
+
+    @property
+    def reason_without_line(self) -> str:
+        """Reason why no line is recommended; empty if enough of the steps have contact."""
+        if self.sizes is None or self.sizes.has_enough_contact:
+            return ""
+        if not self.sizes.can_touch:
+            return (
+                f"No setting is recommended: {self.sizes.contact_phrase}, and settings do not matter without."
+            )
+        return (
+            f"No setting is recommended: {self.sizes.contact_phrase}. A setting that is fast and accurate without "
+            "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
+        )
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
+        if self.reason_without_line:
+            return []
+        none = f"none of {len(self._same_problem)} settings"
+        enough = (
+            f"not needed, {format_size(self.present_result.worst_error)} m/s is within {self.threshold:g}"
+        )
+        closer = enough if self.present_result.worst_error <= self.threshold else none
+        lines = []
+        for description, m, reason, gains, max_ratio in (
+            ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
+            ("as fast as now, more accurate", self.closer, closer, "worst_error", 1.0),
+        ):
+            if m is None:
+                lines.append(f"{description}: {reason}")
+                continue
+            held = next((h for h in self.held[1:] if h.setting == m.setting), None)
+            if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
+                description += ": not on the worlds held back"
+            lines += [
+                f"{m.setting.option_line}  {m.setting.comment.format(description)}",
+                f"    chosen on: {_compare(m, self.present_result)}",
+                f"    held back: {'not measured' if held is None else _compare(held, self.held[0])}",
+            ]  # fmt: skip
+        return lines
+
+    def _table(self, settings: Iterable[Measured]) -> Table:
+        """Build the table of some settings."""
+        rows: list[list[str | Cell]] = [
+            [
+                m.setting.option_line or "as it is", Cell.time(m.mean_step_time),
+                f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
+                Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
+            ]
+            for m in settings
+        ]  # fmt: skip
+        heads = [
+            "setting",
+            "a step",
+            "of now",
+            "error 99 % [m/s]",
+            "worst",
+            f"motion after {self.horizon} [m]",
+        ]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
+    def figure(self) -> Figure:
+        """Error over time: every setting, the front, and the model's own setting."""
+
+        def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
+            notes = tuple(m.setting.option_line for m in settings)
+            return replace(
+                Curve.from_points(
+                    name, name, [(m.mean_step_time, m.worst_error) for m in settings], notes=notes
+                ),
+                **more,
+            )
+
+        solvers = dict.fromkeys(m.solver for m in self.measured)
+        by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
+        parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
+        parts += [curve("front", self.pareto_front), curve("as it is", [self.present_result], points=True)]
+        return Figure("time-and-error", Path(self.model).name, "time of a step [s]",
+                      "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
+
+    @property
+    def summary_page(self) -> SummaryPage:
+        """Page with the result in a sentence, figures and tables, as `lavender tune` writes it."""
+        now = self.present_result
+        head = (
+            f"{Path(self.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "
+            f"have errors above {format_size(now.worst_error)} m/s."
+        )
+        if self.closer is not None:
+            gain = (
+                format_ratio(now.worst_error / self.closer.worst_error)
+                if self.closer.worst_error
+                else "exact:"
+            )
+            head += f" In the same time the error can be {gain} less."
+        if self.reason_without_line:
+            head += f" {self.reason_without_line}"
+        note = now.setting.merge_note
+        merge_note = f" {note}" if note and (self.faster or self.closer) else ""
+        other = [m for m in self.measured if m.setting.changes_problem]
+        shown = [now, *(m for m in self.pareto_front if m is not now)]
+        every = sorted(self.measured, key=lambda m: m.mean_step_time)
+        sizes = [] if self.sizes is None else [self.sizes.size_table]
+        figures = [] if self.reason_without_line else [self.figure]
+        return SummaryPage(
+            "lavender tune", head,
+            [
+                PageSection("Lines to copy", code=self.lines,
+                     note="None, for the reason above." if self.reason_without_line
+                     else "Chosen on the worlds with even numbers, tested on the others." + merge_note),
+                PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
+                PageSection("The front of time and error", [self._table(shown)], figures, short=5),
+                PageSection("Other problems", [self._table(other)], short=2,
+                     note="Settings that change the problem: the error is that of its own problem."),
+                PageSection("Every setting", [self._table(every)], note="Without those with which a world diverges."),
+            ],
+            {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
+             "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
+            stopped=self.stopped,
+            warning=self.busy,
+        )  # fmt: skip
+
+
+def _compare(m: Measured, now: Measured) -> str:
+    """Compare time and error of a setting with the present ones."""
+    return (
+        f"{m.mean_step_time / now.mean_step_time:.2f} of the time, error {format_size(m.worst_error)} m/s "
+        f"instead of {format_size(now.worst_error)}"
+    )
+
+
+def _to_dict(m: Measured) -> dict[str, Any]:
+    """Convert a result to a dict for JSON."""
+    return {"options": dict(m.setting.options), "seconds": m.mean_step_time, "error": m.worst_error,
+            "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip

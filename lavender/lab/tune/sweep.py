@@ -1,0 +1,212 @@
+"""Measure an engine's settings on worlds of one model or scene: time of a step, error, and the line to copy.
+
+    result = tune("ant.xml", worlds=16, steps=200)
+    result.faster, result.closer; result.summary_page.write("lavender-tune")
+    tune("scene.py", engine="kamino")
+
+Settings are chosen on the worlds with even numbers; those with odd numbers are held back. `lavender.lab.tune.measured`
+describes what is measured. If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the present setting is
+measured and no line is recommended.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+
+from lavender.base.arrays import check_float, check_int
+from lavender.base.errors import InputError, check_name, reject_former_names
+from lavender.io.efc import from_mujoco_many
+from lavender.io.recording import Control
+from lavender.judge.residuals import DEFAULT_THRESHOLD
+from lavender.lab.bench import machine
+from lavender.lab.bench.running.runner import Event
+from lavender.lab.simulated_worlds import Runs, StepSizes, can_any_geoms_collide
+from lavender.lab.tune.kamino_settings import KaminoStage
+from lavender.lab.tune.measured import Measured, Schedule, Setting, Stage
+from lavender.lab.tune.mujoco_settings import MujocoStage
+from lavender.lab.tune.recommendation import Tuning
+from lavender.lab.tune.warp_settings import WarpStage
+
+TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
+N_TRIAL_ROUNDS = 2  # Settings near the front are varied after this many rounds.
+# Settings of the front are varied if they take at most this multiple of the present setting's time.
+MAX_VARIED_TIME_RATIO = 1.5
+EXPECTED_VARIED_SETTINGS = 4  # Expected number of settings with measured variants, for the remaining time.
+TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
+
+
+@reject_former_names(ahead="horizon", rounds="repeats")
+def tune(
+    model: str | os.PathLike[str],
+    *,
+    engine: str = "mujoco",
+    worlds: int = 16,
+    steps: int = 200,
+    control: Control = "random",
+    seed: int = 0,
+    spread: float = 0.1,
+    states: Any = None,
+    horizon: int = 10,
+    repeats: int = 5,
+    threshold: float = DEFAULT_THRESHOLD,
+    watch: Callable[[Event], None] | None = None,
+) -> Tuning:
+    """Measure an engine's settings on worlds of a model or scene.
+
+    Parameters
+    ----------
+    model : path (MJCF)
+        For "kamino" the path of a Python file or a name, as for `lavender.lab.engine_scenes.step_scene`.
+    engine : {"mujoco", "mujoco_warp", "kamino"}
+        The last two step all worlds at once; the time of a step is divided by the number of worlds.
+    worlds, steps, control, seed, spread
+        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`. Scenes of Kamino set their own
+        controls.
+    states : path of an .npz, "keyframes", or arrays, optional
+        States in which the worlds start: see `audit`, and for "kamino" `lavender.lab.engine_scenes`.
+    horizon : int
+        Number of steps of a stretch.
+    repeats : int
+        Repetitions of the timing, in which settings alternate.
+    threshold : float, m/s, m
+        Smaller errors and distances count as accurate enough.
+    watch : callable, optional
+        Called with the progress.
+
+    Returns
+    -------
+    Tuning
+        After Ctrl-C, the result so far, with `stopped`.
+
+    Raises
+    ------
+    InputError
+        The model cannot be read, the engine is not installed, there are fewer than two worlds, or `horizon` does not
+        divide `steps`.
+    CapabilityError
+        The problem of the model's integrator is not one of M, or a world has more rows than the engine has memory for.
+    UnknownName
+        The engine is unknown.
+    """
+    check_name("engine", engine, TUNE_ENGINES)
+    worlds = check_int("worlds", worlds, 2, None)
+    horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
+    threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
+    if check_int("steps", steps, 1, None) % horizon:
+        raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
+    if engine == "kamino":
+        if control != "random":
+            raise InputError("control is for models of MuJoCo; a scene of kamino sets its own: leave it out")
+        start = {"states": states, "spread": spread, "seed": seed}
+        return measure_settings(
+            lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
+            name, horizon, repeats, threshold, can_touch=True, watch=watch,
+        )  # fmt: skip
+    runs = Runs(name, worlds, steps, control=control, seed=seed, spread=spread).with_start_states(states)
+    mj, configured = runs.load_model()
+    # An unsupported model raises here, once.
+    from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
+    stage_type = MujocoStage if engine == "mujoco" else WarpStage
+
+    def make_stages() -> tuple[Stage, Stage]:
+        """Simulate the worlds with even numbers, and those with odd numbers."""
+        even, odd = (stage_type.from_runs(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
+        return cast("tuple[Stage, Stage]", (even, odd))
+
+    can_touch = can_any_geoms_collide(mj, configured)
+    return measure_settings(make_stages, name, horizon, repeats, threshold, can_touch=can_touch, watch=watch)
+
+
+def measure_settings(
+    make_stages: Callable[[], tuple[Stage, Stage]],
+    model: str,
+    horizon: int,
+    repeats: int,
+    threshold: float,
+    *,
+    can_touch: bool,
+    watch: Callable[[Event], None] | None = None,
+) -> Tuning:
+    """Measure settings on one stage, and those chosen on a second one.
+
+    Parameters
+    ----------
+    make_stages : callable
+        Returns the stage on which settings are chosen and the one of the worlds held back.
+    model : str
+        Name in messages and tables.
+    horizon, repeats, threshold, watch
+        As for `tune`.
+    can_touch : bool
+        Whether bodies of the model can collide, see `StepSizes`.
+    """
+    schedule = Schedule(watch)
+    measured: list[Measured] = []
+    held: list[Measured] = []
+    sizes: StepSizes | None = None
+
+    def make_result(stopped: bool) -> Tuning:
+        """Build the result so far."""
+        timed = [m for m in measured if np.isfinite(m.mean_step_time)]
+        busy = machine.describe_busy(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+        return Tuning(
+            model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy
+        )
+
+    def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
+        """Judge settings."""
+        results = []
+        schedule.expect("judging", len(settings))
+        for setting in settings:
+            with schedule.measure("judging", setting.name):
+                results.append(stage.judge_setting(setting))
+        return results
+
+    try:
+        stage, held_back = make_stages()
+        own, first_settings = stage.own_setting, stage.list_first_settings()
+        n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
+        n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
+        schedule.reserve("judging", n_first + 3 + n_variants)  # 3: the worlds held back
+        schedule.reserve("timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats)
+        measured += judge(stage, [own])
+        if not np.isfinite(measured[0].error).all():
+            raise InputError(f"{model}: these worlds diverge with the model's own setting")
+        last = judge(held_back, [own])
+        both = [*measured, *last]
+        rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
+        sizes = StepSizes(rows, contacts, can_touch)
+        if not sizes.has_enough_contact:
+            schedule.reserve("judging", 0)
+            schedule.reserve("timing", 0)
+            stage.time_settings(measured, repeats, schedule)
+            return make_result(False)
+        measured += judge(stage, first_settings[1:])
+        stage.time_settings(measured, n_trial, schedule)
+        near = [
+            m.setting
+            for m in make_result(False).pareto_front
+            if m.mean_step_time <= MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
+        ]
+        known = {m.setting for m in measured}
+        more = dict.fromkeys(x for s in [own, *near] for x in stage.list_variants(s) if x not in known)
+        schedule.reserve("judging", len(more) + 2)
+        schedule.reserve("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
+        measured += judge(stage, list(more))
+        stage.time_settings(measured, repeats, schedule)
+        chosen = make_result(False)
+        other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
+        last += judge(held_back, list(other))
+        schedule.reserve("judging", 0)
+        schedule.reserve("timing", 0)
+        held_back.time_settings(last, 2 * repeats, schedule)
+        held += last if np.isfinite(last[0].mean_step_time) else []
+    except KeyboardInterrupt:
+        if not measured or not np.isfinite(measured[0].mean_step_time):
+            raise
+        return make_result(True)
+    return make_result(False)
