@@ -13,6 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 NAMES = (
     "decisions",
     "derivatives",
+    "engine_claims",
     "kernels",
     "limits",
     "page",
