@@ -159,11 +159,14 @@ def measure_errors(
     normals = before + 3 * np.arange(len(mu)) + 2
     lam_n, w_n, lam_t, w_t = lam[normals], w[normals], lam[tangents], w[tangents]
     error_n = np.abs(d[normals] * (lam_n - np.maximum(0.0, lam_n - w_n / d[normals])))
-    free = lam_t - w_t / d[tangents]
+    d_t = d[tangents].mean(
+        axis=1, keepdims=True
+    )  # With one d, w_t opposite to lambda_t stays on the edge of the disk.
+    free = lam_t - w_t / d_t
     bound = mu * np.maximum(0.0, lam_n)
     size = np.linalg.norm(free, axis=1)
     projected = free * np.minimum(1.0, bound / np.maximum(size, 1e-300))[:, None]
-    error_t = np.abs(d[tangents] * (lam_t - projected))
+    error_t = np.abs(d_t * (lam_t - projected))
     limits = slice(int(np.searchsorted(lower[:before] == 0.0, True)), before)
     products = np.abs(np.concatenate([lam_n * w_n, (lam * w)[limits] * (lower[limits] == 0.0)]))
     excess = np.linalg.norm(lam_t, axis=1) - mu * lam_n

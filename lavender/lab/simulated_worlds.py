@@ -442,7 +442,9 @@ class WarpWorlds:
         """Use the options of a model that is otherwise equal."""
         self.device_model = self.mjw.put_model(model)
         if hasattr(self.device_model.opt, "warn_overflow"):
-            self.device_model.opt.warn_overflow = 0  # Do not print a line for each solve that uses up its iterations.
+            self.device_model.opt.warn_overflow = (
+                0  # Do not print a line for each solve that uses up its iterations.
+            )
 
     def start(self, start_arrays: dict[str, Any]) -> None:
         """Continue from a state of all worlds."""
