@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.cli.options import EXIT_UNMET, FILE, limit_to_one_thread, make_console, print_escaped
+from lavender.io.stored import check_figure_path, check_writable, write_figure
 
 
 @click.command()
@@ -20,7 +21,9 @@ from lavender.cli.options import EXIT_UNMET, FILE, limit_to_one_thread, make_con
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",
               help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
-def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...]) -> None:
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.png|svg|pdf",
+              help="Draw the parts of the slip of each contact.")  # fmt: skip
+def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None) -> None:
     """Explain why contacts of a MuJoCo model slip.
 
     MODEL.xml is an MJCF file. For each contact, the table shows its mean sliding speed in the engine's answer, in the
@@ -34,8 +37,11 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
     from lavender.io.recording import load_model
     from lavender.lab.report.terminal import print_table
     from lavender.lab.slip import explain_slip_of_states, summarize_slip
+    from lavender.lab.slip_figure import draw_slip
 
     steps = check_int("--steps", steps, 1)
+    if out is not None:
+        out = check_writable(check_figure_path(out))
     limit_to_one_thread()
     explanations = explain_slip_of_states(
         load_model(model)[1], states, contacts=contacts or None, steps=steps
@@ -45,6 +51,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
             f"{model}: no contact with friction in these states; give other --states, or more --steps"
         )
         raise click.exceptions.Exit(EXIT_UNMET)
+    if out is not None:
+        write_figure(draw_slip(explanations), out)
     print_table(make_console(), summarize_slip(explanations))
     worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
     print_escaped(worst.sentence)

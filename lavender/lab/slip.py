@@ -373,26 +373,63 @@ def explain_slip_of_states(
     return explanations
 
 
-def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
-    """Return the mean sliding speed of each contact [m/s] in each variant over several steps, and its main cause."""
+@dataclass(frozen=True, eq=False)
+class AverageSlip:
+    """Slip of one contact, averaged over the points and steps in which it occurred.
+
+    Parameters
+    ----------
+    contact : str
+        Both geoms, without the number of the contact.
+    count : int
+        Number of points, summed over all steps.
+    speeds : (variants,) m/s
+    parts : dict
+        Cause -> part of the slip [m/s].
+    """
+
+    contact: str
+    count: int
+    speeds: FloatArray
+    parts: dict[str, float]
+
+    @property
+    def cause(self) -> str:
+        """Dominant cause: the largest part; "no slip" below 1e-6 m/s."""
+        return (
+            max(self.parts, key=lambda c: self.parts[c]) if self.speeds[0] > MIN_EXPLAINED_SLIP else "no slip"
+        )
+
+
+def average_slip(explanations: Iterable[SlipExplanation]) -> list[AverageSlip]:
+    """Return the slip of each contact, averaged over its points in several steps."""
     speeds: dict[str, list[list[float]]] = {}
     parts: dict[str, dict[str, float]] = {}
-    names: list[str] = []
-    undefined: set[int] = set()  # variants without values in one of the steps
     for explanation in explanations:
-        undefined |= {k for k, variant in enumerate(explanation.variants) if variant.note == UNDEFINED_LAW}
-        names = names or [variant.name for variant in explanation.variants]
         for i, contact in enumerate(explanation.contacts):
             key = contact.partition(" (")[2].rstrip(")") or contact  # the geoms, without the contact's number
             speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
             sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
             for cause, sizes in explanation.parts.items():
                 sums[cause] += float(sizes[i])
+    return [
+        AverageSlip(
+            key, len(values), np.mean(values, axis=0), {c: x / len(values) for c, x in parts[key].items()}
+        )
+        for key, values in speeds.items()
+    ]
+
+
+def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
+    """Return the mean sliding speed of each contact [m/s] in each variant over several steps, and its main cause."""
+    explanations = list(explanations)
+    names = [variant.name for variant in explanations[0].variants] if explanations else []
+    undefined = {  # variants without values in one of the steps
+        k for e in explanations for k, variant in enumerate(e.variants) if variant.note == UNDEFINED_LAW
+    }
     rows = []
-    for key, values in speeds.items():
-        mean = np.mean(values, axis=0)
-        cause = max(parts[key], key=lambda c: parts[key][c]) if mean[0] > MIN_EXPLAINED_SLIP else "no slip"
-        speeds_of_variants = [NONE if k in undefined else format_size(x) for k, x in enumerate(mean.tolist())]
-        rows.append([key, str(len(values)), *speeds_of_variants, cause])
+    for a in average_slip(explanations):
+        speeds = [NONE if k in undefined else format_size(x) for k, x in enumerate(a.speeds.tolist())]
+        rows.append([a.contact, str(a.count), *speeds, a.cause])
     heads = ["contact", "steps x points", *(f"{name} [m/s]" for name in names), "dominant cause"]
     return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))

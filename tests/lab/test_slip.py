@@ -5,7 +5,8 @@ import pytest
 
 import lavender as lv
 from lavender.lab.report.text import NONE
-from lavender.lab.slip import explain_slip, explain_slip_of_states, summarize_slip
+from lavender.lab.slip import CAUSES, average_slip, explain_slip, explain_slip_of_states, summarize_slip
+from lavender.lab.slip_figure import draw_slip
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -172,6 +173,28 @@ def test_chosen_contacts_and_summary():
     assert table.rows[0][-1] == "load above the friction limit"
     with pytest.raises(lv.InputError, match="no contact's name contains 'hand'"):
         explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
+
+
+def test_bars_of_the_figure_are_the_parts():
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=200, contacts="box")
+    (average,) = average_slip(explanations)
+    axes = draw_slip(explanations).axes[0]
+    assert [bar.get_label() for bar in axes.containers] == list(CAUSES.values())
+    widths = [float(bar.patches[0].get_width()) for bar in axes.containers]
+    assert widths == pytest.approx(list(average.parts.values()), rel=1e-6)
+    assert axes.lines[0].get_xdata() == [average.speeds[0]] and average.count == len(explanations[0].contacts)
+    with pytest.raises(lv.InputError, match="no contact to draw"):
+        draw_slip([])
+
+
+@pytest.mark.parametrize("option", ['cone="elliptic"', 'cone="pyramidal"', 'cone="elliptic" impratio="10"'])
+def test_every_variant_is_solved_and_judged(option):
+    """Each solution has a relative residual of at most 1e-9, and an engine that converged has the same velocity."""
+    for angle in (0.2, 0.6):
+        explanation = explain_slip_of_states(block(angle, option=option), steps=100)[0]
+        for variant in explanation.variants[1:]:
+            assert not variant.note.startswith("not solved")
+            assert variant.relative <= 1e-9, variant.name
 
 
 def test_problems_without_contacts_or_velocities_are_rejected():
