@@ -1,7 +1,7 @@
 """Rank solvers: for each structure and sequence, to each tolerance and within each time.
 
 To a tolerance, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
-times. Within a time, and with a budget of sweeps, they rank by the number of cases served (up to half of the start's
+times; only runs to a tolerance count. Within a time, and with a budget of sweeps, they rank by the number of cases served (up to half of the start's
 residual is left), then by the 90th percentile of the residual; a solver is recommended only if it serves nine cases of
 ten. A case without a result in the time counts with residual 1, as the zero impulse. A solver with a false claim
 on one of the cases ranks behind all solvers without one.
@@ -24,6 +24,7 @@ from lavender.lab.bench.statistics import (
     collect_times_to,
     compute_geometric_mean,
     compute_quantile,
+    get_modes_to_tolerance,
     get_time_of_miss,
     get_tolerances,
     group_cases_by_family,
@@ -171,6 +172,7 @@ class _RunGroup:
     how: str = ""  # the call; empty for single cases
     iterations: int = 0
     tol: float = 0.0  # that a call has
+    mode: str = ""  # of the call
     runs: dict[str, list[Record]] = field(default_factory=dict)  # by case
 
     def describe_budget(self, runs: Sequence[Record]) -> dict[str, Any]:
@@ -195,7 +197,7 @@ def _group_runs(records: Records) -> RunGroups:
             group = groups.setdefault((r.solver, "", ""), _RunGroup(r.solver))
         else:
             tol, budget = (r.tol, 0) if r.mode == "tol" else (0.0, r.max_iter)
-            new = _RunGroup(r.solver, f"{r.target}, {r.start}", budget, tol)
+            new = _RunGroup(r.solver, f"{r.target}, {r.start}", budget, tol, r.mode)
             group = groups.setdefault((r.solver, r.target, r.start), new)
         group.runs.setdefault(r.case, []).extend([r] if r.is_usable else [])
     return groups
@@ -210,7 +212,7 @@ def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
         )
         if compared and r.mode == "budget" and counts_sweeps(r):
             start = "" if r.step < 0 else r.start
-            new = _RunGroup(r.solver, start, r.max_iter)
+            new = _RunGroup(r.solver, start, r.max_iter, mode="budget")
             groups[r.max_iter].setdefault((r.solver, "", start), new).runs[r.case] = [r]
     return {n: groups[n] for n in sorted(groups)}
 
@@ -230,15 +232,19 @@ def rank_to_tolerance(
 ) -> Advice:
     """Rank the solvers that bring these cases, or steps, to a tolerance.
 
-    Steps of several sequences count together, by calls with this or a tighter tolerance, or with a budget. If `groups`
-    is given, the records are not grouped again.
+    Only runs to a tolerance count; steps of several sequences count together, by calls with this or a tighter
+    tolerance. If `groups` is given, the records are not grouped again.
     """
     limit, liars = get_time_of_miss(records), _list_false_claims(records, cases)
+    modes = get_modes_to_tolerance(records)
     choices: list[RankedChoice] = []
     for group in _select_groups(cases, _group_runs(records) if groups is None else groups):
-        if group.tol > tolerance:
+        if group.tol > tolerance or group.mode not in ("", *modes):
             continue
-        runs = {c: _select_fastest(group.runs.get(c, ()), tolerance) for c in cases}
+        runs = {
+            c: _select_fastest((r for r in group.runs.get(c, ()) if r.mode in modes), tolerance)
+            for c in cases
+        }
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
         score = compute_geometric_mean(
@@ -315,7 +321,7 @@ def _select_most_accurate(runs: Iterable[Record], limit: float) -> Record | None
 
 def choose_time_budgets(records: Records) -> tuple[float, ...]:
     """Return three decades of time [s] about the median of the fastest times to the middle tolerance."""
-    tolerances = get_tolerances(records)
+    tolerances, modes = get_tolerances(records), get_modes_to_tolerance(records)
     tolerance = tolerances[len(tolerances) // 2]
     fastest = [min(by.values()) for by in collect_times_to(records, tolerance).values() if by]
     for passes in group_passes(records).values():
@@ -323,7 +329,7 @@ def choose_time_budgets(records: Records) -> tuple[float, ...]:
             median(w.times[start])
             for w in passes
             for start, residuals in w.residuals.items()
-            if len(residuals) == w.steps and max(residuals) <= tolerance
+            if w.mode in modes and len(residuals) == w.steps and max(residuals) <= tolerance
         ]
         fastest.append(min(reached, default=math.inf))
     fastest = [t for t in fastest if 0.0 < t < math.inf]

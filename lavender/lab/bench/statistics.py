@@ -1,7 +1,8 @@
 """Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
-The time to a tolerance is the shortest time of all runs with a judged residual of up to this tolerance. Runs are
-compared by the residual that they reached, not by the tolerance that they were given.
+The time to a tolerance is the shortest time of the runs to any tolerance with a judged residual of up to this
+tolerance: they are compared by the residual that they reached, not by the tolerance that they were given. Runs with a
+fixed budget do not count, since a reader cannot choose the budget in advance (`get_modes_to_tolerance`).
 """
 
 from __future__ import annotations
@@ -36,6 +37,11 @@ def get_tolerances(records: Records) -> tuple[float, ...]:
         if run.plan.get("tolerances"):
             return tuple(sorted(map(float, run.plan["tolerances"]), reverse=True))
     return tuple(sorted({r.tol for r in records if r.mode == "tol"}, reverse=True)) or (1e-3, 1e-6, 1e-9)
+
+
+def get_modes_to_tolerance(records: Iterable[Record]) -> frozenset[str]:
+    """Return the modes of the runs that count to a tolerance: "tol", or "budget" if no run is to a tolerance."""
+    return frozenset({"tol"} if any(r.mode == "tol" for r in records) else {"budget"})
 
 
 def group_runs_by_pair(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
@@ -93,7 +99,7 @@ class Reach:
     ----------
     case, solver, start : str
     times : mapping of float to float, s
-        Time to each tolerance; inf if it was not reached.
+        Time to each tolerance, of the runs to a tolerance; inf if it was not reached.
     best, roundoff_floor : float
         Smallest relative residual of all runs, and its round-off floor.
     status : str
@@ -201,7 +207,7 @@ class Spread:
 def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
     """Return one row for each case, solver and start, in the order of the records."""
     tolerances = get_tolerances(records) if tolerances is None else tuple(tolerances)
-    out = []
+    modes, out = get_modes_to_tolerance(records), []
     for (case, solver, start), group in group_runs_by_pair(records).items():
         good = [r for r in group if r.is_usable]
         best = min(good, key=lambda r: (r.relative, r.time_min), default=None)
@@ -213,7 +219,10 @@ def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None 
                 solver=solver,
                 start=start,
                 times={
-                    tolerance: min((r.time_min for r in good if r.relative <= tolerance), default=math.inf)
+                    tolerance: min(
+                        (r.time_min for r in good if r.mode in modes and r.relative <= tolerance),
+                        default=math.inf,
+                    )
                     for tolerance in tolerances
                 },
                 best=best.relative if best else math.inf,
@@ -434,19 +443,21 @@ def count_matrix_passes(record: Record) -> float:
     return float(sum(passes)) if passes else math.nan
 
 
+def find_other_work(records: Iterable[Record]) -> set[str]:
+    """Return the solvers with a run with other work than passes over A (`count_matrix_passes`)."""
+    return {r.solver for r in records if r.is_usable and math.isnan(count_matrix_passes(r))}
+
+
 def matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
 
-    Solvers with other work in their runs are left out (`count_matrix_passes`). Less than one pass counts as one.
+    As for times, only runs to a tolerance count. Solvers with other work in their runs are left out
+    (`find_other_work`). Less than one pass counts as one.
     """
-    groups = {
-        k[:2]: [r for r in group if r.is_usable]
-        for k, group in group_runs_by_pair(records).items()
-        if k[2] == "cold"
-    }
-    excluded = {
-        s for (_, s), group in groups.items() if any(math.isnan(count_matrix_passes(r)) for r in group)
-    }
+    modes = get_modes_to_tolerance(records)
+    groups = {k[:2]: group for k, group in group_runs_by_pair(records).items() if k[2] == "cold"}
+    excluded = find_other_work(r for group in groups.values() for r in group)
+    groups = {k: [r for r in group if r.is_usable and r.mode in modes] for k, group in groups.items()}
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for (case, solver), group in groups.items():
         if solver not in excluded:
@@ -497,7 +508,7 @@ class Backend:
     backend_time : float, s
         Geometric mean of the time in the solver's own interface, on converted data.
     wins : int
-        Cases on which `backend_time` is shorter than the time of lavender's fastest solver.
+        Cases on which `backend_time` is shorter than the complete call of lavender's fastest solver.
     """
 
     solver: str
@@ -509,12 +520,13 @@ class Backend:
 
 def compare_backend_times(records: Records) -> list[Backend]:
     """Return solvers with both times, sorted by the time of their own interface."""
-    tolerances = get_tolerances(records)
+    tolerances, modes = get_tolerances(records), get_modes_to_tolerance(records)
     tolerance = tolerances[len(tolerances) // 2]
     best: dict[tuple[str, str], Record] = {}
     for r in records:
         key = (r.solver, r.case)
-        reached = r.is_usable and r.relative <= tolerance and r.start == "cold" and not r.interleave_group
+        counts = r.mode in modes and r.start == "cold" and not r.interleave_group
+        reached = counts and r.is_usable and r.relative <= tolerance
         if reached and (key not in best or r.time_min < best[key].time_min):
             best[key] = r
     ours: dict[str, float] = {}
@@ -600,7 +612,7 @@ class Robustness:
     family: str
     solver: str
     cases: int
-    reached: Mapping[float, int]  # tolerance -> number of cases that the judge confirms
+    reached: Mapping[float, int]  # tolerance -> number of cases with a run to a tolerance that reached it
     wrong: int  # number of contradicted claims
     died: int
     budgets: Mapping[int, tuple[float, float]]  # iterations -> median and 95th percentile of the residual
@@ -609,7 +621,7 @@ class Robustness:
 
 def compute_robustness(records: Records) -> list[Robustness]:
     """Count solved cases, false claims and crashes by structure and solver, with residuals by budget."""
-    tolerances = get_tolerances(records)
+    tolerances, modes = get_tolerances(records), get_modes_to_tolerance(records)
     groups = {k[:2]: g for k, g in group_runs_by_pair(records).items() if k[2] == "cold"}
     solvers = sorted({solver for _, solver in groups})
     out = []
@@ -619,6 +631,10 @@ def compute_robustness(records: Records) -> list[Robustness]:
             if not groups_of_case:
                 continue
             best = {c: min(r.relative for r in g) for c, g in groups_of_case.items()}
+            to_tolerance = [
+                min((r.relative for r in g if r.mode in modes), default=math.inf)
+                for g in groups_of_case.values()
+            ]
             by_budget: dict[int, list[float]] = defaultdict(list)
             for group in groups_of_case.values():
                 for r in group:
@@ -630,7 +646,7 @@ def compute_robustness(records: Records) -> list[Robustness]:
                     family=family,
                     solver=solver,
                     cases=len(groups_of_case),
-                    reached={x: sum(v <= x for v in best.values()) for x in tolerances},
+                    reached={x: sum(v <= x for v in to_tolerance) for x in tolerances},
                     wrong=sum(bool(r.status_conflict) for r in runs),
                     died=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
                     budgets={n: (median(v), compute_quantile(v, 0.95)) for n, v in sorted(by_budget.items())},

@@ -12,20 +12,55 @@ from lavender.lab.report import table_specs
 from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, TOLERANCES, info, record, records_of
 
 
-def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
+def test_time_to_a_level_is_that_of_the_cheapest_run_to_a_level_that_reached_it():
     found = records_of(
         record("a", "x", 5.0, 1e-4, tol=1e-3),
         record("a", "x", 9.0, 1e-8),
-        record("a", "x", 1.0, 9e-4, **BUDGET),
+        record("a", "x", 1.0, 9e-4, **BUDGET),  # nor does a budget that happened to reach it
         record("a", "x", 0.1, 1e-9, order="reverse", mode="budget"),  # another order does not count
         record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
         record("a", "y", 3.0, 0.5, tol=1e-3, **FALSE_CLAIM),
     )
     x, y = report.summarize_runs_by_case(found)
-    assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
+    assert dict(x.times) == {1e-3: 5.0, 1e-6: 9.0}
     assert (x.best, x.status) == (1e-8, "CONVERGED")
     assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
     assert (y.best, y.status_conflict) == (2e-3, "says CONVERGED")
+
+
+def test_budgets_change_no_table_to_a_tolerance():
+    """The runs with a budget are faster, make fewer passes and reach more than the runs to a tolerance."""
+    made = []
+    for case in "ab":
+        made += [
+            record(case, "x", 5.0, 1e-7, work={"sweeps": 50}),
+            record(case, "y", 4.0, 1e-7, work={"sweeps": 40}),
+        ]
+        made.append(record(case, "z", 2.0, 1e-2, work={"sweeps": 30}, backend_time_min=1.0))
+    steps = [record(f"s {i}", "y", 4.0, 1e-7, step=i) for i in range(2)]
+    swept = BUDGET | {"max_iter": 20, "work": {"sweeps": 20}}
+    budgets = [record(case, solver, 1.0, 1e-9, backend_time_min=0.1 if solver == "z" else None, **swept)
+               for case in "ab" for solver in "xz"]  # fmt: skip
+    budgets += [record(f"s {i}", "y", 1.0, 1e-9, step=i, **swept) for i in range(2)]
+
+    def tables(*records):
+        found = records_of(*records)
+        for i in range(2):
+            found.add(info(f"s {i}", sequence="s", step=i))
+        return (
+            [dict(r.times) for r in report.summarize_runs_by_case(found)],
+            report.compute_mean_times_by_law(found),
+            report.compute_profiles(found, "time"),
+            report.compute_profiles(found, "work"),
+            [line.by_tolerance for line in report.recommend_solvers(found, [9.0])],
+            statistics.compare_backend_times(found),
+            [r.reached for r in statistics.compute_robustness(found)],
+        )
+
+    assert tables(*made, *steps) == tables(*made, *steps, *budgets)
+    # Without any run to a tolerance, budgets are all that there is.
+    (z,) = report.summarize_runs_by_case(records_of(record("a", "z", 1.0, 1e-9, **BUDGET)))
+    assert z.times[1e-6] == 1.0
 
 
 @pytest.mark.parametrize(
