@@ -1,10 +1,10 @@
 """Rank solvers: for each structure and sequence, to each tolerance and within each time.
 
 To a tolerance, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
-times; only runs to a tolerance count. Within a time, and with a budget of sweeps, they rank by the number of cases served (up to half of the start's
-residual is left), then by the 90th percentile of the residual; a solver is recommended only if it serves nine cases of
-ten. A case without a result in the time counts with residual 1, as the zero impulse. A solver with a false claim
-on one of the cases ranks behind all solvers without one.
+times; only runs to a tolerance count. Within a time, and with a budget of sweeps, they rank by the number of cases
+served (up to half of the start's residual is left), then by the 90th percentile of the residual; a solver is
+recommended only if it serves nine cases of ten. A case without a result in the time counts with residual 1, as the zero
+impulse. A solver with a false claim on one of the cases ranks behind all solvers without one.
 """
 
 from __future__ import annotations

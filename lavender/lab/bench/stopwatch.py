@@ -33,6 +33,12 @@ BACKEND_ENTRY_POINTS = {
 }  # fmt: skip
 
 
+def excludes_setup(solver: str) -> bool:
+    """Return whether the time of a backend's own solve has no set-up: it is a method, and data come to it before."""
+    entry_points = BACKEND_ENTRY_POINTS.get(solver, ())
+    return bool(entry_points) and all("." in point.partition(":")[2] for point in entry_points)
+
+
 class _TimedObject:
     """A backend's object with some methods timed."""
 

@@ -51,6 +51,7 @@ class Records:
     cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
     records: list[Record] = field(default_factory=list)
     source: str = ""
+    selected_from: tuple[str, ...] = ()  # All solvers with records, if these are a selection of them.
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
     # the identity of each, as described last
     _sequences: dict[str, str] = field(default_factory=dict, repr=False)
@@ -119,7 +120,7 @@ class Records:
         self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
     ) -> Records:
         """Return other records of the same runs, with the descriptions and notes that `keep` accepts."""
-        found = Records(source=self.source)
+        found = Records(source=self.source, selected_from=self.selected_from)
         entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips]
         for entry in (*filter(keep, entries), *records):
             found.add(entry)
@@ -138,10 +139,17 @@ class Records:
         for name in wanted:
             if name not in known:
                 raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
-        return self.with_records(
+        selection = self.with_records(
             (r for r in self.records if r.solver in wanted),
             lambda e: not isinstance(e, Skip) or e.solver in ("", *wanted),
         )
+        selection.selected_from = tuple(sorted(self.solvers))
+        return selection
+
+    @property
+    def solvers(self) -> set[str]:
+        """The solvers with records, and those that a selection left out."""
+        return {*self.selected_from, *(r.solver for r in self.records)}
 
     def is_successful(self, record: Record) -> bool | None:
         """Return whether a run succeeded, or None if the zero impulse solves the case."""

@@ -14,7 +14,7 @@ from lavender.lab.bench import statistics
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.store import Records
 from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
-from lavender.lab.report.text import format_count, name_run
+from lavender.lab.report.text import format_count, name_run, name_time
 from lavender.solvers import registry
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
@@ -110,9 +110,10 @@ def _sort_by_work(runs: list[Record]) -> list[Record]:
 
 def build_work_precision(records: Records, case: str) -> Figure:
     """Plot error against time for every run of a case: a curve for each solver and start, in the order of work."""
-    curves = []
+    curves, drawn = [], []
     for (name, solver, start), group in sorted(statistics.group_runs_by_pair(records).items()):
         runs = _sort_by_work([r for r in group if r.is_usable]) if name == case else []
+        drawn += runs
         if runs:
             points, targets = [(r.time_min, r.relative) for r in runs], tuple(r.target for r in runs)
             curves.append(
@@ -120,7 +121,7 @@ def build_work_precision(records: Records, case: str) -> Figure:
                     solver, name_run(solver, start), points, notes=targets, thin=start != "cold"
                 )
             )
-    return _build_case_figure("work-precision", "time: set-up and solve [s]", records, case, curves)
+    return _build_case_figure("work-precision", name_time(drawn), records, case, curves)
 
 
 def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
@@ -142,16 +143,27 @@ FLAT_LINES_NOTE = (
     "A curve is flat after its solver has stopped: it met a tolerance (grey lines) and did not go on, so the residual "
     "of its last run remains."
 )
-GRID_SIZE = 49  # Times at which the residuals of all cases are compared.
+PASSES_NOTE = (
+    "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "
+    "factorise, pivot or solve linear systems do other work and are not compared"
+)
+GRID_SIZE = 49  # Times, or numbers of passes, at which the residuals of all cases are compared.
 
 
-def build_overall_figure(records: Records) -> Figure:
+def build_overall_figure(records: Records, measure: str = "time") -> Figure:
     """Plot the residual that a solver has reached by a time, over all cases: the median, and a band of the middle half.
 
     A case without a result by that time counts with residual 1, as the zero impulse; so does a case that a solver
     does not accept, which the title states. Cases are single problems from a cold start. If there are only sequences,
     each step is a case, with carried impulses if there are any.
+
+    Parameters
+    ----------
+    records : Records
+    measure : {"time", "work"}
+        "work": by passes over A in place of time, of the solvers that do no other work.
     """
+    by_work = measure == "work"
     single = any(r.step < 0 for r in records)
     start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
     runs = [
@@ -159,15 +171,16 @@ def build_overall_figure(records: Records) -> Figure:
         if (r.step < 0) == single and r.start == start and r.order == "given" and not r.interleave_group
     ]  # fmt: skip
     cases = sorted({r.case for r in runs})
+    excluded = statistics.find_other_work(runs) if by_work else set()
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for r in runs:
-        if r.is_usable and r.time_min > 0.0:
-            by.setdefault(r.solver, {}).setdefault(r.case, []).append(
-                (r.time_min, max(r.relative, MIN_RESIDUAL))
-            )
+        if r.is_usable and r.time_min > 0.0 and r.solver not in excluded:
+            cost = max(1.0, statistics.count_matrix_passes(r)) if by_work else r.time_min
+            by.setdefault(r.solver, {}).setdefault(r.case, []).append((cost, max(r.relative, MIN_RESIDUAL)))
     times = [t for own in by.values() for some in own.values() for t, _ in some]
+    name = "work over all" if by_work else "over all"
     if not times:
-        return Figure("over all", "", "", "", ())
+        return Figure(name, "", "", "", ())
     grid = np.geomspace(min(times), max(times), GRID_SIZE)
     curves = []
     for solver, own in sorted(by.items()):
@@ -183,10 +196,14 @@ def build_overall_figure(records: Records) -> Figure:
     over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
     if any(len(own) < len(cases) for own in by.values()):
         over += "; no result: 1"
+    note = FLAT_LINES_NOTE
+    if by_work:
+        names = f" ({', '.join(sorted(excluded))})" if excluded else ""
+        note = f"{PASSES_NOTE}{names}. {note}"
     return Figure(
-        "over all", f"Error against time{over if len(cases) > 1 else ''}",
-        "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
-        tolerances=statistics.get_tolerances(records), note=FLAT_LINES_NOTE,
+        name, f"Error against {'work' if by_work else 'time'}{over if len(cases) > 1 else ''}",
+        "passes over A" if by_work else name_time(runs), "relative residual [-]", tuple(curves),
+        tolerances=statistics.get_tolerances(records), note=note,
     )  # fmt: skip
 
 
@@ -196,7 +213,10 @@ def build_budget_figure(records: Records, case: str) -> Figure:
     for (name, solver, start), points in sorted(statistics.group_runs_by_budget(records).items()):
         if name == case:
             curves.append(Curve.from_points(solver, name_run(solver, start), points, thin=start != "cold"))
-    return _build_case_figure("budget", "iterations (sweeps)", records, case, curves)
+    # An iteration of admm solves a linear system, an iteration of pgs is a sweep.
+    swept = all("sweeps" in r.work for r in records if r.mode == "budget" and r.case == case and r.is_usable)
+    title = "sweeps" if swept else "iterations, each solver's own unit"
+    return _build_case_figure("budget", title, records, case, curves)
 
 
 MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead about the second place.
@@ -209,11 +229,13 @@ def is_plug_in(solver: str) -> bool:
     return spec is None or not spec.builtin
 
 
-def select_drawn(ranked: Sequence[str]) -> list[str]:
-    """Select the solvers of a figure: every plug-in, then the first of the others, up to `MAX_CURVES` in all."""
+def select_drawn(ranked: Sequence[str], always: Sequence[str] = ()) -> list[str]:
+    """Select the solvers of a figure: plug-ins, the first of the others, `always`; up to `MAX_CURVES` in all."""
     plug_ins = [name for name in ranked if is_plug_in(name)]
-    others = [name for name in ranked if name not in plug_ins]
-    return [*plug_ins, *others[: max(MAX_CURVES - len(plug_ins), MIN_COMPARED)]]
+    required = [name for name in ranked if name in always and name not in plug_ins]
+    others = [name for name in ranked if name not in (*plug_ins, *required)]
+    n_others = max(MAX_CURVES - len(plug_ins), MIN_COMPARED) - len(required)
+    return [*plug_ins, *others[: max(n_others, 1)], *required]
 
 
 def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:

@@ -82,6 +82,22 @@ class Report:
         return machine.describe_busy(loads, run.cores)
 
     @cached_property
+    def load_summary(self) -> str:
+        """Sentences on the load during the runs, with numbers; empty without times or loads."""
+        if self.is_campaign or not len(self.newest_run):
+            return ""
+        (run,) = self.newest_run.runs.values()
+        return machine.summarise_loads((r.load for r in self.newest_run), run.cores)
+
+    @cached_property
+    def load_warning(self) -> str:
+        """A sentence on single runs with more runnable processes than cores; empty if there are none."""
+        if self.is_campaign or not len(self.newest_run):
+            return ""
+        (run,) = self.newest_run.runs.values()
+        return machine.describe_loaded_runs((r.load for r in self.newest_run), run.cores)
+
+    @cached_property
     def tolerances(self) -> tuple[float, ...]:
         """Residual tolerances, largest first."""
         return statistics.get_tolerances(self.ranked_records)

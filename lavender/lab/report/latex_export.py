@@ -1,14 +1,16 @@
 """Write PDF figures, LaTeX tables and a paragraph on the method of a report, for a paper.
 
-Figures and mean times show the time of its own interface for a solver of another package.
+All times are of one call of `lv.solve`, for solvers of other packages, too. A table has the part of the call that these
+spend in their own interface.
 
 paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
-paper/class-FOLDER.pdf      the same for each folder that the cases came from, if there are several
+paper/work-over-all.pdf     error against passes over A, of the solvers that do no other work
+paper/class-FOLDER.pdf      both for each folder that the cases came from, if there are several
 paper/profile-LAW-X.pdf     performance profiles by time, for each problem class and tolerance
 paper/work-profile-....pdf  the same by passes over A, of the solvers that do no other work
 paper/sequence-....pdf      each step of a sequence
 paper/figures.tex           these figures with their captions
-paper/tables.tex            recommendations, mean times by law, claims against the judge (booktabs)
+paper/tables.tex            recommendations, mean times by law, own interfaces, claims against the judge (booktabs)
 paper/method.tex            what was measured, how, on which machine, with its numbers
 """
 
@@ -16,7 +18,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,19 +28,28 @@ from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
+from lavender.lab.bench.stopwatch import excludes_setup
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
-from lavender.lab.report.figures import Figure, Group, build_figures, build_overall_figure, select_drawn
+from lavender.lab.report.figures import (
+    PASSES_NOTE,
+    Figure,
+    Group,
+    build_figures,
+    build_overall_figure,
+    select_drawn,
+)
 from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import assign_styles, plot_figure
 from lavender.lab.report.table import Cell, Table
-from lavender.lab.report.text import format_count, format_left_out
+from lavender.lab.report.text import describe_time, format_count, format_left_out
 
-FEWEST_PASSES = (
-    "the fewest passes over A (sweeps and products with A, as each solver counts them; solvers that factorise or pivot "
-    "are not compared)"
-)
 FIGURE_SIZE = (5.5, 3.4)  # [inches] The width is the text width of a page.
+FIGURES_HEAD = (
+    "% \\usepackage{graphicx}\n"
+    "% The figures are 5.5 in wide with text of 7 to 10 pt: use figure* in two columns.\n\n"
+)
+REFERENCE_SOLVER = "osqp"  # Figures of error against time show it if it was measured.
 
 
 def write_paper(report: Report, folder: str | Path) -> Path:
@@ -64,51 +75,53 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     records = report.ranked_records
     if not len(records) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    own = records.with_records(
-        r if r.backend_time_min is None else replace(r, time_min=r.backend_time_min) for r in records
-    )
-    drawn = build_figures(own)
-    groups = (drawn.over, _build_folder_figures(own), drawn.profiles, drawn.sequences)
+    drawn = build_figures(records)
+    by_work = build_overall_figure(records, "work")
+    work = {"all": (by_work,)} if by_work.curves else {}
+    groups = (drawn.over, work, _build_folder_figures(records), drawn.profiles, drawn.sequences)
     some = [
         _select_leaders(figure, report.verdict.leaders)
         for group in groups
         for fs in group.values()
         for figure in fs
     ]
-    look = assign_styles({c.solver for figure in some for c in figure.curves})
+    look = assign_styles(records.solvers)
     folder = make_folder(folder)
     for figure in some:
         canvas = plot_figure(replace(figure, title=""), look, FIGURE_SIZE)
         write_figure(canvas, folder / _name_file(figure), metadata={"CreationDate": None, "Producer": None})
-    write_text(folder / "figures.tex", "\n".join(_include_figure(figure, own) for figure in some))
-    write_text(folder / "tables.tex", _write_tables(report, own))
+    text = FIGURES_HEAD + "\n".join(_include_figure(figure, report) for figure in some)
+    write_text(folder / "figures.tex", text)
+    write_text(folder / "tables.tex", _write_tables(report))
     write_text(folder / "method.tex", _describe_method(report))
     return folder
 
 
 def _build_folder_figures(records: Records) -> Group:
-    """Build figures of error against time over the cases of each folder, if the cases come from several folders."""
+    """Build figures of error against time and work over the cases of each folder, if there are several folders."""
     sources = {r.case: Path(records.cases[r.case].source) for r in records if r.step < 0}
     folders = sorted({p.parent for p in sources.values() if p.suffix.lower() in SUFFIXES})
     groups = {}
     for folder in folders if len(folders) > 1 else ():
-        figure = build_overall_figure(
-            records.with_records(r for r in records if sources.get(r.case, Path()).parent == folder)
-        )
+        part = records.with_records(r for r in records if sources.get(r.case, Path()).parent == folder)
         name = folder.name if sum(f.name == folder.name for f in folders) == 1 else str(folder)
-        if figure.curves:
-            groups[name] = (replace(figure, name=f"class {name}", title=f"{name}: {figure.title}"),)
+        groups[name] = tuple(
+            replace(figure, name=f"{prefix}class {name}", title=f"{name}: {figure.title}")
+            for prefix, measure in (("", "time"), ("work ", "work"))
+            for figure in (build_overall_figure(part, measure),)
+            if figure.curves
+        )
     return groups
 
 
 def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
-    """Reduce a figure to plug-ins and leaders of the verdict, then those that end lowest; bands to two solvers."""
+    """Reduce a figure to plug-ins, leaders of the verdict, those that end lowest, and osqp; bands to two solvers."""
     if all(c.steps for c in figure.curves):
         return figure  # The curves of a profile are selected already.
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
-    drawn = select_drawn(solvers)
+    drawn = select_drawn(solvers, (REFERENCE_SOLVER,))
     selected = [c for name in drawn for c in figure.curves if c.solver == name]
     selected[2:] = [replace(c, low=(), high=()) for c in selected[2:]]
     return replace(figure, curves=tuple(selected), left_out=tuple(sorted(set(solvers) - set(drawn))))
@@ -145,44 +158,64 @@ def _name_file(figure: Figure) -> str:
     return make_file_name(figure.name.replace(" ", "-")) + ".pdf"
 
 
-def _state_own_times(records: Records, solvers: Iterable[str]) -> str:
-    """Return a sentence on the timing of third-party solvers among these; empty without such solvers."""
-    names = sorted({r.solver for r in records if r.backend_time_min is not None}.intersection(solvers))
-    if not names:
-        return ""
-    return f" Time in its own interface, without conversion: {', '.join(names)}."
-
-
 def _state_lost_cases(records: Records) -> str:
     """Return a sentence on problems that did not load; empty if all did."""
     lost = sum(map(len, records.left_out.values()))
     return f" Left out, for it did not load: {format_count(lost, 'problem')}." if lost else ""
 
 
-def _include_figure(figure: Figure, records: Records) -> str:
+def _state_times(report: Report, solvers: set[str], sequences: bool = False) -> str:
+    """Return a sentence on the code that the times of these solvers include, with the load if it was too high."""
+    records = report.ranked_records
+    runs = [
+        r for r in records
+        if r.solver in solvers and r.order == "given" and not r.interleave_group and (r.step >= 0) is sequences
+    ]  # fmt: skip
+    sentence = describe_time(runs)
+    return f" {sentence} {report.load_warning}".rstrip() if sentence else ""
+
+
+def _include_figure(figure: Figure, report: Report) -> str:
     """Return a floating figure with its caption."""
-    own_times = _state_own_times(records, {c.solver for c in figure.curves})
-    caption = f"{figure.title}.{own_times}{_state_lost_cases(records)}"
+    records, solvers = report.ranked_records, {c.solver for c in figure.curves}
+    is_time = not figure.name.startswith("work ") and any(
+        "time" in x for x in (figure.x_title, figure.y_title)
+    )
+    sequences = figure.name.startswith("sequence ") or not any(r.step < 0 for r in records)
+    times = _state_times(report, solvers, sequences) if is_time else ""
+    caption = f"{figure.title}.{times}{_state_lost_cases(records)}"
     if any(c.steps for c in figure.curves):
-        cost = FEWEST_PASSES if figure.name.startswith("work ") else "the fastest solver's time"
+        by_work = figure.name.startswith("work ")
+        cost = "the fewest passes over A" if by_work else "the fastest solver's time"
         caption = f"Share of cases solved within a multiple of {cost}: law {caption}"
+        caption += f" {PASSES_NOTE}." if by_work else ""
+        caption += " Only runs to a tolerance count."
     if figure.note:
         caption += f" {figure.note}"
     if figure.left_out:
         caption += f" Not drawn: {', '.join(figure.left_out)}."
     return (
-        f"\\begin{{figure}}\n\\centering\n\\includegraphics{{{_name_file(figure)}}}\n\\caption{{{escape_tex(caption)}}}\n"
+        f"\\begin{{figure}}\n\\centering\n\\includegraphics[width=\\linewidth]{{{_name_file(figure)}}}\n"
+        f"\\caption{{{escape_tex(caption)}}}\n"
         f"\\label{{fig:{_name_file(figure).removesuffix('.pdf')}}}\n\\end{{figure}}\n"
     )
 
 
-def _write_tables(report: Report, own: Records) -> str:
+def _write_tables(report: Report) -> str:
     records, shift = report.ranked_records, format_seconds(statistics.MEAN_TIME_SHIFT)
+    middle = format_tolerance(report.tolerances[len(report.tolerances) // 2])
     caption = (
-        "Recommended solver, its mean time (of other packages with conversion), and the cases that it brings to the "
-        f"tolerance where that is not all. Within {TIME_NOISE_FACTOR:g} times of each other solvers count as equal."
+        "Recommended solver, its mean time, and the cases that it brings to the tolerance if it misses some, from runs "
+        f"to a tolerance. Solvers within {TIME_NOISE_FACTOR:g} times of each other count as equal."
     )
-    caption += _state_lost_cases(records)
+    if table_specs.has_interleaved_calls(report):
+        caption += (
+            f" To {middle} the lower quartile of repetitions that alternate between solvers, otherwise the minimum of "
+            "consecutive repeats."
+        )
+    everyone = {r.solver for r in records}
+    single = any(r.step < 0 for r in records)
+    caption += _state_times(report, everyone, not single) + _state_lost_cases(records)
     advice, last = table_specs.tabulate_advice(report), 1 + len(report.tolerances)
     rows: list[list[str | Cell]] = [
         [
@@ -193,17 +226,33 @@ def _write_tables(report: Report, own: Records) -> str:
         for row, line in zip(advice.rows, report.rankings, strict=True)
     ]
     parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
-    for law, by_tolerance in statistics.compute_mean_times_by_law(own).items():
+    for law, by_tolerance in statistics.compute_mean_times_by_law(records).items():
         solvers = set(next(iter(by_tolerance.values())))
-        rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - solvers)
+        ran = {r.solver for r in records if r.step < 0 and records.cases[r.case].law == law}
+        rest = sorted(ran - solvers)
         others = f" (not {', '.join(rest)})" if rest else ""
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the tolerance; a miss costs "
-            f"{format_seconds(statistics.get_time_of_miss(records))}. Solvers that take every case{others}."
+            f"{format_seconds(statistics.get_time_of_miss(records))}. Only runs to a tolerance count, to this or a "
+            f"tighter one. Solvers that take every case{others}."
         )
-        caption += _state_own_times(own, solvers) + _state_lost_cases(records)
+        caption += _state_times(report, solvers) + _state_lost_cases(records)
         parts.append(format_latex(table_specs.tabulate_means(by_tolerance), caption, f"means-{law}"))
-    caption = "Claims of solvers against the judge, which recomputes every residual from the problem's data."
+    backends = table_specs.tabulate_backends(records)
+    if backends.rows:
+        separate = ", ".join(sorted({s for row in backends.rows if excludes_setup(s := str(row[0]))}))
+        caption = (
+            f"Solvers of other packages, to {middle}, geometric means over the cases that each solves. Call: the time "
+            "of the other tables. Own interface: its part in the package's own solve function, on converted data"
+            f"{f' (without set-up: {separate})' if separate else ''}. Rest: conversion, checks, judge, Python, and "
+            "set-up outside of that function. Last: cases on which the own interface takes less time than the "
+            "complete call of lavender's fastest solver."
+        )
+        parts.append(format_latex(backends, caption + _state_lost_cases(records), "own-interface"))
+    caption = (
+        "Claims of solvers against the judge, which recomputes every residual from the problem's data. "
+        f"{table_specs.explain_run_counts(records)}"
+    )
     caption += _state_lost_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
     return "% \\usepackage{booktabs}\n" + "\n".join(parts)
@@ -232,15 +281,16 @@ def _describe_method(report: Report) -> str:
     lost = format_left_out(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
-    own_times = _state_own_times(records, {r.solver for r in own})
+    timed = describe_time(r for r in own if r.order == "given" and not r.interleave_group)
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
         f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
-        "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution. Times are those",
-        f"of set-up and solve, {minimum}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
-        f"{own_times} {report.stopped_warning} {report.high_load} Means of times are",
-        f"geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
+        "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution.",
+        f"{timed} Each is {minimum}, within a limit of {limit}, on numbers that were written just before;",
+        f"BLAS and OpenMP had {threads}. {report.load_summary} {report.stopped_warning} {report.high_load}",
+        "Times to a tolerance are of runs to this tolerance or a tighter one, never of runs with a fixed budget. Means",
+        f"are geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
         f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",
         f"Python {run.python}, {versions}; run {run.run}, {run.started}.",
     )

@@ -1,7 +1,8 @@
 """Draw figures with matplotlib: as SVG and PNG files, as PDF of a paper, and as SVG within a page.
 
-In files a solver keeps its colour, dash and mark in a whole report. The colours are from Okabe and Ito (distinct under
-the common colour-vision deficiencies); dashes and marks distinguish solvers that share a colour, also in grey print.
+In files a solver of lavender has the same colour, dash and mark in all reports. The colours are from Okabe and Ito
+(distinct under the common colour-vision deficiencies); dashes and marks distinguish solvers that share a colour, also
+in grey print. Plug-ins have colours of their own.
 
 Within a page the colours are from its style sheet, so that they follow the theme and the selected solvers. The drawing
 has classes in place of matplotlib's styles, whole coordinates, and the ranges of its axes, from which the page's script
@@ -24,10 +25,16 @@ from xml.etree import ElementTree
 
 from lavender.io.stored import make_folder, write_figure
 from lavender.lab.bench.record import format_tolerance, make_file_name
-from lavender.lab.report.figures import Curve, Figure
+from lavender.lab.report.figures import Curve, Figure, is_plug_in
 from lavender.lab.report.text import TIME_UNITS
+from lavender.solvers import registry
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
+PLUG_IN_COLORS = (
+    "#000000",
+    "#6A0DAD",
+    "#8B0000",
+)  # Plug-ins; no solver of lavender has one of these colours.
 DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
 LEGEND_COLUMNS = 3  # Columns of a legend above the axes.
@@ -164,18 +171,31 @@ class CurveStyle:
     marker: str
 
 
-# These solvers get the first styles, so that the solvers that are often compared have different colours.
-FIRST_SOLVERS = ("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses")
+# These solvers get the first styles, so that the solvers that are often compared have different colours. The last two
+# share the colour of one with which they are rarely drawn.
+FIRST_SOLVERS = (
+    *("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses"),
+    *("jacobi", "admm"),
+)
 
 
 def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
-    """Return a style for each solver: by its place in `FIRST_SOLVERS`, then among the sorted names."""
+    """Return a style for each solver.
+
+    A solver of lavender has a fixed style, by its place in `FIRST_SOLVERS`, then among the sorted names. Plug-ins have
+    the colours of `PLUG_IN_COLORS` in the order of their names; the first has a fixed one if it is the only one.
+    """
     names = set(solvers)
-    order = (*FIRST_SOLVERS, *sorted(names - set(FIRST_SOLVERS)))
+    own = {name for name in registry.specs() if not is_plug_in(name)}
+    groups = (
+        (COLORS, (*FIRST_SOLVERS, *sorted(own - set(FIRST_SOLVERS)))),
+        (PLUG_IN_COLORS, sorted(names - own)),
+    )
     return {
         name: CurveStyle(
-            COLORS[i % len(COLORS)], DASHES[i // len(COLORS) % len(DASHES)], MARKERS[i % len(MARKERS)]
+            colors[i % len(colors)], DASHES[i // len(colors) % len(DASHES)], MARKERS[i % len(MARKERS)]
         )
+        for colors, order in groups
         for i, name in enumerate(order)
         if name in names
     }

@@ -31,6 +31,7 @@ from lavender.lab.report.text import (
     format_share,
     name_run,
 )
+from lavender.solvers.registry import specs
 
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "ROUNDOFF_LIMIT")
@@ -467,6 +468,37 @@ def tabulate_claims(records: Records) -> Table:
     )
 
 
+def explain_run_counts(records: Records) -> str:
+    """Return sentences on why solvers have different numbers of runs and of claims."""
+    tolerances = list(map(format_tolerance, statistics.get_tolerances(records)))
+    known, solvers = specs(), sorted({r.solver for r in records})
+    swept = {r.solver for r in records if r.mode == "budget"}
+    exact = [s for s in solvers if s in known and known[s].exact]
+    unlimited = [
+        s for s in solvers if s not in swept and (s in exact or not (s in known and known[s].resumable))
+    ]
+    limited = sorted({r.solver for r in records if r.mode == "time"})
+    sentences = [f"Runs are to {', '.join(tolerances)}"]
+    if swept:
+        sentences[0] += (
+            ", and with a fixed budget or sweep order, which claim nothing unless they end at a solution"
+        )
+    sentences.append("After a missed tolerance no tighter one is run")
+    if any(skip.solver for skip in records.skips):
+        sentences.append("A solver has no runs on problems that it does not accept")
+    if exact and len(tolerances) > 1:
+        sentences.append(f"Exact solvers are run to {tolerances[-1]} alone: {', '.join(exact)}")
+    if unlimited and swept:
+        sentences.append(
+            f"Solvers that cannot stop after any iteration have no budgets: {', '.join(unlimited)}"
+        )
+    if limited:
+        sentences.append(
+            f"Candidates of a recommendation also have runs with a time limit: {', '.join(limited)}"
+        )
+    return ". ".join(sentences) + "."
+
+
 def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
     """Tabulate the geometric mean time to each tolerance for one law, and the number of cases that reach it."""
     tolerances = list(by_tolerance)
@@ -481,17 +513,25 @@ def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, i
 
 
 def tabulate_backends(records: Records) -> Table:
-    """Tabulate total time, its two parts, and wins against the built-in solvers, of solvers of other packages."""
+    """Tabulate the time of a call, its part in the own interface, the rest, and wins, of solvers of other packages."""
     rows: Rows = [
         [
             b.solver,
             str(b.solved),
-            *map(Cell.time, (b.total_time, b.total_time - b.backend_time, b.backend_time)),
+            *map(Cell.time, (b.total_time, b.backend_time, b.total_time - b.backend_time)),
             str(b.wins),
         ]
         for b in statistics.compare_backend_times(records)
     ]
-    return Table(["solver", "cases", "total", "conversion", "own interface", "faster than lavender"], rows)
+    heads = [
+        "solver",
+        "cases",
+        "call",
+        "own interface",
+        "rest",
+        "own interface below lavender's fastest call",
+    ]
+    return Table(heads, rows)
 
 
 def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:

@@ -108,8 +108,16 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 
     lines: list[Text] = []
     for i, statement in enumerate(report.verdict.statements):
-        if complete or i == 0 or statement.requested:
-            lines.append(Text(statement.text, style="" if i else "bold"))
+        if complete or i == 0 or statement.requested or statement.one_line:
+            cut = statement.one_line and not complete
+            lines.append(
+                Text(
+                    statement.text,
+                    style="" if i else "bold",
+                    no_wrap=cut,
+                    overflow="ellipsis" if cut else None,
+                )
+            )
             hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
             in_c = (f"# in C: {statement.in_c}",) * bool(statement.in_c)
             code = (
@@ -118,14 +126,13 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
                 else (statement.call_line + hint,) * bool(statement.call_line)
             )
             lines += [Text(f"    {line}") for line in code]
-    lines += [
-        Text(warning, style="yellow") for warning in (report.stopped_warning, report.busy_warning) if warning
-    ]
+    warnings = (report.stopped_warning, report.busy_warning or report.load_warning)
+    lines += [Text(warning, style="yellow") for warning in warnings if warning]
     notes = [
         Text.assemble((text, style)) for text, style in _list_notes(report, MAX_NOTES if complete else 1)
     ]
     for text in lines:
-        console.print(text, highlight=False)
+        console.print(text, highlight=False, no_wrap=text.no_wrap, overflow=text.overflow)
     if complete:
         for section in list_sections(report):
             note = f" ({section.note})" if section.table.rows else f": {section.empty}"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from shlex import quote
 
 from lavender.base.deadline import format_seconds
@@ -13,6 +14,7 @@ from lavender.lab.bench import statistics
 from lavender.lab.bench.recommendation import (
     SERVED_QUANTILE,
     SHORT_TIME_RATIO,
+    Advice,
     Choice,
     Subject,
     list_subjects,
@@ -30,10 +32,13 @@ from lavender.lab.bench.resampling import (
 from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, EngineAnswers, rank_engine, ranks_before
+from lavender.lab.report.figures import is_plug_in
 from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_left_out, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
+
+MAX_PLUG_INS = 2  # The sentence on plug-ins names so many; if there are more, only the best.
 
 
 @dataclass(frozen=True)
@@ -46,12 +51,14 @@ class Statement:
     code : lines of Python, as they were timed
     in_c : command that exports the call to C, or the reason why it cannot be exported
     requested : whether the sentence is about a time or a number of sweeps that the user requested
+    one_line : whether a short report on a terminal has the sentence, too, cut to one line
     """
 
     text: str
     code: tuple[str, ...] = ()
     in_c: str = ""
     requested: bool = False
+    one_line: bool = False
 
     @property
     def call_line(self) -> str:
@@ -141,6 +148,7 @@ def _recommend(
     head = _state_choice(records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases)
     statements = [
         _add_code(records, call, _add_engine(records, head, first, engine, cases)),
+        *_state_plug_ins(subject.best, first.solver),
         *_state_certainty(resampled),
     ]
     leaders = [c.solver for _, c in resampled.ranking[:3] if c.solved]
@@ -167,15 +175,7 @@ def _recommend(
         text = _state_service(f"If you have only {format_seconds(t)}", choice, t)
         statements.append(_add_code(records, best, text, bool(times)))
         leaders.insert(1, choice.solver)
-    for budget in sweeps:
-        calls = [f for f in single if f.as_record.mode == "budget" and f.as_record.max_iter == budget]
-        swept = rank_calls_in_time(records, calls, math.inf, n)
-        budget_text = f"With {format_count(budget, 'sweep')}"
-        if swept is not None and swept.ranking[0][1].solves_share(SERVED_QUANTILE):
-            best, choice = swept.ranking[0]
-            statements.append(_add_code(records, best, _state_service(budget_text, choice, math.inf), True))
-        elif swept is not None:
-            statements.append(Statement(f"{budget_text} no solver serves nine cases of ten.", requested=True))
+    statements += _state_sweep_budgets(records, single, sweeps, n)
     faster = [
         f"{b.solver} on {b.wins} of {b.solved} cases"
         for b in statistics.compare_backend_times(records)
@@ -183,7 +183,8 @@ def _recommend(
     ]
     if faster and subject.timing_mode == "call":
         head = (
-            "In their own interface, without conversion, some other solvers are faster than all of lavender's"
+            "The own interface of some other solvers, without conversion and judge, takes less time than the complete "
+            "call of every solver of lavender"
         )
         statements.append(Statement(f"{head}: {', '.join(faster)}."))
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
@@ -291,6 +292,66 @@ def _add_engine(records: Records, head: str, first: Choice | None, engine: Choic
         return f"{head} The engine's own {engine.solver} solves none of them to that tolerance."
     of = f"solves {engine.solved} of them in" if has_misses else "takes"
     return f"{head} The engine's own {engine.solver} {of} {time}, {INSIDE}."
+
+
+def _state_plug_ins(advice: Advice, first: str) -> list[Statement]:
+    """State place and time of the best plug-ins other than the recommended solver `first`, in one sentence."""
+    ranked = [
+        (place, choice)
+        for place, choice in enumerate(advice.ranking, 1)
+        if is_plug_in(choice.solver) and choice.solver != first
+    ]
+    named = ranked if len(ranked) <= MAX_PLUG_INS else ranked[:1]
+    texts = []
+    for place, choice in named:
+        time = f" in {format_seconds(choice.score)}" if choice.solved else ""
+        solved = f"{choice.solved} of {choice.cases} solved{time}"
+        texts.append(f"{choice.solver}: place {place} of {len(advice.ranking)}, {solved}")
+    if not texts:
+        return []
+    more = f" (and {len(ranked) - len(named)} more)" if len(ranked) > len(named) else ""
+    return [Statement(f"Plug-in {'; '.join(texts)}{more}.", one_line=True)]
+
+
+def _state_sweep_budgets(
+    records: Records, calls: Sequence[TimedCall], sweeps: Sequence[int], cases: int
+) -> list[Statement]:
+    """State the recommended solver for each number of sweeps; consecutive budgets with one solver get one sentence."""
+    firsts: list[tuple[int, TimedCall | None, Choice]] = []
+    for budget in sweeps:
+        some = [f for f in calls if f.as_record.mode == "budget" and f.as_record.max_iter == budget]
+        swept = rank_calls_in_time(records, some, math.inf, cases)
+        if swept is not None:
+            call, choice = swept.ranking[0]
+            firsts.append((budget, call if choice.solves_share(SERVED_QUANTILE) else None, choice))
+
+    def get_recommendation(entry: tuple[int, TimedCall | None, Choice]) -> tuple[object, ...]:
+        _, call, choice = entry
+        return () if call is None else (choice.solver, choice.solved, choice.cases, call.as_record.start)
+
+    statements = []
+    for _, group in groupby(firsts, get_recommendation):
+        budgets, served_by, choices = zip(*group, strict=True)
+        condition = f"With {_join_words([str(n) for n in budgets])} sweep{'s' * (budgets != (1,))}"
+        if served_by[0] is None:
+            statements.append(Statement(f"{condition} no solver serves nine cases of ten.", requested=True))
+            continue
+        text = _state_service(condition, choices[0], math.inf)
+        if len(budgets) > 1:
+            text = text.removesuffix(f"{format_residual(choices[0].score)}.")
+            text += f"{_join_words([format_residual(choice.score) for choice in choices])}."
+        statement = _add_code(records, served_by[0], text, True)
+        others = ", ".join(map(str, budgets[1:]))
+        code = tuple(
+            f"{line}  # or {others}" if others and "lv.solve" in line else line for line in statement.code
+        )
+        statements.append(replace(statement, code=code))
+    return statements
+
+
+def _join_words(words: Sequence[str]) -> str:
+    """Join words with commas, and the last two with "and"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _state_certainty(resampled: ResampledRanking) -> list[Statement]:

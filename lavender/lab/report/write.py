@@ -50,5 +50,5 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     write_text(index, render_page(report, drawn, saved=figures))
     write_text(folder / "summary.md", summarise_report(report))
     if figures:
-        save_figures(drawn, folder / "figures", {r.solver for r in report.newest_run})
+        save_figures(drawn, folder / "figures", report.all_records.solvers)
     return index

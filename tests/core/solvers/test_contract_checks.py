@@ -198,6 +198,11 @@ class Option(Sweeps):
 FAULTS = [
     (StopsEarly, "every_listed_law_is_solved", "CONVERGED within a relative residual of 1e-08 is required"),
     (Sloppy, "every_listed_law_is_solved", "is required, because the spec lists the law"),
+    (
+        Sloppy,
+        "every_listed_law_is_solved",
+        "Claim CONVERGED only if lv.residual(problem, impulse).relative <= tol",
+    ),
     (CountsNothing, "every_listed_law_is_solved", "Its work counts nothing"),
     (
         Option,

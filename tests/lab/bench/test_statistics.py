@@ -146,6 +146,22 @@ def test_claims_failures_and_spreads():
     )
 
 
+def test_the_table_of_claims_explains_different_numbers_of_runs():
+    found = records_of(
+        record("a", "direct", 1.0, 1e-7), record("a", "newton", 1.0, 1e-7), record("a", "newton", 1.0, 1e-4, tol=1e-3),
+        record("a", "pgs", 1.0, 1e-7), record("a", "pgs", 1.0, 1e-4, tol=1e-3), record("a", "pgs", 1.0, 1e-2, **BUDGET),
+        record("a", "auto", 1.0, 1e-7, mode="time", interleave_group="one"),
+    )  # fmt: skip
+    text = table_specs.explain_run_counts(found)
+    assert "Exact solvers are run to 1e-6 alone: direct." in text
+    assert "Solvers that cannot stop after any iteration have no budgets: auto, direct, newton." in text
+    assert "runs with a time limit: auto." in text and "does not accept" not in text
+    found.add(bench.Skip("run", "a", "sor", "takes laws linear"))
+    assert "A solver has no runs on problems that it does not accept." in table_specs.explain_run_counts(
+        found
+    )
+
+
 def test_changes_beyond_noise_are_named():
     old = records_of(
         record("a", "x", 1.0, 1e-7), record("a", "y", 1.0, 1e-7), record("a", "z", 1.0, 1e-2, success=False),

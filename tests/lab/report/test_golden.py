@@ -134,7 +134,7 @@ def test_files_are_whole_and_a_paper_has_no_clock(written):
     assert all(p.stat().st_size > 1000 for p in (out / "figures").iterdir())
     pdf = {p.name: p.read_bytes() for p in (out / "paper").glob("*.pdf")}
     captions = (out / "paper" / "figures.tex").read_text(encoding="utf-8")
-    assert set(re.findall(r"includegraphics{(.*?)}", captions)) == set(pdf)
+    assert set(re.findall(r"includegraphics\[width=.linewidth\]{(.*?)}", captions)) == set(pdf)
     assert all(
         data.startswith(b"%PDF") and b"/Type3" not in data for data in pdf.values()
     )  # publishers refuse such fonts

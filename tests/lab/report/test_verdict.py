@@ -46,6 +46,66 @@ def test_the_sentence_has_the_worst_case_and_the_line_its_command_in_c():
     assert nobody.joined_text == "No solver brings your stack down to 1e-6 of the error of the zero impulse."
 
 
+def test_a_plug_in_is_named_with_its_place_and_time_in_the_terminal():
+    made = [
+        record(case, name, 1e-3 * (1 + i), 1e-7)
+        for case in "ab"
+        for i, name in enumerate(("auto", "pgs", "nncg"))
+    ]
+    made += [record("a", "my_solver", 2.5e-3, 1e-7), record("b", "my_solver", 2.5e-3, 1e-7)]
+    report = Report(records_of(*made))
+    assert "Plug-in my_solver: place 3 of 4, 2 of 2 solved in 2.50 ms." in shown(report)
+    made += [record(case, "other", 9e-3, 0.5) for case in "ab"]
+    sentence = next(s for s in build_verdict(records_of(*made)).statements if s.one_line)
+    assert sentence.text.endswith("in 2.50 ms; other: place 5 of 5, 0 of 2 solved.")
+    # A recommended plug-in is in the first sentence already.
+    first = build_verdict(records_of(*made, *(record(case, "mine", 1e-4, 1e-7) for case in "ab")))
+    assert first.statements[0].text.startswith("Use mine") and "Plug-in mine" not in first.joined_text
+
+
+def test_budgets_with_one_recommended_solver_have_one_sentence():
+    budgets = {4: ("pgs", 0.4), 8: ("pgs", 0.2), 16: ("nncg", 1e-3), 32: ("nncg", 1e-5), 64: ("nncg", 1e-7)}
+    made = [record("a", "nncg", 1e-3, 1e-7)]
+    for n, (best, left) in budgets.items():
+        for name in ("pgs", "nncg"):
+            more = BUDGET | {"max_iter": n, "work": {"sweeps": n}, "iterations": n}
+            made.append(record("a", name, 1e-4, left if name == best else 0.6, **more))
+    made += [record("a", "nncg", 1e-4, 0.9, **BUDGET | {"max_iter": 2, "work": {"sweeps": 2}})]
+    swept = [
+        s
+        for s in build_verdict(records_of(*made), sweeps=(2, *budgets)).statements
+        if s.text.startswith("With")
+    ]
+    starts = [
+        "With 2 sweeps no solver serves",
+        "With 4 and 8 sweeps, use pgs",
+        "With 16, 32 and 64 sweeps, use nncg",
+    ]
+    assert [s.text.startswith(start) for s, start in zip(swept, starts, strict=True)] == [True] * 3
+    assert "at the 90th percentile 1.0e-3, 1.0e-5 and 1.0e-7." in swept[2].text
+    assert swept[2].call_line == 'lv.solve(problem, "nncg", tol=0, max_iter=16)  # or 32, 64'
+    alone = build_verdict(records_of(*made), sweeps=(8,)).statements[-1]
+    assert alone.text.startswith("With 8 sweeps, use pgs") and alone.call_line.endswith("max_iter=8)")
+
+
+def test_runs_with_more_processes_than_cores_are_counted():
+    """The synthetic machine has two cores; the mean load of 1.75 is no reason to call all times invalid."""
+    loads = (1.0, 1.0, 2.0, 3.0)
+    made = [record(f"case {i}", "pgs", 1e-3, 1e-7, load=load) for i, load in enumerate(loads)]
+    report = Report(records_of(*made))
+    warning = (
+        "In 1 of 4 runs more processes were runnable (up to 3) than the machine has cores (2), so their times may be "
+        "too long."
+    )
+    assert (report.busy_warning, report.load_warning) == ("", warning)
+    assert report.load_summary == f"Load during the runs: 1.8 on average and 3 at most, on 2 cores. {warning}"
+    assert warning in shown(report)
+    assert (
+        Report(records_of(*made[:3])).load_warning == ""
+        and Report(records_of(record("a", "x", 1.0, 1.0))).load_summary == ""
+    )
+
+
 @pytest.mark.parametrize(
     ("solver", "law", "structure", "sign"),
     [
