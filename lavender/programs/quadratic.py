@@ -179,8 +179,8 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     stages = tuple(stage for solution in ran for stage in solution.stages)
     work = MappingProxyType(sum_work(solution.work for solution in ran))
     message = f"{describe_stages(stages)}; {answer.solution.message}".rstrip("; ")
-    answer.solution.__dict__.update(stages=stages, work=work, message=message)
-    return answer
+    solution = replace(answer.solution, stages=stages, work=work, message=message)
+    return replace(answer, solution=solution)
 
 
 def _solve_over_velocities(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:

@@ -170,7 +170,7 @@ class Tree:
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
         p = self.problem
-        found = {name: estimate_cost(name, p, state).total for name, state in self.states.items()}
+        found = {name: state.cost for name, state in self.states.items()}  # `Newton.cost` with the state.
         if p.matrix is not None and self.law == "lcp":
             found["direct"] = self.direct
         failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
