@@ -13,6 +13,7 @@ from worked import after
 import lavender as lv
 from lavender import registry
 from lavender.solvers import newton
+from lavender_ext.newton.warm_start import FACTORED
 
 SCENES = [
     ("stack", {"n": 5}),
@@ -191,3 +192,12 @@ def test_few_bodies_whose_factor_is_full_reach_the_tolerance(scene, parameters):
         values = run.step()
         assert np.isfinite(values).all()
     assert all(run.ended)
+
+
+def test_more_bodies_than_the_first_scratch_serves():
+    """1,596 boxes: the pattern of the factor needs more integers than the order, and the plan says how many."""
+    steps = NewtonSteps("pyramid", base=56)
+    steps.substeps = 1
+    steps.step()
+    code, _, factorisations, relative = steps.told
+    assert code == FACTORED and factorisations > 0 and relative <= steps.tol
