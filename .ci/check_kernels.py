@@ -132,7 +132,9 @@ def check(work: Path) -> tuple[list[str], str]:
     breaches = [f"{path.name}: {text}" for path in sources for text in read_source(path)]
     web = runpy.run_path(str(ROOT / "lavender" / "sim" / "web" / "compile.py"))
     files = []
-    for name, text in web["EXTRACT_C"]["translate"](ROOT, modules, work, ROOT / "build" / "cython"):
+    for name, text in web["EXTRACT_C"]["translate_modules_to_c"](
+        ROOT, modules, work, ROOT / "build" / "cython"
+    ):
         files.append(work / f"{name}.c")
         files[-1].write_text(text, encoding="utf-8")
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -405,7 +405,7 @@ def by_structure(records):
         return "<br>".join(filter(None, words))
 
     report = Report(records)
-    found = table_specs.tabulate_advice(report)
+    found = table_specs.tabulate_recommended_solvers(report)
     rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
     first = 1 + len(report.tolerances)
     to_tolerance = table(found.heads[:first], [row[:first] for row in rows])

@@ -139,7 +139,7 @@ def driven(problem, tol=1e-9, budget=1500, work=10**6):
     while how in (MORE, CERTIFICATE):
         how, proof = driver.step(work, impulse), driver.direction
         if proof is not None and check_certificate(problem, proof) is None:
-            driver.prove()
+            driver.confirm_certificate()
     return how, driver.counts[1], driver.relative, impulse
 
 

@@ -16,10 +16,10 @@ from lavender.contract.problems import (  # noqa: F401 - tests import them from 
     random_lcp,
     random_rows,
     random_tree,
-    touching,
 )
 from lavender.contract.problems import as_generalized as general  # noqa: F401
 from lavender.contract.problems import list_ancestors as ancestors  # noqa: F401
+from lavender.contract.problems import make_touching_bodies as touching  # noqa: F401
 from lavender.contract.problems import random_tree_mass as tree_mass  # noqa: F401
 from lavender.contract.problems import random_unit as unit  # noqa: F401
 from lavender.contract.problems import rotation_matrix as rotation  # noqa: F401

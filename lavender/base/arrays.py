@@ -389,7 +389,7 @@ def _format_index(index: np.ndarray, csr: Any) -> str:
 
 def check_magnitudes(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
     """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
-    if checks.all_valid(array.reshape(-1)):
+    if checks.all_in_valid_range(array.reshape(-1)):
         return
     check_finite(name, array, csr)
     bad = np.argwhere(np.abs(array) > MAX_MAGNITUDE)
@@ -402,7 +402,7 @@ def check_magnitudes(name: str, array: np.ndarray, unit: str = "", csr: Any = No
 def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -> None:
     """Raise InputError at the first number that is negative, or neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE]."""
     flat = array.reshape(-1)
-    position = checks.first_invalid_magnitude_of(flat)
+    position = checks.find_invalid_magnitude_in_array(flat)
     if position < 0:
         return
     check_magnitudes(name, array, unit)
@@ -432,7 +432,7 @@ def check_not_nan(name: str, array: np.ndarray) -> None:
 def check_not_negative(name: str, array: np.ndarray) -> None:
     """Raise InputError at the first negative entry of an array."""
     for_kernel = array.ndim == 1 and array.dtype is FLOAT64 and array.flags.c_contiguous
-    if checks.has_negative(array) if for_kernel else array.size and array.min() < 0:
+    if checks.has_negative_number(array) if for_kernel else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{name} must not be negative; entry [{i}] is {array[i]}")
 

@@ -23,7 +23,7 @@ MAX_THREADS = (
 
 
 @cache
-def thread_pool() -> ThreadPoolExecutor:
+def get_thread_pool() -> ThreadPoolExecutor:
     """Return the pool of threads of this process."""
     from concurrent.futures import ThreadPoolExecutor  # takes 5 ms to import, and is only needed here
 
@@ -31,11 +31,13 @@ def thread_pool() -> ThreadPoolExecutor:
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=thread_pool.cache_clear)  # A forked process has none of the threads.
+    os.register_at_fork(
+        after_in_child=get_thread_pool.cache_clear
+    )  # A forked process has none of the threads.
 
 
 @contextmanager
-def _sigint_blocked() -> Iterator[None]:
+def _defer_sigint() -> Iterator[None]:
     """Deliver Ctrl-C after the block: an interrupted start leaves a thread that the pool never ends."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -65,8 +67,8 @@ def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
 
     futures: list[Any] = []
     try:
-        with _sigint_blocked():
-            futures += [thread_pool().submit(run) for _ in range(threads - 1)]
+        with _defer_sigint():
+            futures += [get_thread_pool().submit(run) for _ in range(threads - 1)]
         return [run(), *(future.result() for future in futures if not future.cancel())]
     finally:
         stop[0] = 1  # Ctrl-C may have interrupted the wait of this thread.

@@ -32,7 +32,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
-from lavender_ext.core.problem import LAWS, zero_impulse
+from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
 
 __all__ = ["Batch"]
 
@@ -411,7 +411,7 @@ class Batch(Sequence[Problem]):
         if self._arrays is None:
             return self[i].start()
         first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
-        return zero_impulse(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
+        return clip_zero_to_bounds(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
 
     def flatten_impulses(self, name: str, value: Any) -> FloatArray:
         """Convert impulses [N s] of the batch's shape to a new flat array; numbers need not be finite."""

@@ -37,7 +37,7 @@ from lavender.judge.residuals import (
 )
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, data_of
+from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_problem_data
 
 NO_MORE_WORLDS = -1  # return value of the methods of `Worker`
 
@@ -70,7 +70,7 @@ class Many:
             self._velocity: FloatArray | None = np.zeros(int(np.prod(problems.velocity_shape)))
             self._worlds: Worlds = problems.make_kernel_worlds(self._impulse, self._velocity, cold)
             return
-        self._data, self._sizes = data_of(problems, Problem)
+        self._data, self._sizes = list_problem_data(problems, Problem)
         at = np.zeros((len(problems), len(PLACE)), np.int64)
         self._first = np.cumsum(self._sizes) - self._sizes
         at[:, PLACE["rows"]], at[:, PLACE["row"]] = self._sizes, self._first

@@ -92,7 +92,7 @@ def main(args: Sequence[str] | None = None) -> None:
     ends the process at once.
     """
     _early_sigint.restore_handler()
-    with _note_signals() as received:
+    with _record_signals() as received:
         try:
             code = _run_command(args)
         except Exception as error:
@@ -116,7 +116,7 @@ DEFAULT_SIGNAL_HANDLERS: dict[int, Any] = {
 
 
 @contextlib.contextmanager
-def _note_signals() -> Iterator[list[int]]:
+def _record_signals() -> Iterator[list[int]]:
     """Note the signals that arrive; C libraries replace the exception of a signal by an error of their own."""
     received: list[int] = []
 

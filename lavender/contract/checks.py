@@ -24,9 +24,9 @@ from lavender.contract.problems import (
     FORMS,
     as_matrix,
     change_numbers,
+    make_touching_bodies,
     random_contact_problem,
     random_general,
-    touching,
 )
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import residual
@@ -43,8 +43,8 @@ __all__ = [
     "ContractError",
     "check_name",
     "list_checks",
-    "problems_of_every_kind",
-    "well_posed_problems",
+    "make_problems_of_every_kind",
+    "make_well_posed_problems",
 ]
 
 #: Backends of other packages that must solve every example. Any other backend may fail if its result reports it.
@@ -121,7 +121,7 @@ def list_checks(spec: SolverSpec) -> list[Check]:
     return [check for check in CHECKS.values() if check.applies(spec)]
 
 
-def _require(condition: bool | np.bool_, sentence: str) -> None:
+def _raise_unless(condition: bool | np.bool_, sentence: str) -> None:
     if not condition:
         raise ContractError(sentence)
 
@@ -136,7 +136,7 @@ def _add_compliance(problem: Problem, compliance: float) -> Problem:
 
 
 @functools.cache
-def well_posed_problem(law: str, rows: bool) -> Problem:
+def make_well_posed_problem(law: str, rows: bool) -> Problem:
     """Return a problem of a law, given by rows or as a matrix; the smallest eigenvalue of A is far from zero."""
     if law == "linear":
         base = random_contact_problem(21, contacts=0, joints=12, bodies=6)
@@ -152,18 +152,18 @@ def well_posed_problem(law: str, rows: bool) -> Problem:
     return problem if rows else as_matrix(problem)
 
 
-def well_posed_problems(spec: SolverSpec) -> Iterator[Problem]:
+def make_well_posed_problems(spec: SolverSpec) -> Iterator[Problem]:
     """Yield the well-posed problems of every law and form that a solver accepts."""
     for law in LAWS:
         for rows in (True, False):
-            problem = well_posed_problem(law, rows)
+            problem = make_well_posed_problem(law, rows)
             if spec.refuses(problem) is None:
                 yield problem
 
 
 def _first_problem(spec: SolverSpec) -> Problem:
     """Return the first well-posed problem that a solver accepts."""
-    for problem in well_posed_problems(spec):
+    for problem in make_well_posed_problems(spec):
         return problem
     raise ContractError(
         f"the solver accepts none of the well-posed problems of the laws {', '.join(sorted(spec.laws))} that its spec "
@@ -172,11 +172,11 @@ def _first_problem(spec: SolverSpec) -> Problem:
 
 
 @functools.cache
-def problems_of_every_kind() -> dict[tuple[str, str], tuple[list[Problem], FloatArray]]:
+def make_problems_of_every_kind() -> dict[tuple[str, str], tuple[list[Problem], FloatArray]]:
     """Return {(law, kind of block): (a well-posed problem in each form of A, its slack (m,) [m/s])}."""
     problems: dict[tuple[str, str], list[Problem]] = {}
     for law in ("linear", "lcp"):
-        problems[law, "rows"] = [convert(well_posed_problem(law, True)) for convert in FORMS.values()]
+        problems[law, "rows"] = [convert(make_well_posed_problem(law, True)) for convert in FORMS.values()]
     for law, (kind, draw) in itertools.product(("coulomb", "cone"), CONTACTS.items()):
         base = draw(23, law)
         soft = _add_compliance(base, 0.3)
@@ -192,29 +192,29 @@ def problems_of_every_kind() -> dict[tuple[str, str], tuple[list[Problem], Float
     return result
 
 
-def _describe(problem: Problem, kind: str = "") -> str:
+def _describe_problem(problem: Problem, kind: str = "") -> str:
     """Return a phrase such as "a problem of 24 rows (law coulomb, disks, given as rows)"."""
     form = "J and M" if problem.operator == "generalized" else problem.operator
     details = ", ".join(filter(None, (f"law {problem.law}", kind, f"given as {form}")))
     return f"a problem of {problem.m} row{'s' * (problem.m != 1)} ({details})"
 
 
-def _budget(spec: SolverSpec) -> int | None:
+def _choose_iteration_budget(spec: SolverSpec) -> int | None:
     return max(spec.max_iter, MIN_BUDGET) if spec.resumable else None
 
 
-def _tolerance(spec: SolverSpec) -> float:
+def _choose_tolerance(spec: SolverSpec) -> float:
     return BACKEND_TOLERANCE if spec.external else OWN_TOLERANCE
 
 
-def _same_bits(first: Solution, second: Solution) -> bool:
+def _are_bit_identical(first: Solution, second: Solution) -> bool:
     return first.impulse.tobytes() == second.impulse.tobytes() and (first.status, first.iterations) == (
         second.status,
         second.iterations,
     )
 
 
-def _difference(first: Solution, second: Solution) -> str:
+def _describe_difference(first: Solution, second: Solution) -> str:
     """Return how two results differ, for a sentence."""
     if first.status is not second.status or first.iterations != second.iterations:
         return (
@@ -231,10 +231,10 @@ def _difference(first: Solution, second: Solution) -> str:
 def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
     """Require that the solver solves every law that it lists, in every form that it accepts, and counts its work."""
     must_solve = not spec.external or spec.name in REQUIRED_BACKENDS
-    tol, accepted = _tolerance(spec), set()
-    for (law, kind), (forms, slack) in problems_of_every_kind().items():
+    tol, accepted = _choose_tolerance(spec), set()
+    for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
         for problem in forms:
-            phrase = _describe(problem, kind)
+            phrase = _describe_problem(problem, kind)
             if spec.refuses(problem) is not None:
                 try:
                     solve(problem, spec.name)
@@ -242,46 +242,46 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
                     continue
                 raise ContractError(f"the solver refuses {phrase}, but solve returned a result for it")
             accepted.add(law)
-            solution = solve(problem, spec.name, tol=tol, max_iter=_budget(spec))
+            solution = solve(problem, spec.name, tol=tol, max_iter=_choose_iteration_budget(spec))
             text = f"for {phrase} the result is: {solution}"
             if must_solve and not (spec.external and kind.startswith("round")):
-                _require(
+                _raise_unless(
                     solution.success,
                     f"{text}. CONVERGED within a relative residual of {tol:g} is required, because the spec lists "
                     f"the law {law!r}{'' if solution.status is not Status.CONVERGED else STOP_TEST_REMEDY}",
                 )
-                _require(
+                _raise_unless(
                     solution.claim_check == "confirmed",
                     f"{text}. The judge must confirm the claim; it found: {solution.claim_check}{STOP_TEST_REMEDY}",
                 )
             # Other backends may fail. If their claim is wrong, the result reports it.
-            _require(
+            _raise_unless(
                 solution.success or bool(solution.status_conflict) or solution.status is not Status.CONVERGED,
                 f"{text}. The claim CONVERGED is wrong and not reported as such",
             )
-            _require(
+            _raise_unless(
                 solution.solver.name == spec.name, f"{text}. It names another solver: {solution.solver.name}"
             )
-            _require(
+            _raise_unless(
                 sum(solution.work.values()) > 0,
                 f"{text}. Its work counts nothing; the claim must count sweeps, products or other work",
             )
-            _require(
+            _raise_unless(
                 solution.iterations > 0 or not spec.resumable,
                 f"{text}. It reports 0 iterations although the start is not a solution",
             )
             judged = residual(problem, solution.impulse).slack
-            _require(np.array_equal(solution.slack, judged), f"{text}. Its slack is not A impulse - b")
+            _raise_unless(np.array_equal(solution.slack, judged), f"{text}. Its slack is not A impulse - b")
             if law != "coulomb" and solution.success:
                 size = np.abs(problem.slack(problem.start())).max()
                 error = np.abs(solution.slack - slack).max()
-                _require(
+                _raise_unless(
                     error <= MAX_CONDITION * tol * size + 1e-7 * np.abs(slack).max(),
                     f"{text}. Its slack differs by {error:.3g} m/s from the unique solution; at most "
                     f"{MAX_CONDITION * tol * size:.3g} m/s is accepted",
                 )
     missing = set(spec.laws) - accepted
-    _require(
+    _raise_unless(
         not missing,
         f"the spec lists the laws {', '.join(sorted(missing))}, but the solver refuses every problem of them",
     )
@@ -290,31 +290,31 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
 @_register("solvers with an option `form`", lambda spec: "form" in spec.options)
 def require_forms_agree(spec: SolverSpec) -> None:
     """Require that every value of the option `form` gives the same solution."""
-    tol, must_solve = _tolerance(spec), not spec.external or spec.name in REQUIRED_BACKENDS
-    for (law, kind), (forms, slack) in problems_of_every_kind().items():
+    tol, must_solve = _choose_tolerance(spec), not spec.external or spec.name in REQUIRED_BACKENDS
+    for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
         if kind.startswith("round") or spec.refuses(forms[0]):
             continue  # Round cones have one form.
         if kind == "boxes" and law not in spec.laws:
             continue  # Boxes are passed on as bounded rows of a matrix.
         for form in ("impulse",) if kind == "ellipses" else ("impulse", "velocity"):
             solution = solve(forms[0], spec.name, tol=tol, form=form)
-            text = f"for {_describe(forms[0], kind)} with form={form!r} the result is: {solution}"
-            _require(
+            text = f"for {_describe_problem(forms[0], kind)} with form={form!r} the result is: {solution}"
+            _raise_unless(
                 str(solution.solver.form).startswith(form),
                 f"{text}. Another form ran: {solution.solver.form}",
             )
-            _require(solution.success or not must_solve, f"{text}. CONVERGED is required")
+            _raise_unless(solution.success or not must_solve, f"{text}. CONVERGED is required")
             if solution.success and law != "coulomb":
                 size = np.abs(forms[0].slack(forms[0].start())).max()
                 error = np.abs(solution.slack - slack).max()
                 limit = MAX_CONDITION * tol * size + 1e-7 * np.abs(slack).max()
-                _require(
+                _raise_unless(
                     error <= limit, f"{text}. Its slack differs by {error:.3g} m/s from the unique solution"
                 )
     try:
-        solve(well_posed_problem("lcp", True), spec.name, form="velocities")
+        solve(make_well_posed_problem("lcp", True), spec.name, form="velocities")
     except LavenderError as error:
-        _require(
+        _raise_unless(
             "velocity" in str(error),
             f"the error for an unknown form does not list the known ones: {error}",
         )
@@ -341,7 +341,7 @@ def require_unknown_options_are_rejected(spec: SolverSpec) -> None:
         try:
             solve(problem, spec.name, **option)
         except kind as error:
-            _require(word in str(error), f"the error for {word} does not name it: {error}")
+            _raise_unless(word in str(error), f"the error for {word} does not name it: {error}")
         else:
             raise ContractError(
                 f"{spec.name}: {word}= was accepted, but the spec does not list it: add it there, or raise an error"
@@ -353,8 +353,10 @@ def require_options_match_the_factory(spec: SolverSpec) -> None:
     """Require that the spec lists exactly the options that the factory accepts."""
     parameters = set(inspect.signature(spec.load()).parameters)
     extra, missing = sorted(spec.accepts - parameters), sorted(parameters - spec.accepts)
-    _require(not extra, f"the spec lists the options {', '.join(extra)}, which the factory does not accept")
-    _require(
+    _raise_unless(
+        not extra, f"the spec lists the options {', '.join(extra)}, which the factory does not accept"
+    )
+    _raise_unless(
         not missing, f"the factory accepts the options {', '.join(missing)}, which the spec does not list"
     )
 
@@ -365,37 +367,37 @@ def require_options_match_the_factory(spec: SolverSpec) -> None:
 @_register("all solvers except code of another project", lambda spec: not spec.external)
 def require_budgets_are_kept(spec: SolverSpec) -> None:
     """Require that iteration limits are kept: 0 returns the start, and with tol = 0 exactly max_iter iterations run."""
-    for problem in well_posed_problems(spec):
-        phrase = _describe(problem)
+    for problem in make_well_posed_problems(spec):
+        phrase = _describe_problem(problem)
         none = solve(problem, spec.name, tol=1e-12, max_iter=0)
-        _require(
+        _raise_unless(
             none.status is Status.MAX_ITERATIONS and none.iterations == 0,
             f"for {phrase} max_iter=0 returned {none.status.name} after {none.iterations} iterations",
         )
-        _require(
+        _raise_unless(
             none.impulse.tobytes() == problem.start().tobytes(),
             f"for {phrase} max_iter=0 changed the start",
         )
         for n in (1, 3, 8):
             few = solve(problem, spec.name, tol=1e-12, max_iter=n)
-            _require(few.iterations <= n, f"for {phrase} max_iter={n} ran {few.iterations} iterations")
-            _require(
+            _raise_unless(few.iterations <= n, f"for {phrase} max_iter={n} ran {few.iterations} iterations")
+            _raise_unless(
                 few.claim_check == "confirmed",
                 f"for {phrase} max_iter={n} gave a claim that the judge does not confirm: {few}",
             )
             # A resumable solver may raise the residual for some iterations.
-            _require(
+            _raise_unless(
                 few.residual.relative <= 1.0 or spec.resumable,
                 f"for {phrase} max_iter={n} returned a result that is worse than the start: {few}",
             )
         if spec.resumable:
             exact = solve(problem, spec.name, tol=0.0, max_iter=5)
-            _require(
+            _raise_unless(
                 exact.status is Status.MAX_ITERATIONS and exact.iterations == 5,
                 f"for {phrase} tol=0 and max_iter=5 ended as {exact.status.name} after {exact.iterations} "
                 "iterations; exactly 5 are required",
             )
-            _require(
+            _raise_unless(
                 sum(exact.work.values()) >= 5,
                 f"for {phrase} 5 iterations count a work of {sum(exact.work.values())}; at least 5 are required",
             )
@@ -407,13 +409,13 @@ def require_budgets_are_kept(spec: SolverSpec) -> None:
 )
 def require_runs_can_be_continued(spec: SolverSpec) -> None:
     """Require that a run of n1 and then n2 iterations gives the bits of a run of n1 + n2 iterations."""
-    for problem in well_posed_problems(spec):
+    for problem in make_well_posed_problems(spec):
         for tol in (0.0, 1e-14):
             whole, parts = (_run_in_parts(spec, problem, sizes, tol) for sizes in ([23], [1, 7, 15]))
-            _require(
+            _raise_unless(
                 whole == parts,
-                f"for {_describe(problem)} and tol={tol:g}, 1 + 7 + 15 iterations ended as {parts[1].name} after "
-                f"{parts[0]} iterations, and 23 iterations as {whole[1].name} after {whole[0]}"
+                f"for {_describe_problem(problem)} and tol={tol:g}, 1 + 7 + 15 iterations ended as {parts[1].name} "
+                f"after {parts[0]} iterations, and 23 iterations as {whole[1].name} after {whole[0]}"
                 + (", with other bits of the impulse" if whole[:2] == parts[:2] else "")
                 + ". The same result is required: keep everything that changes in the state",
             )
@@ -439,9 +441,9 @@ def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     problem = _first_problem(spec)
     solve(problem, spec.name, max_iter=1)  # Its imports do not count.
     solution = solve(problem, spec.name, tol=0.0, max_iter=2**31 - 1, time_limit=0.05)
-    _require(
+    _raise_unless(
         solution.status is Status.TIME_LIMIT and solution.iterations > 0,
-        f"for {_describe(problem)} tol=0 and a time limit of 0.05 s ended as {solution.status.name} after "
+        f"for {_describe_problem(problem)} tol=0 and a time limit of 0.05 s ended as {solution.status.name} after "
         f"{solution.iterations} iterations; TIME_LIMIT after at least 1 is required",
     )
 
@@ -454,18 +456,20 @@ def require_history_at_fixed_counts(spec: SolverSpec) -> None:
     history = solution.history
     assert history is not None
     counts = history.iterations.tolist()
-    _require(
+    _raise_unless(
         counts == HISTORY_COUNTS,
         f"the history of 40 iterations has the counts {counts}; {HISTORY_COUNTS} are required",
     )
-    _require(abs(history.relative[0] - 1.0) <= 1e-6, f"the history begins at {history.relative[0]}, not at 1")
-    _require(
+    _raise_unless(
+        abs(history.relative[0] - 1.0) <= 1e-6, f"the history begins at {history.relative[0]}, not at 1"
+    )
+    _raise_unless(
         history.relative[-1] == solution.residual.relative,
         f"the history ends at {history.relative[-1]}, but the residual is {solution.residual.relative}",
     )
-    _require(bool(np.all(np.diff(history.time) >= 0.0)), "the times of the history decrease")
+    _raise_unless(bool(np.all(np.diff(history.time) >= 0.0)), "the times of the history decrease")
     without = solve(problem, spec.name, tol=0.0, max_iter=40)
-    _require(
+    _raise_unless(
         without.impulse.tobytes() == solution.impulse.tobytes(),
         "history=True changes the bits of the result; runs must give the same bits in parts",
     )
@@ -482,12 +486,12 @@ def require_callback_may_stop(spec: SolverSpec) -> None:
         return n >= 3
 
     solution = solve(problem, spec.name, callback=callback, tol=0.0, max_iter=50)
-    _require(
+    _raise_unless(
         solution.status is Status.INTERRUPTED and counts == [0, 1, 2, 3],
         f"a callback that stops at iteration 3 was called at {counts}, and the status is {solution.status.name}; "
         "[0, 1, 2, 3] and INTERRUPTED are required",
     )
-    _require(
+    _raise_unless(
         bool(np.isfinite(solution.impulse).all()), "a callback that overwrites its impulse changed the result"
     )
 
@@ -498,16 +502,18 @@ def require_callback_may_stop(spec: SolverSpec) -> None:
 @_register("solvers with `impulse`", lambda spec: spec.impulse)
 def require_a_solution_as_start_is_kept(spec: SolverSpec) -> None:
     """Require that a solve that starts at a solution ends there, and does not modify the array of the start."""
-    for problem in well_posed_problems(spec):
-        first = solve(problem, spec.name, tol=1e-9, max_iter=_budget(spec))
+    for problem in make_well_posed_problems(spec):
+        first = solve(problem, spec.name, tol=1e-9, max_iter=_choose_iteration_budget(spec))
         if not first.success:
             continue
         start = first.impulse.copy()
         again = solve(problem, spec.name, tol=1e-8, impulse=start)
-        text = f"for {_describe(problem)}, a solve that starts at the solution ended as: {again}"
-        _require(again.success, f"{text}. CONVERGED is required")
-        _require(again.iterations == 0 or not spec.resumable, f"{text}. 0 iterations are required")
-        _require(start.tobytes() == first.impulse.tobytes(), f"{text}. The array of the start was modified")
+        text = f"for {_describe_problem(problem)}, a solve that starts at the solution ended as: {again}"
+        _raise_unless(again.success, f"{text}. CONVERGED is required")
+        _raise_unless(again.iterations == 0 or not spec.resumable, f"{text}. 0 iterations are required")
+        _raise_unless(
+            start.tobytes() == first.impulse.tobytes(), f"{text}. The array of the start was modified"
+        )
 
 
 @_register(
@@ -530,34 +536,36 @@ def require_a_normal_without_inverse_mass_bears_friction(spec: SolverSpec) -> No
         if spec.refuses(problem) is not None:
             continue
         kept = solve(problem, spec.name, tol=1e-9, impulse=impulse)
-        _require(
+        _raise_unless(
             kept.status is Status.CONVERGED
             and kept.iterations == 0
             and bool(np.array_equal(kept.impulse, impulse)),
-            f"for {_describe(problem)}, the start is a solution and was not kept: {kept}",
+            f"for {_describe_problem(problem)}, the start is a solution and was not kept: {kept}",
         )
         cold = solve(problem, spec.name, tol=1e-9)
-        _require(cold.success, f"for {_describe(problem)} the result is: {cold}. CONVERGED is required")
+        _raise_unless(
+            cold.success, f"for {_describe_problem(problem)} the result is: {cold}. CONVERGED is required"
+        )
 
 
 @_register("solvers with `order`", lambda spec: spec.order)
 def require_orders_change_the_sweep(spec: SolverSpec) -> None:
     """Require that each order sweeps differently and all orders lead to a solution."""
-    problem = next((p for p in well_posed_problems(spec) if p.law != "coulomb"), None)
+    problem = next((p for p in make_well_posed_problems(spec) if p.law != "coulomb"), None)
     if problem is None:
         problem = _first_problem(spec)
     early: dict[bytes, str] = {}
     for order in ("given", "reverse", "random", "colored"):
         solution = solve(problem, spec.name, order=order, tol=1e-10, max_iter=MIN_BUDGET)
-        _require(
+        _raise_unless(
             solution.success,
-            f"for {_describe(problem)} the order {order!r} ended as: {solution}. CONVERGED is required",
+            f"for {_describe_problem(problem)} the order {order!r} ended as: {solution}. CONVERGED is required",
         )
         bits = solve(problem, spec.name, order=order, tol=0.0, max_iter=2).impulse.tobytes()
-        _require(
+        _raise_unless(
             bits not in early,
-            f"for {_describe(problem)} the orders {early.get(bits)!r} and {order!r} give the same bits after 2 sweeps; "
-            "each order must sweep differently",
+            f"for {_describe_problem(problem)} the orders {early.get(bits)!r} and {order!r} give the same bits "
+            "after 2 sweeps; each order must sweep differently",
         )
         early[bits] = order
 
@@ -570,56 +578,56 @@ def require_seeds_change_random_sweeps(spec: SolverSpec) -> None:
         solve(problem, spec.name, order="random", seed=seed, tol=0.0, max_iter=2).impulse.tobytes()
         for seed in (1, 1, 2)
     )
-    _require(first == same, "two random sweeps with seed=1 differ; equal bits are required")
-    _require(first != other, "random sweeps with seed=1 and seed=2 are equal; the seed has no effect")
+    _raise_unless(first == same, "two random sweeps with seed=1 differ; equal bits are required")
+    _raise_unless(first != other, "random sweeps with seed=1 and seed=2 are equal; the seed has no effect")
 
 
 # -- reproducible results -----------------------------------------------------------------------------
 
 
-def _short_options(spec: SolverSpec) -> dict[str, Any]:
+def _make_short_options(spec: SolverSpec) -> dict[str, Any]:
     return {"tol": 1e-7, "max_iter": 60 if spec.resumable else None}
 
 
 @_register("all solvers except code of another project", lambda spec: not spec.external)
 def require_results_are_reproducible(spec: SolverSpec) -> None:
     """Require that the same call gives the same bits, also from several threads at once."""
-    options = _short_options(spec)
-    for problem in well_posed_problems(spec):
+    options = _make_short_options(spec)
+    for problem in make_well_posed_problems(spec):
         first = solve(problem, spec.name, **options)
 
         def repeat(_: int, problem: Problem = problem) -> Solution:
             return solve(problem, spec.name, **options)
 
         again = repeat(0)
-        _require(
-            _same_bits(again, first),
-            f"for {_describe(problem)} the same call gave another result: {_difference(again, first)}",
+        _raise_unless(
+            _are_bit_identical(again, first),
+            f"for {_describe_problem(problem)} the same call gave another result: {_describe_difference(again, first)}",
         )
         with ThreadPoolExecutor(THREADS) as pool:
             for other in pool.map(repeat, range(THREADS)):
-                _require(
-                    _same_bits(other, first),
-                    f"for {_describe(problem)} a call from one of {THREADS} threads gave another result: "
-                    f"{_difference(other, first)}. The object of the factory holds options only",
+                _raise_unless(
+                    _are_bit_identical(other, first),
+                    f"for {_describe_problem(problem)} a call from one of {THREADS} threads gave another result: "
+                    f"{_describe_difference(other, first)}. The object of the factory holds options only",
                 )
 
 
 @_register("all solvers except code of another project", lambda spec: not spec.external)
 def require_update_equals_prepare(spec: SolverSpec) -> None:
     """Require that `update` to new numbers gives the bits of a new `prepare`."""
-    options = _short_options(spec)
-    for problem in well_posed_problems(spec):
+    options = _make_short_options(spec)
+    for problem in make_well_posed_problems(spec):
         changed = change_numbers(problem)
         if spec.refuses(changed) is not None:
             continue
         prepared = prepare(changed, spec.name)
         prepared.solve(**options)
         updated, fresh = prepared.solve(problem, **options), solve(problem, spec.name, **options)
-        _require(
-            _same_bits(updated, fresh),
-            f"for {_describe(problem)}, the result after `update` is not the one after `prepare`: "
-            f"{_difference(updated, fresh)}",
+        _raise_unless(
+            _are_bit_identical(updated, fresh),
+            f"for {_describe_problem(problem)}, the result after `update` is not the one after `prepare`: "
+            f"{_describe_difference(updated, fresh)}",
         )
 
 
@@ -627,7 +635,7 @@ def require_update_equals_prepare(spec: SolverSpec) -> None:
 def require_units_do_not_matter(spec: SolverSpec) -> None:
     """Require that impulses scale with the units of mass and velocity."""
     mass, velocity = 2.0**10, 2.0**-20  # Powers of two: the scaled data have no rounding errors.
-    for problem in well_posed_problems(spec):
+    for problem in make_well_posed_problems(spec):
         if problem.operator != "matrix":
             continue
         cones, matrix = problem.cones, problem.matrix
@@ -641,13 +649,15 @@ def require_units_do_not_matter(spec: SolverSpec) -> None:
         if spec.refuses(scaled) is not None:
             continue
         first, second = (
-            solve(p, spec.name, tol=OWN_TOLERANCE, max_iter=_budget(spec)) for p in (problem, scaled)
+            solve(p, spec.name, tol=OWN_TOLERANCE, max_iter=_choose_iteration_budget(spec))
+            for p in (problem, scaled)
         )
-        text = f"for {_describe(problem)} in other units of mass (2^10) and velocity (2^-20) the result is: {second}"
-        _require(second.success or not first.success, f"{text}. CONVERGED is required, as in SI units")
+        description = f"{_describe_problem(problem)} in other units of mass (2^10) and velocity (2^-20)"
+        text = f"for {description} the result is: {second}"
+        _raise_unless(second.success or not first.success, f"{text}. CONVERGED is required, as in SI units")
         error = np.abs(second.impulse / (mass * velocity) - first.impulse).max()
         limit = 1e4 * OWN_TOLERANCE * max(1.0, np.abs(first.impulse).max())
-        _require(
+        _raise_unless(
             not first.success or error <= limit,
             f"{text}. Its impulse, in SI units, differs by {error:.3g} N s from the one of SI units",
         )
@@ -656,13 +666,13 @@ def require_units_do_not_matter(spec: SolverSpec) -> None:
 # -- problems that are unusual, hard or have no solution ----------------------------------------------
 
 
-def soft_static_contacts() -> Problem:
+def make_soft_static_contacts() -> Problem:
     """Return two contacts of a body that cannot move: compliance alone makes A = diag(1, 2, 1, 2)."""
-    rows = touching([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))
+    rows = make_touching_bodies([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))
     return Problem.from_rows(rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0])
 
 
-def unusual_problems() -> dict[str, Problem]:
+def make_unusual_problems() -> dict[str, Problem]:
     """Return unusual but valid problems by their description."""
     return {
         "0 rows (linear)": Problem.linear(np.zeros((0, 0)), []),
@@ -681,24 +691,26 @@ def unusual_problems() -> dict[str, Problem]:
         "a contact with tangents that cannot move": Problem.contact(
             np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]
         ),
-        "two soft contacts of a static body": soft_static_contacts(),
+        "two soft contacts of a static body": make_soft_static_contacts(),
     }
 
 
 @_register("all solvers")
 def require_unusual_problems_have_a_result(spec: SolverSpec) -> None:
     """Require that unusual but valid problems have a finite result, or are refused with a CapabilityError."""
-    for name, problem in unusual_problems().items():
+    for name, problem in make_unusual_problems().items():
         try:
             solution = solve(problem, spec.name)
         except CapabilityError:
             continue
-        _require(bool(np.isfinite(solution.impulse).all()), f"for {name} the impulse is {solution.impulse}")
-        _require(
+        _raise_unless(
+            bool(np.isfinite(solution.impulse).all()), f"for {name} the impulse is {solution.impulse}"
+        )
+        _raise_unless(
             spec.external or solution.claim_check == "confirmed",
             f"for {name} the judge does not confirm the claim ({solution.claim_check}): {solution}",
         )
-        _require(problem.m > 0 or solution.success, f"{name} are not CONVERGED: {solution}")
+        _raise_unless(problem.m > 0 or solution.success, f"{name} are not CONVERGED: {solution}")
 
 
 @_register("all solvers except code of another project", lambda spec: not spec.external)
@@ -714,19 +726,19 @@ def require_claims_are_true(spec: SolverSpec) -> None:
             return
         solution = solve(problem, spec.name, tol=1e-9)
         text = f"for A = {a.tolist()}, b = {problem.b.tolist()}, bounds {low.tolist()} and {high.tolist()}: {solution}"
-        _require(
+        _raise_unless(
             solution.claim_check == "confirmed",
             f"{text}. The judge does not confirm the claim: {solution.claim_check}",
         )
-        _require(bool(np.isfinite(solution.impulse).all()), f"{text}. The impulse is not finite")
+        _raise_unless(bool(np.isfinite(solution.impulse).all()), f"{text}. The impulse is not finite")
         if solution.status is Status.INFEASIBLE:
             exact = enumerate_lcp(a, problem.b, low, high)
-            _require(not exact, f"{text}. But {exact and exact[0][0].tolist()} N s is a solution")
+            _raise_unless(not exact, f"{text}. But {exact and exact[0][0].tolist()} N s is a solution")
 
-    for_each_draw(compare)
+    check_on_random_problems(compare)
 
 
-def for_each_draw(compare: Callable[[int, int], None]) -> None:
+def check_on_random_problems(compare: Callable[[int, int], None]) -> None:
     """Call `compare(seed, m)` for random small problems. Hypothesis, if installed, reduces a failure to a small one."""
     try:
         import hypothesis
@@ -760,7 +772,7 @@ def require_failures_have_a_message(spec: SolverSpec) -> None:
                 continue
             solution = solve(problem, spec.name, tol=1e-6)
             failed = solution.status in (Status.DIVERGED, Status.STALLED, Status.NUMERICAL_ERROR)
-            _require(
+            _raise_unless(
                 bool(solution.message) or not failed,
                 f"for A = {matrix}, b = {[1.0, second]} the status is {solution.status.name} without a message",
             )
@@ -778,13 +790,13 @@ def require_infeasible_rows_are_reported(spec: SolverSpec) -> None:
         return
     solution = solve(problem, spec.name)
     text = f"for A = diag(1, 0), b = (1, 1) and impulses >= 0 the result is: {solution}"
-    _require(
+    _raise_unless(
         solution.status is Status.INFEASIBLE,
         f"{text}. INFEASIBLE is required: no impulse satisfies row 1",
     )
-    _require("row 1" in solution.message, f"{text}. Its message must name row 1: {solution.message!r}")
-    _require(
+    _raise_unless("row 1" in solution.message, f"{text}. Its message must name row 1: {solution.message!r}")
+    _raise_unless(
         solution.certificate is not None and check_certificate(problem, solution.certificate) is None,
         f"{text}. Its certificate is not valid",
     )
-    _require(solution.claim_check == "confirmed", f"{text}. The judge does not confirm it")
+    _raise_unless(solution.claim_check == "confirmed", f"{text}. The judge does not confirm it")

@@ -24,6 +24,7 @@ __all__ = [
     "as_matrix",
     "change_numbers",
     "list_ancestors",
+    "make_touching_bodies",
     "random_boxes",
     "random_contact_problem",
     "random_ellipses",
@@ -34,7 +35,6 @@ __all__ = [
     "random_tree_mass",
     "random_unit",
     "rotation_matrix",
-    "touching",
 ]
 
 
@@ -93,7 +93,7 @@ def random_rows(rng: np.random.Generator, bodies: int = 5, joints: int = 3, cont
     )
 
 
-def touching(contact_body: Any, **fields: Any) -> Rows:
+def make_touching_bodies(contact_body: Any, **fields: Any) -> Rows:
     """Build bodies at rest of 1 kg and 1 kg m^2 that touch at their centres along z; `fields` replaces fields of it."""
     body = np.reshape(contact_body, (-1, 2)).astype(np.int32)
     c, n = len(body), len(fields.get("inv_mass", range(body.max(initial=-1) + 1)))

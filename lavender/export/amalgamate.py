@@ -88,7 +88,9 @@ def amalgamate(root: Path, cache: Path | None = None) -> str:
     front += generate_name_functions(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
     with tempfile.TemporaryDirectory() as work:
-        kernels = EXTRACT_C["extract_c"](EXTRACT_C["translate"](root, MODULES, Path(work), cache), front)
+        kernels = EXTRACT_C["extract_c"](
+            EXTRACT_C["translate_modules_to_c"](root, MODULES, Path(work), cache), front
+        )
     return (
         f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
         f" * This file is generated: change the kernels instead. Sources {hash_sources(root)}\n */\n"

@@ -15,7 +15,14 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.as_qp import QP, make_bound_rows, merge_bound_multipliers
-from lavender.external.running import Answer, Call, Limits, capture_output, check_iterate, clamp_tolerance
+from lavender.external.running import (
+    Answer,
+    Call,
+    Limits,
+    capture_backend_output,
+    check_iterate,
+    clamp_tolerance,
+)
 from lavender.judge.solution import Status
 
 
@@ -115,7 +122,7 @@ def _call_through_qpsolvers(
         lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)  # With bounds, qpsolvers does not use LSQR.
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
-    with capture_output(False) as warnings:
+    with capture_backend_output(False) as warnings:
         solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
     warning = "; ".join(warnings)
     if "LSQR" in warning:

@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
 from lavender.external.as_qp import QP, build_impulse_form
 from lavender.external.backend import Backend
-from lavender.external.running import Answer, Failed, Limits, capture_output
+from lavender.external.running import Answer, Failed, Limits, capture_backend_output
 from lavender.judge.solution import Status
 from lavender.problem import Problem
 
@@ -153,11 +153,11 @@ def run_backend(
     if qp is None or impulse is None or limit is None or settings is None:
         if backend.name not in _warmed_up:
             _warmed_up.add(backend.name)
-            with suppress(Exception), capture_output(backend.noisy):
+            with suppress(Exception), capture_backend_output(backend.noisy):
                 tiny = build_impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
                 backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
         return {}, ()
-    with capture_output(backend.noisy) as printed:
+    with capture_backend_output(backend.noisy) as printed:
         answer = backend.run(qp, impulse, limit, settings)
     work = {str(kind): int(count) for kind, count in answer.work.items()}
     message = str(answer.message or "; ".join(printed))[:MAX_BACKEND_MESSAGE_LENGTH]

@@ -19,7 +19,7 @@ from lavender.external.running import (
     MIN_TOLERANCE,
     Answer,
     Limits,
-    capture_output,
+    capture_backend_output,
     check_iterate,
     clamp_tolerance,
     copy_certificate,
@@ -151,7 +151,7 @@ def _print_banner() -> None:
     """Create the first HiGHS object of a process, which always prints a banner to standard output, and discard it."""
     import highspy
 
-    with capture_output(noisy=True):
+    with capture_backend_output(noisy=True):
         highspy.Highs()  # type: ignore[no-untyped-call]
 
 

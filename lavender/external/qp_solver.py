@@ -113,7 +113,11 @@ class QPSolver(Solver):
         claim = call_until_accepted(
             qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy
         )
-        if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
+        if (
+            len(qp.assumed)
+            and not deadline.passed()
+            and _violates_inactive_row_assumption(qp, impulse, claim)
+        ):
             first_claim, impulse[:] = claim, start
             remaining = max(1, max_iter - first_claim.iterations)
             qp = self._build_program(qp.problem, False)
@@ -136,7 +140,7 @@ class QPSolver(Solver):
             import_numerics(*self.backend.modules)
 
 
-def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
+def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
     """Return whether a row assumed to stay at its bound leaves it, or may cause a proof of infeasibility."""
     if claim.status is Status.INFEASIBLE:
         return True

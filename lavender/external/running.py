@@ -243,7 +243,7 @@ def _call_once(
 ) -> Claim:
     """Run the backend once, write its iterate to `impulse` if it is valid, and convert its answer to a claim."""
     try:
-        with capture_output(noisy) as warning_texts:
+        with capture_backend_output(noisy) as warning_texts:
             answer = call(qp, impulse, limit, dict(settings))
     except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
         raise
@@ -289,7 +289,7 @@ def _call_once(
 
 
 @contextlib.contextmanager
-def capture_output(noisy: bool) -> Iterator[list[str]]:
+def capture_backend_output(noisy: bool) -> Iterator[list[str]]:
     """Collect the warnings of a backend, and discard its output to sys.stdout and sys.stderr, in this thread only.
 
     `noisy` also discards output of compiled code. This redirects the file descriptors of the whole process, so it is

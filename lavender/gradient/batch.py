@@ -46,10 +46,10 @@ class _LazySequence(Sequence[Any]):
 
     def _get(self, i: int) -> Any:
         if i not in self._items:
-            self._items[i] = self._make(i)
+            self._items[i] = self._make_item(i)
         return self._items[i]
 
-    def _make(self, i: int) -> Any:
+    def _make_item(self, i: int) -> Any:
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -85,7 +85,7 @@ class Gradients(_LazySequence):
         inv_mass: FloatArray
         inv_inertia: FloatArray
 
-    def _make(self, i: int) -> Gradient:
+    def _make_item(self, i: int) -> Gradient:
         return Gradient(self._of._get(i), self._numbers[self._of._linears.result_slice(i)])
 
     if not TYPE_CHECKING:  # Type checkers report unknown names.
@@ -112,7 +112,7 @@ class Derivatives(_LazySequence):
         """Pickle problems and impulses; a copy is prepared again."""
         return derivatives, (self._problems, [each._impulse for each in self])
 
-    def _make(self, i: int) -> Derivative:
+    def _make_item(self, i: int) -> Derivative:
         return Derivative(self._problems[i], self._linears.item(i))
 
     @cached_property

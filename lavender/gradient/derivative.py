@@ -18,8 +18,8 @@ from lavender.judge.residuals import residual
 from lavender.judge.states import States, compute_states, linearise_at
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.core.problem import rows_velocity
-from lavender_ext.derivative.linear import CASES, Linear, wrench
+from lavender_ext.core.problem import multiply_body_jacobian
+from lavender_ext.derivative.linear import CASES, Linear, write_body_wrenches
 
 # Solutions with a larger relative residual (without the part that rounding explains) are not differentiated.
 MAX_ACCEPTED_RESIDUAL = 1e-8
@@ -176,7 +176,7 @@ class Derivative:
         if p.generalized is not None:
             return p.generalized.velocity_of(v)
         out = np.empty(p.m)
-        rows_velocity(p.data, v.reshape(-1, 6), out)
+        multiply_body_jacobian(p.data, v.reshape(-1, 6), out)
         return out
 
     def _apply_jacobian_transposed(self, x: FloatArray) -> FloatArray:
@@ -185,7 +185,7 @@ class Derivative:
         if p.rows is None:
             return np.asarray(p.jacobian.T @ x)
         out = np.empty((p.rows.n_bodies, 6))
-        wrench(p.data, np.ascontiguousarray(x), out)
+        write_body_wrenches(p.data, np.ascontiguousarray(x), out)
         return out.ravel()
 
     def _apply_mobility(self, x: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ def form_dense_a(
     """
     label = sp.csgraph.connected_components(mass, directed=False)[1]
     budget.reserve_bytes(SPARSE_ENTRY_BYTES * max_condensed_entries(label, jt), "A = H^T M^-1 H")
-    solve = _factor(mass, label, budget)
+    solve = _make_mass_solver(mass, label, budget)
     m = jt.shape[1]
     step = max(1, DENSE_CHUNK_NUMBERS // max(1, *jt.shape))
     columns = sp.csc_array(jt)
@@ -54,7 +54,9 @@ def max_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
     return int(min(rows @ rows, float(m) ** 2))
 
 
-def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable[[np.ndarray], np.ndarray]:
+def _make_mass_solver(
+    matrix: sp.csr_array, label: np.ndarray, budget: Budget
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function y -> M^-1 y that uses LU factors of a size that is bounded in advance.
 
     The factors of a component of n unknowns have up to n^2 entries. If that exceeds the budget, the unknowns are

@@ -76,15 +76,15 @@ def from_drake(
         The plant has something other than joints, point contacts and joint limits, or SAP's impulses do not explain
         its next velocity.
     """
-    return _convert(plant, context, dt, friction, compliance, correction, name)[0]
+    return _convert_contact_problem(plant, context, dt, friction, compliance, correction, name)[0]
 
 
 def impulse(plant: Any, context: Any) -> FloatArray:
     """Return SAP's own answer as impulses (m,) [N s] of the problem's rows, for `lavender.residual`."""
-    return _convert(plant, context, None, "coulomb", None, 0.0, "")[1]
+    return _convert_contact_problem(plant, context, None, "coulomb", None, 0.0, "")[1]
 
 
-def _convert(plant: Any, context: Any, *options: Any) -> tuple[Problem, FloatArray]:
+def _convert_contact_problem(plant: Any, context: Any, *options: Any) -> tuple[Problem, FloatArray]:
     """Check the types and return the problem and SAP's impulses (m,) [N s]; errors of Drake become InputError."""
     try:
         from pydrake.multibody.plant import MultibodyPlant_

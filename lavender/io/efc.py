@@ -145,8 +145,8 @@ def from_efc(
     target = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
     smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
     row_type, loss = (
-        _broadcast_to_rows("efc_type", efc_type, n, m),
-        _broadcast_to_rows("efc_frictionloss", efc_frictionloss, n, m),
+        _broadcast_numbers_to_rows("efc_type", efc_type, n, m),
+        _broadcast_numbers_to_rows("efc_frictionloss", efc_frictionloss, n, m),
     )
     count = np.full(n, m) if nefc is None else check_row_counts("nefc", nefc, n, m)
     used_rows = np.arange(m) < count[:, None]
@@ -373,7 +373,7 @@ def _import_states(
     return Imported(batch, lam)
 
 
-def _broadcast_to_rows(name: str, values: Any, n: int, m: int) -> FloatArray:
+def _broadcast_numbers_to_rows(name: str, values: Any, n: int, m: int) -> FloatArray:
     """Return the numbers of all rows (n, m), given as (n, m), (m,) or one number."""
     if len(get_shape(name, values)) == 2:
         return as_array(name, values, (n, m), finite=False)

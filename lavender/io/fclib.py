@@ -222,7 +222,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
 
 def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Contents:
     """Read the matrices and vectors of an FCLIB file without changing them; raises the errors of `read`."""
-    h5py = _h5py()
+    h5py = _import_h5py()
     try:
         with h5py.File(path, "r") as file:
             return _read_file(_Reader(h5py, file, max_bytes))
@@ -604,7 +604,7 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
     InputError
         The path cannot be written, or h5py is not installed.
     """
-    h5py = _h5py()
+    h5py = _import_h5py()
     # The file is built in memory first, because HDF5 ends the process by a signal if the disk is full.
     with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
         _write_file(out, file)
@@ -658,7 +658,7 @@ def _write_array(group: Any, name: str, value: Any) -> None:
     group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))
 
 
-def _h5py() -> Any:
+def _import_h5py() -> Any:
     try:
         import h5py
     except ImportError:

@@ -58,18 +58,18 @@ def from_genesis(scene: Any) -> EngineStep:
             f"scene is a {type(scene).__name__}; a built genesis.Scene with rigid bodies is needed"
         )
     try:
-        return _convert(scene, solver)
+        return _convert_solver_arrays(scene, solver)
     except AttributeError as error:
         raise CapabilityError(f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}") from None
 
 
-def _convert(scene: Any, solver: Any) -> EngineStep:
+def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     """Read the engine's arrays and build the batch."""
     config, constraints = solver.rigid_config, solver.constraint_solver.constraint_state
     _check_configuration(scene, solver)
-    rows = _host(constraints.n_constraints).astype(np.int32)
+    rows = _copy_to_host(constraints.n_constraints).astype(np.int32)
     equalities, losses, contact_rows = (
-        _host(x).astype(np.int64)
+        _copy_to_host(x).astype(np.int64)
         for x in (
             constraints.n_constraints_equality,
             constraints.n_constraints_frictionloss,
@@ -80,41 +80,43 @@ def _convert(scene: Any, solver: Any) -> EngineStep:
     size = int(config.rows_per_contact)
     is_elliptic = bool(config.enable_elliptic_friction)
     if not is_elliptic:
-        contact_rows = size * _host(solver.collider.collider_state.n_contacts).astype(np.int64)
+        contact_rows = size * _copy_to_host(solver.collider.collider_state.n_contacts).astype(np.int64)
     index = np.arange(m)
     ends = np.cumsum([equalities, losses, contact_rows], axis=0)[:, :, None]  # (3, n, 1)
     contact_type = ELLIPTIC if is_elliptic else PYRAMIDAL
     row_type = np.select(
         [index < ends[0], index < ends[1], index < ends[2]], [EQUALITY, FRICTION[0], contact_type], LIMIT
     )
-    loss = _host(constraints.efc_frictionloss, m).T
-    contacts = _contacts(loss, ends[1, :, 0], contact_rows // size, size) if is_elliptic else None
+    loss = _copy_to_host(constraints.efc_frictionloss, m).T
+    contacts = (
+        _list_elliptic_contacts(loss, ends[1, :, 0], contact_rows // size, size) if is_elliptic else None
+    )
     dofs, dt = solver.dyn_state.dofs, float(solver.substep_dt)
-    jac = np.ascontiguousarray(np.moveaxis(_host(constraints.jac, m), 2, 0))
-    velocity = _host(dofs.vel).T.astype(float) - dt * _host(constraints.qacc).T
+    jac = np.ascontiguousarray(np.moveaxis(_copy_to_host(constraints.jac, m), 2, 0))
+    velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(constraints.qacc).T
     result = from_efc(
         efc_J=jac,
-        efc_D=_host(constraints.efc_D, m).T,
-        efc_aref=_host(constraints.aref, m).T,
+        efc_D=_copy_to_host(constraints.efc_D, m).T,
+        efc_aref=_copy_to_host(constraints.aref, m).T,
         efc_type=row_type,
-        M=np.ascontiguousarray(np.moveaxis(_host(solver.rigid_info.mass_mat), 2, 0)),
+        M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
         qvel=velocity.astype(jac.dtype),
-        qacc_smooth=_host(dofs.acc_smooth).T,
+        qacc_smooth=_copy_to_host(dofs.acc_smooth).T,
         timestep=dt,
         efc_frictionloss=np.abs(loss),
         nefc=rows,
         contacts=contacts,
-        efc_force=_host(constraints.efc_force, m).T,
-        qfrc_smooth=_host(dofs.qf_smooth).T,
+        efc_force=_copy_to_host(constraints.efc_force, m).T,
+        qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
         friction="coulomb" if config.enable_signorini_contact else "cone",
     )
-    converged = ~_host(constraints.improved).astype(bool)
+    converged = ~_copy_to_host(constraints.improved).astype(bool)
     if result.impulse is None:
         raise AssertionError("from_efc returns impulses if it is given forces")
     return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
 
 
-def _contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any, Any, Any, Any]:
+def _list_elliptic_contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any, Any, Any, Any]:
     """Return (world, efc_address, dim, friction) of all elliptic contacts.
 
     The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of torsional or
@@ -146,7 +148,7 @@ def _check_configuration(scene: Any, solver: Any) -> None:
             raise CapabilityError(f"{name}: it is not supported here")
 
 
-def _host(array: Any, rows: int | None = None) -> Any:
+def _copy_to_host(array: Any, rows: int | None = None) -> Any:
     """Copy the first `rows` rows of an array of the engine to the host, in its canonical order."""
     from genesis.utils.misc import qd_to_torch
 

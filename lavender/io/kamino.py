@@ -97,8 +97,8 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
         _check_configuration(engine)
         worlds = _Worlds(engine, solver._contacts_kamino)
         step = worlds.convert()
-        claims = _claims(solver.status.numpy())
-        _verify(solver, engine, worlds, verify)
+        claims = _make_claims(solver.status.numpy())
+        _verify_delassus_matrix(solver, engine, worlds, verify)
     except AttributeError as error:
         raise CapabilityError(
             f"an attribute of this SolverKamino is missing: {error}. {KAMINO_ADVICE}"
@@ -127,7 +127,7 @@ def _check_configuration(engine: Any) -> None:
         )
 
 
-def _claims(status: Any) -> Claims:
+def _make_claims(status: Any) -> Claims:
     """Build the claims from the engine's array of status records."""
     names = [name for name in status.dtype.names if name in RESIDUAL_NAMES]
     residuals = {name: status[name].astype(float) for name in names}
@@ -156,7 +156,7 @@ class _Worlds:
                 f"world {world} has {stored[world]} rows; its joints, bounded rows, limits and contacts have "
                 f"{self.rows[world]}. {KAMINO_ADVICE}"
             )
-        self.row_ptr, self.velocity_ptr = _pointers(self.rows), _pointers(self.columns)
+        self.row_ptr, self.velocity_ptr = _cumulate_counts(self.rows), _cumulate_counts(self.columns)
         self.world = np.repeat(np.arange(n), self.rows)  # world of each row
         self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]  # index within the world
         # Index of the same row in the engine's order: both tangents of a contact, then its normal.
@@ -176,9 +176,9 @@ class _Worlds:
             data = self.engine._jacobians.data
             return data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
         blocks = self.engine._jacobians._J_cts.bsm  # of one row and the six columns of a body
-        count, start = _as_int(blocks.num_nzb), _pointers(self.rows * self.columns)
+        count, start = _as_int(blocks.num_nzb), _cumulate_counts(self.rows * self.columns)
         world = np.repeat(np.arange(self.n), count)
-        block = _as_int(blocks.nzb_start)[world] + np.arange(len(world)) - _pointers(count)[world]
+        block = _as_int(blocks.nzb_start)[world] + np.arange(len(world)) - _cumulate_counts(count)[world]
         row, column = _as_int(blocks.nzb_coords)[block].T
         first = start[world] + row * self.columns[world] + column
         values = np.zeros(start[-1], np.float32)
@@ -187,23 +187,25 @@ class _Worlds:
 
     def convert(self) -> tuple[Batch, FloatArray]:
         """Build the batch and the impulses."""
-        scale = _floats(self.problem.P)[self.position]
+        scale = _copy_as_float64(self.problem.P)[self.position]
         first_body = _as_int(self.info.bodies_offset)[: self.n]
         within = np.arange(self.velocity_ptr[-1]) - self.velocity_ptr[self.velocity_world]
         of_velocity = COLUMNS_PER_BODY * first_body[self.velocity_world] + within
-        free = _floats(self.problem.u_f).reshape(-1)[of_velocity]
-        mass, is_fixed = self._mass()
+        free = _copy_as_float64(self.problem.u_f).reshape(-1)[of_velocity]
+        mass, is_fixed = self._form_mass_matrix()
         moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[of_velocity]
-        jac, products = self._jacobian(free, moves)
-        target = products - _floats(self.problem.v_f)[self.position] / scale
-        self.compliance = self._compliance()
-        lower, upper, mu = self._bounds(scale)
-        wrong = self._worlds_of_rows(~np.isfinite(target) | ~np.isfinite(self.compliance) | ~(scale > 0.0))
-        wrong |= self._worlds_of_rows(np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0))
+        jac, products = self._form_jacobian(free, moves)
+        target = products - _copy_as_float64(self.problem.v_f)[self.position] / scale
+        self.compliance = self._compute_row_compliance()
+        lower, upper, mu = self._compute_row_bounds(scale)
+        wrong = self._find_worlds_of_rows(
+            ~np.isfinite(target) | ~np.isfinite(self.compliance) | ~(scale > 0.0)
+        )
+        wrong |= self._find_worlds_of_rows(np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0))
         is_wrong_row = wrong[self.world]
         lower[is_wrong_row], upper[is_wrong_row], mu[is_wrong_row] = -np.inf, np.inf, 0.0
         free[wrong[self.velocity_world]] = np.nan
-        begins = self._block_begins()
+        begins = self._mark_block_begins()
         first = np.flatnonzero(begins)
         cones = Cones(
             ptr=np.append(first, len(begins)),
@@ -219,11 +221,11 @@ class _Worlds:
             compliance=self.compliance, friction="coulomb", row_ptr=self.row_ptr, **ragged,
         )  # fmt: skip
         batch.precision = "float32"
-        batch.names_of = self._block_names(first)
+        batch.names_of = self._make_block_namer(first)
         batch.contact_counts = self.contacts
-        return batch, _floats(self.engine.solver_fd.data.solution.lambdas)[self.position]
+        return batch, _copy_as_float64(self.engine.solver_fd.data.solution.lambdas)[self.position]
 
-    def _worlds_of_rows(self, rows: np.ndarray) -> np.ndarray:
+    def _find_worlds_of_rows(self, rows: np.ndarray) -> np.ndarray:
         """Return the worlds (n,) bool that have one of the given rows (bool)."""
         return np.bincount(self.world[rows], minlength=self.n) > 0
 
@@ -232,7 +234,7 @@ class _Worlds:
         """Whether all worlds have the same number of bodies."""
         return bool((self.bodies == self.bodies[0]).all())
 
-    def _jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    def _form_jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Return J and J v*: (rows, nv) if worlds have equal numbers of bodies, else one array of all entries."""
         values, start = self.jacobian_values, self.jacobian_start
         first = start[self.world] + self.source * self.columns[self.world]  # of each row
@@ -243,7 +245,7 @@ class _Worlds:
                 jac *= moves.reshape(self.n, nv)[self.world]
             return jac, np.einsum("ij,ij->i", jac, free.reshape(self.n, nv)[self.world])
         width = self.columns[self.world]
-        ptr = _pointers(width)
+        ptr = _cumulate_counts(width)
         entry = np.arange(ptr[-1])
         velocity = entry + np.repeat(self.velocity_ptr[self.world] - ptr[:-1], width)
         jac = np.where(moves[velocity], values[entry + np.repeat(first - ptr[:-1], width)], 0.0)
@@ -251,10 +253,10 @@ class _Worlds:
         products: Any = np.bincount(row, jac * free[velocity], minlength=len(width))
         return jac, products
 
-    def _mass(self) -> tuple[Any, np.ndarray]:
+    def _form_mass_matrix(self) -> tuple[Any, np.ndarray]:
         """Return M, as lower triangles of one pattern or one array of all entries, and the fixed bodies (bodies,)."""
-        inv_mass = _floats(self.engine._model.bodies.inv_m_i)
-        inv_inertia = _floats(self.engine.data.bodies.inv_I_i)
+        inv_mass = _copy_as_float64(self.engine._model.bodies.inv_m_i)
+        inv_inertia = _copy_as_float64(self.engine.data.bodies.inv_I_i)
         is_fixed = (inv_mass == 0.0) & (inv_inertia == 0.0).all(axis=(1, 2))
         # M is not read if J is 0. A body with numbers that are not finite makes J v* and so the world NaN.
         is_ordinary = np.isfinite(inv_mass) & np.isfinite(inv_inertia).all(axis=(1, 2)) & ~is_fixed
@@ -275,25 +277,25 @@ class _Worlds:
         if self.has_equal_bodies:
             count = int(self.bodies[0])
             offset = COLUMNS_PER_BODY * np.repeat(np.arange(count), len(BODY_COLUMN))
-            indptr = _pointers(np.tile(BODY_ROW_ENTRIES, count))
+            indptr = _cumulate_counts(np.tile(BODY_ROW_ENTRIES, count))
             return (values.reshape(self.n, -1), np.tile(BODY_COLUMN, count) + offset, indptr), is_fixed
-        ptr = _pointers(self.columns**2)
+        ptr = _cumulate_counts(self.columns**2)
         mass = np.zeros(ptr[-1])
         world = np.repeat(np.arange(self.n), self.bodies)
-        corner = COLUMNS_PER_BODY * (np.arange(len(world)) - _pointers(self.bodies)[world])
+        corner = COLUMNS_PER_BODY * (np.arange(len(world)) - _cumulate_counts(self.bodies)[world])
         nv = self.columns[world]
         for row, column, entry in zip(BODY_ROW, BODY_COLUMN, values.T, strict=True):
             mass[ptr[world] + (corner + row) * nv + corner + column] = entry
             mass[ptr[world] + (corner + column) * nv + corner + row] = entry
         return mass, is_fixed
 
-    def _compliance(self) -> FloatArray:
+    def _compute_row_compliance(self) -> FloatArray:
         """Return the compliance of each row [1/kg, 1/(kg m^2)]."""
         problem, info, joints = self.problem, self.info, self.engine.data.joints
         soft = (
             np.zeros(len(self.index))
             if problem.compliance is None
-            else _floats(problem.compliance)[self.position]
+            else _copy_as_float64(problem.compliance)[self.position]
         )
         for kind, values in (
             ("dynamic", joints.inv_m_j),
@@ -303,27 +305,27 @@ class _Worlds:
             count, offset, group = (_as_int(getattr(info, name))[: self.n] for name in names)
             if count.any():
                 world = np.repeat(np.arange(self.n), count)
-                k = np.arange(len(world)) - _pointers(count)[world]
-                soft[self.row_ptr[world] + group[world] + k] += _floats(values)[offset[world] + k]
+                k = np.arange(len(world)) - _cumulate_counts(count)[world]
+                soft[self.row_ptr[world] + group[world] + k] += _copy_as_float64(values)[offset[world] + k]
         return soft
 
-    def _bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _compute_row_bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return lower and upper bounds [N s] and the coefficient of friction of each row; 0 on rows of no contact."""
         problem, world, index = self.problem, self.world, self.index
         lower, upper, mu = np.full(len(index), -np.inf), np.full(len(index), np.inf), np.zeros(len(index))
         is_bounded = (index >= self.joints[world]) & (index < (self.joints + self.bounded)[world])
         if is_bounded.any():
             k = (_as_int(problem.bcio)[world] + index - self.joints[world])[is_bounded]
-            lower[is_bounded] = scale[is_bounded] * _floats(problem.bound_lower)[k]
-            upper[is_bounded] = scale[is_bounded] * _floats(problem.bound_upper)[k]
+            lower[is_bounded] = scale[is_bounded] * _copy_as_float64(problem.bound_lower)[k]
+            upper[is_bounded] = scale[is_bounded] * _copy_as_float64(problem.bound_upper)[k]
         is_limit = (index >= (self.joints + self.bounded)[world]) & ~self.is_contact_row
         lower[is_limit] = 0.0
         at = self.begins_contact
         k = (_as_int(problem.cio)[world] + (index - self.before_contacts[world]) // ROWS_PER_CONTACT)[at]
-        mu[at] = _floats(problem.mu)[k]
+        mu[at] = _copy_as_float64(problem.mu)[k]
         return lower, upper, mu
 
-    def _block_begins(self) -> np.ndarray:
+    def _mark_block_begins(self) -> np.ndarray:
         """Return the rows (bool) that begin a block: the rows that hold one joint together form one block."""
         begins = ~self.is_contact_row | self.begins_contact
         joints = self.engine._model.joints
@@ -333,16 +335,16 @@ class _Worlds:
         if (group + per_world != self.joints).any():
             raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {KAMINO_ADVICE}")
         before = (
-            _pointers(count)[:-1] - _pointers(per_world)[world]
+            _cumulate_counts(count)[:-1] - _cumulate_counts(per_world)[world]
         )  # rows of joints before this one in its world
         start = self.row_ptr[world] + group[world] + before
-        begins[np.repeat(start, count) + np.arange(count.sum()) - np.repeat(_pointers(count)[:-1], count)] = (
-            False
-        )
+        begins[
+            np.repeat(start, count) + np.arange(count.sum()) - np.repeat(_cumulate_counts(count)[:-1], count)
+        ] = False
         begins[start[count > 0]] = True
         return begins
 
-    def _block_names(self, first: np.ndarray) -> Callable[[int], list[str]]:
+    def _make_block_namer(self, first: np.ndarray) -> Callable[[int], list[str]]:
         """Return a function that returns the names of a world's blocks, given the first row of each block."""
         model = self.engine._model
         labels, bodies = list(model.joints.label), list(model.bodies.label)
@@ -354,7 +356,7 @@ class _Worlds:
         }
         world_of_joint = _as_int(model.joints.wid)
         counts = {kind: (_as_int(count), joined) for kind, (count, joined) in joints.items()}
-        pairs = self._contact_bodies()
+        pairs = self._find_contact_bodies()
 
         def names_of(i: int) -> list[str]:
             own = np.flatnonzero(world_of_joint == i).tolist()
@@ -373,7 +375,7 @@ class _Worlds:
 
         return names_of
 
-    def _contact_bodies(self) -> dict[tuple[int, int], list[int]]:
+    def _find_contact_bodies(self) -> dict[tuple[int, int], list[int]]:
         """Return the two bodies of each contact by (world, number in the world); -1 is the world itself."""
         contacts = self.stored_contacts
         if contacts is None or not self.contacts.any():
@@ -383,31 +385,32 @@ class _Worlds:
         world, number, pair = (x.numpy()[:count] for x in (data.wid, data.cid, data.bid_AB))
         return {(w, k): p for w, k, p in zip(world.tolist(), number.tolist(), pair.tolist(), strict=True)}
 
-    def kinds_of_world(self) -> dict[str, np.ndarray]:
+    def count_rows_by_kind(self) -> dict[str, np.ndarray]:
         """Return the number of rows of each kind in each world (n,)."""
         soft = np.bincount(self.world, self.compliance != 0.0, minlength=self.n)
         return {
             "joint": self.joints, "bounded": self.bounded, "limit": self.limits, "contact": self.contacts, "soft": soft
         }  # fmt: skip
 
-    def matrix_difference(self, i: int) -> float:
+    def compare_delassus_matrix(self, i: int) -> float:
         """Return the largest difference of the engine's D of world i from J M^-1 J^T, relative to its largest entry."""
         size, bodies = (
             int(self.rows[i]),
-            slice(int(self.first_body(i)), int(self.first_body(i) + self.bodies[i])),
+            slice(int(self.index_of_first_body(i)), int(self.index_of_first_body(i) + self.bodies[i])),
         )
         if size == 0:
             return 0.0
         start = int(_as_int(self.problem.mio)[i])
-        stored = _floats(self.problem.D[start : start + size * size]).reshape(size, size)
+        stored = _copy_as_float64(self.problem.D[start : start + size * size]).reshape(size, size)
         sigma = float(self.engine.solver_fd.data.state.sigma.numpy()[i][0])
         first = int(_as_int(self.problem.vio)[i])
-        scale = _floats(self.problem.P[first : first + size])
+        scale = _copy_as_float64(self.problem.P[first : first + size])
         nv, begin = int(self.columns[i]), int(self.jacobian_start[i])
         jac = self.jacobian_values[begin : begin + size * nv].astype(float).reshape(size, nv)
         blocks = jac.reshape(size, -1, 2, 3)
         inv_mass, inv_inertia = (
-            _floats(x[bodies]) for x in (self.engine._model.bodies.inv_m_i, self.engine.data.bodies.inv_I_i)
+            _copy_as_float64(x[bodies])
+            for x in (self.engine._model.bodies.inv_m_i, self.engine.data.bodies.inv_I_i)
         )
         linear = np.einsum("ibk,b->ibk", blocks[:, :, 0], inv_mass)
         angular = np.einsum("ibk,bkl->ibl", blocks[:, :, 1], inv_inertia)
@@ -418,12 +421,12 @@ class _Worlds:
         largest = np.abs(product).max(initial=0.0)
         return float(np.abs(matrix - product).max(initial=0.0) / largest) if largest > 0.0 else 0.0
 
-    def first_body(self, i: int) -> int:
+    def index_of_first_body(self, i: int) -> int:
         """Return the number of world i's first body."""
         return int(_as_int(self.info.bodies_offset)[i])
 
 
-def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
+def _verify_delassus_matrix(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
     """Compare the engine's matrix with the one of J, M and the compliance if this has not been done.
 
     Raises
@@ -431,7 +434,7 @@ def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
     CapabilityError
         They differ in a world of finite numbers.
     """
-    kinds = worlds.kinds_of_world()
+    kinds = worlds.count_rows_by_kind()
     layout = worlds.bodies.tobytes(), _as_int(worlds.problem.maxdim).tobytes()
     known = _VERIFIED.get(solver)
     verified = known[1] if known is not None and known[0] == layout else frozenset()
@@ -444,7 +447,7 @@ def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
     else:
         return
     for i in chosen.tolist():
-        difference = worlds.matrix_difference(i)
+        difference = worlds.compare_delassus_matrix(i)
         if difference > MATRIX_TOLERANCE:
             raise CapabilityError(
                 f"world {i}: the engine's matrix differs from J M^-1 J^T + compliance by {difference:.1e} of its "
@@ -459,11 +462,11 @@ def _as_int(array: Any) -> np.ndarray:
     return array.numpy().astype(np.int64)
 
 
-def _floats(array: Any) -> FloatArray:
+def _copy_as_float64(array: Any) -> FloatArray:
     """Copy an array of the engine to the host as float64."""
     return array.numpy().astype(float)
 
 
-def _pointers(counts: np.ndarray) -> np.ndarray:
+def _cumulate_counts(counts: np.ndarray) -> np.ndarray:
     """Return 0 and the sums of the first 1, 2, ... counts."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

@@ -145,7 +145,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     mass = _read_mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
     cones, scale, key = _make_blocks(seen, data, contacts, dt)
     jac = _read_jacobian(seen, model, data, m, scale)
-    rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.numbers(
+    rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.compute_problem_numbers(
         *jac, scale, dt, _get_velocity_before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D,
         data.efc_force,
         _get_expected_velocity(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
@@ -161,7 +161,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         seen.first_operator = general.operator
     build = (
         Problem._from_engine_arrays
-        if is_finite and not general.operator.is_beyond(MAX_SAFE_ENTRY)
+        if is_finite and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
         else Problem
     )
     return build(
@@ -284,7 +284,9 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
     """
     if seen.n and not data.M[:1].any():  # The first diagonal entry of a computed M is positive.
         raise InputError("M of this MjData is 0: mj_forward(model, data) was not called")
-    result = mujoco_rows.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like)
+    result = mujoco_rows.lower_triangle_of_mass(
+        *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
+    )
     if result is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL_ADVICE}")
     mass, gap = result
@@ -315,7 +317,7 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
             raise InputError(
                 f"efc_J holds {len(values)} numbers; {m} x {n} are needed if opt.jacobian is dense. {CHANGED_ADVICE}"
             )
-        return mujoco_rows.rows_of_dense(values, m, n, scale)
+        return mujoco_rows.scale_dense_rows(values, m, n, scale)
     count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
     columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
@@ -323,7 +325,7 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
             f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED_ADVICE} "
             f"{LAYOUT_NOTE}"
         )
-    result = mujoco_rows.rows_of_sparse(values, count, first, columns, scale, n)
+    result = mujoco_rows.scale_sparse_rows(values, count, first, columns, scale, n)
     if isinstance(result, int):  # The number of the first invalid row.
         raise InputError(
             f"row {result} of efc_J has {count[result]} entries from position {first[result]} of {len(columns)}, in "
@@ -371,15 +373,19 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     """
     parent, bodies = seen.tree
     axis, spatial, v = data.cdof, data.cvel, data.qvel
-    gap, size = mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)
+    gap, size = mujoco_rows.compare_spatial_velocities(parent, bodies, axis, spatial, v)
     if gap < 0.0:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL_ADVICE}")
     if gap <= SUM_TOLERANCE * size or (
         not np.any(spatial) and np.any(data.efc_vel)
     ):  # A copy may not fill cvel.
         return v
-    v = mujoco_rows.motion_before(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
-    if v is None or not mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUM_TOLERANCE * size:
+    v = mujoco_rows.recover_joint_velocity(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
+    if (
+        v is None
+        or not mujoco_rows.compare_spatial_velocities(parent, bodies, axis, spatial, v)[0]
+        <= SUM_TOLERANCE * size
+    ):
         raise CapabilityError(
             "the velocity before the step cannot be computed from cvel and cdof: joints of one body move it alike, or "
             "MjData was changed since its forward pass: run mj_forward"
@@ -432,7 +438,7 @@ def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tupl
     contact = data.contact if contacts else NO_CONTACT
     type_counts = (*seen.type_counts, contacts, contacts, contacts)
     types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _get_type_codes(seen.mj)
-    result = mujoco_rows.blocks(
+    result = mujoco_rows.make_blocks_of_rows(
         types, ids, codes, type_counts, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
     if isinstance(result, int):  # The number of the first invalid row.

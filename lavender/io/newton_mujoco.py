@@ -52,12 +52,12 @@ def from_newton_mujoco(solver: Any, velocity: Any) -> EngineStep:
             f"solver is a {type(solver).__name__}; a newton.solvers.SolverMuJoCo that runs MuJoCo Warp is needed"
         )
     try:
-        return _convert(solver, data, model, to_numpy("velocity", velocity))
+        return _convert_solver_arrays(solver, data, model, to_numpy("velocity", velocity))
     except AttributeError as error:
         raise CapabilityError(f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}") from None
 
 
-def _convert(solver: Any, data: Any, model: Any, velocity: Any) -> EngineStep:
+def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) -> EngineStep:
     """Read the engine's arrays and build the batch."""
     rows, contact, count = data.nefc.numpy().astype(np.int64), data.contact, int(data.nacon.numpy()[0])
     capacity, nv = int(data.efc.D.shape[1]), int(model.nv)

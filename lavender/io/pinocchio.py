@@ -125,8 +125,8 @@ def _convert_constraints(
     targets: list[Any] = [np.zeros(0)]
     cones, names = Cones.free(0), []
     for i, (wrapped_model, wrapped_data) in enumerate(pairs):
-        model_of = _unwrap(wrapped_model)
-        _check_constraint(i, model, model_of, _unwrap(wrapped_data))
+        model_of = _unwrap_constraint(wrapped_model)
+        _check_constraint(i, model, model_of, _unwrap_constraint(wrapped_data))
         with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
             data_of = model_of.createData()  # New data have the sizes of this model.
             model_of.calc(model, data, data_of)
@@ -279,7 +279,7 @@ def _is_rotation(r: Any) -> bool:
     return bool(np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(r) > 0.0)
 
 
-def _unwrap(constraint: Any) -> Any:
+def _unwrap_constraint(constraint: Any) -> Any:
     return constraint.extract() if hasattr(constraint, "extract") else constraint
 
 

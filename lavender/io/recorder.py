@@ -174,11 +174,11 @@ class Recorder:
             problems, impulse = problems
         if impulse is None:
             raise InputError("impulse is missing: give the engine's answer [N s] to judge")
-        verdicts, reasons = self._judge(problems, impulse, claims)
+        verdicts, reasons = self._judge_worlds(problems, impulse, claims)
         states = self._split_states(state, len(verdicts), isinstance(problems, Problem))
         changed = False
         for verdict in verdicts:
-            changed |= self._record(
+            changed |= self._record_selected_world(
                 verdict, problems, impulse, claims, states, reasons.get(verdict.world, "")
             )
         if changed:
@@ -187,7 +187,7 @@ class Recorder:
         self.n_steps += 1
         return verdicts
 
-    def _judge(
+    def _judge_worlds(
         self, problems: Any, impulse: Any, claims: Claims | None
     ) -> tuple[list[StepVerdict], dict[int, str]]:
         """Return the verdict of each world, and the reasons why worlds could not be judged."""
@@ -225,7 +225,7 @@ class Recorder:
                 raise InputError(f"state {name!r} has shape {x.shape}; {n} worlds first are needed")
         return lambda i: {name: x[i] for name, x in arrays.items()}
 
-    def _record(
+    def _record_selected_world(
         self,
         verdict: StepVerdict,
         problems: Any,

@@ -97,7 +97,7 @@ def _read_keyframes(mj: Any, model: Any) -> StartStates:
     data, vectors = mj.MjData(model), []
     for key in range(model.nkey):
         mj.mj_resetDataKeyframe(model, data, key)
-        vectors.append(_vector_of(mj, model, data))
+        vectors.append(_read_state_vector(mj, model, data))
     return StartStates(np.array(vectors), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
 
 
@@ -135,7 +135,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
                 data.time = float(x[i])
             else:
                 getattr(data, name)[:] = x[i]
-        vectors.append(_vector_of(mj, model, data))
+        vectors.append(_read_state_vector(mj, model, data))
     return StartStates(np.array(vectors), parts.get("ctrl"))
 
 
@@ -156,12 +156,12 @@ def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
     for state in states:
         data = mj.MjData(model)
         mj.mj_setState(model, data, state, kinds[size])
-        vectors.append(_vector_of(mj, model, data))
+        vectors.append(_read_state_vector(mj, model, data))
         controls.append(np.array(data.ctrl))
     return StartStates(np.array(vectors), np.array(controls) if kinds[size] == integration else None)
 
 
-def _vector_of(mj: Any, model: Any, data: Any) -> FloatArray:
+def _read_state_vector(mj: Any, model: Any, data: Any) -> FloatArray:
     kind = mj.mjtState.mjSTATE_INTEGRATION
     vector = np.empty(mj.mj_stateSize(model, kind))
     mj.mj_getState(model, data, vector, kind)

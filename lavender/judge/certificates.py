@@ -223,7 +223,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     if len(vanished):
         name = problem.row_name(int(vanished[0]))
         return Proof(y, 0.0, f"products of {name} vanish in float64: its row of A is not zero")
-    unscaled, y = y, y / _power_of_two(y)
+    unscaled, y = y, y / _round_down_to_power_of_two(y)
     # b.y and the sum of the absolute values of its terms
     gain, gain_size = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
@@ -298,7 +298,7 @@ def _multiply_transposed(a: Any, y: FloatArray) -> FloatArray:
     return out
 
 
-def _power_of_two(x: FloatArray) -> float:
+def _round_down_to_power_of_two(x: FloatArray) -> float:
     """Return the largest power of two up to max |x|, for exact divisions; x must not be zero."""
     return float(2.0 ** np.floor(np.log2(np.abs(x).max())))
 
@@ -348,7 +348,7 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     """
     data, size = problem.metric, np.abs(problem.b)
     get_reference(problem)
-    energy = net / (_energy_norm(data, y * data.d) + _energy_norm(data, z))
+    energy = net / (_compute_energy_norm(data, y * data.d) + _compute_energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
     if not energy + velocity < math.inf:
         return 0.0, 0.0
@@ -359,11 +359,11 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     max_velocity = np.max(data.weight * b_rounding / data.d)
     return (
         divide_by_reference(data, energy, velocity),
-        divide_by_reference(data, _energy_norm(data, b_rounding), max_velocity),
+        divide_by_reference(data, _compute_energy_norm(data, b_rounding), max_velocity),
     )
 
 
-def _energy_norm(data: Any, w: FloatArray) -> Any:
+def _compute_energy_norm(data: Any, w: FloatArray) -> Any:
     """Compute the norm of velocities w (m,) [m/s] in the metric of D^-1 [sqrt J]."""
     return np.sqrt(np.sum(w * w / data.d))
 
@@ -399,7 +399,7 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
             raise TooLate(seconds)
         system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
         y[rows] -= np.linalg.lstsq(system, z[columns], rcond=1e-9)[0] / length[rows]
-    spacing = 2.0**-25 * _power_of_two(y)
+    spacing = 2.0**-25 * _round_down_to_power_of_two(y)
     yield np.rint(y / spacing) * spacing
     yield y
 

@@ -75,7 +75,7 @@ MAX_REST_VELOCITY = (
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half its spacing at 1
 
 # at_floor(relative, floor) of one island; solvers and the judge share this test, its reason is in the kernel.
-at_floor = measure.at_floor
+at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
 DEFAULT_THRESHOLD = (
@@ -245,7 +245,7 @@ class Residual:
     @property
     def energy_rhs(self) -> float:
         """Energy norm of b [sqrt J]."""
-        return float(measure.rhs_norms(self._problem.disk.metric)[0])
+        return float(measure.compute_rhs_norms(self._problem.disk.metric)[0])
 
     @property
     def worst_name(self) -> str:
@@ -263,7 +263,7 @@ class Residual:
         """Error of each island, in the order of their first blocks."""
         problem = self._problem.disk
         get_reference(problem)
-        label, table = measure.by_island(problem.metric, self._impulse)
+        label, table = measure.residuals_by_island(problem.metric, self._impulse)
         return Islands(label, *table.T)
 
     def __str__(self) -> str:
@@ -311,14 +311,14 @@ def compute_verdict(
 
 def divide_by_reference(data: Any, energy: float, velocity: float) -> float:
     """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference."""
-    return measure.compare(energy, velocity, data.reference_energy, data.reference_velocity)
+    return measure.make_relative_score(energy, velocity, data.reference_energy, data.reference_velocity)
 
 
 def get_reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.reference_energy < 0.0:
-        start = measure.begin(data)
+        start = measure.store_zero_impulse_residual(data)
         if problem.derived.start is None:
             problem.derived.start = start
         if problem.generalized is not None and "csr_data" in problem.__dict__:
@@ -354,13 +354,17 @@ def combine_best_islands(
     island, or if its energy is lower there and its relative residual no larger.
     """
     get_reference(problem)
-    best: FloatArray = measure.best_of_islands(problem.metric, list(starts), list(impulses), tol)
+    best: FloatArray = measure.combine_best_islands(problem.metric, list(starts), list(impulses), tol)
     return best
 
 
 def judge_once(problem: Problem, impulse: FloatArray, judged: measure.Judged | None = None) -> measure.Judged:
     """Return `judged` if it belongs to this problem and impulse, bit for bit; else judge a copy of the impulse."""
-    if judged is None or judged.data is not problem.metric or not measure.same_bits(judged.impulse, impulse):
+    if (
+        judged is None
+        or judged.data is not problem.metric
+        or not measure.are_bit_identical(judged.impulse, impulse)
+    ):
         return judge_impulse(problem, impulse.copy())
     return judged
 
@@ -368,7 +372,7 @@ def judge_once(problem: Problem, impulse: FloatArray, judged: measure.Judged | N
 def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None:
     """Return the known relative residual if `impulse` is the zero impulse, bit for bit; else None."""
     relative: float = problem.metric.relative_at_zero
-    return relative if relative >= 0.0 and measure.same_bits(problem._start, impulse) else None
+    return relative if relative >= 0.0 and measure.are_bit_identical(problem._start, impulse) else None
 
 
 def compute_relative(
@@ -379,7 +383,7 @@ def compute_relative(
     Without `floor` both are the relative residual.
     """
     get_reference(problem)
-    _, _, relative, above = measure.judge(problem.metric, impulse, w, e, floor)
+    _, _, relative, above = measure.judge_impulse(problem.metric, impulse, w, e, floor)
     return relative, above
 
 
@@ -441,7 +445,7 @@ def residual(
     result = refine_residual(problem, judge_impulse(problem, impulse), tol)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
-    return result if precision == "float64" else _with_float32_floor(problem, result, impulse)
+    return result if precision == "float64" else _apply_float32_floor(problem, result, impulse)
 
 
 def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
@@ -452,13 +456,13 @@ def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
     return replace(of_disk, error=error, slack=slack, _problem=problem)
 
 
-def _with_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:
+def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:
     """Replace the floor of a residual by the floor of float32."""
     with np.errstate(over="ignore", invalid="ignore"):  # An impulse that is not finite has no floor.
         of_impulse, of_data, of_velocities = estimate_float32_errors(problem, impulse)
         relative = [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
         squares = of_impulse, of_data, of_velocities, of_impulse + of_data + of_velocities
-    floors = [measure.size_of_square(problem.metric, x) for x in squares]
+    floors = [measure.relative_size_by_island(problem.metric, x) for x in squares]
     *contributions, floor = (x[max(result.worst_island, 0)] for x in floors)
     is_rounding = [
         _is_explained_by_rounding(x, island_floor, "float32") and x < 1.0
@@ -476,7 +480,7 @@ def estimate_float32_errors(
     general = problem.generalized
     if general is not None:
         free = general.v_free if general.order is None else general.v_free[general.order]
-        of_impulse, of_data, of_velocities = measure.squares_of_float32(
+        of_impulse, of_data, of_velocities = measure.squared_float32_rounding(
             problem.metric, general.operator.mass, free, impulse
         )
         return of_impulse, of_data, of_velocities

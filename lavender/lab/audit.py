@@ -505,7 +505,7 @@ def audit(
         pieces = _audit_mujoco(runs, judging, workers, backend)
         processes += count_processes(workers)  # This process waits for the workers.
     else:
-        pieces = _audit_frames(engine, runs, judging[1])
+        pieces = _audit_jointly_stepped_worlds(engine, runs, judging[1])
     if watch is not None:
         text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
         watch(Event(0, worlds * steps, text, "", remaining=expected_time))
@@ -614,7 +614,7 @@ def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[
     return [*out[:-1], out[-1]._replace(divergences=divergences)]
 
 
-def _audit_frames(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
+def _audit_jointly_stepped_worlds(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
     """Judge the steps of an engine that steps all worlds at once."""
     world, diverged = np.arange(runs.worlds), np.zeros(runs.worlds, bool)
     for step, frame in enumerate(iterate_frames(engine, runs)):

@@ -252,7 +252,7 @@ def compare_claims(
                     f"step {len(outcomes)} has {len(step.batch)} worlds, the first one {len(outcomes[0])}; all steps "
                     "need the same number"
                 )
-            outcome, velocity = _judge(step, result)
+            outcome, velocity = _judge_claims_of_step(step, result)
             outcomes.append(outcome)
             velocities.append(velocity)
             iterations.append(step.claims.iterations)
@@ -290,7 +290,7 @@ def _write_states(recorder: Recorder) -> None:
         write_arrays(recorder.folder.parent / STATES_FILE, arrays | {"step": step, "world": world})
 
 
-def _judge(step: EngineStep, result: ClaimComparison) -> tuple[Any, FloatArray]:
+def _judge_claims_of_step(step: EngineStep, result: ClaimComparison) -> tuple[Any, FloatArray]:
     """Return outcome and velocity error of each world, and add wrong answers to the result's statistics."""
     residuals = residual_many(step.batch, step.impulse, threshold=result.threshold, errors="status")
     velocity, verdicts, claimed = residuals.velocity_error, residuals.verdict, step.claims.converged

@@ -240,14 +240,14 @@ def explain_slip(
         start if own_disk.m == problem.m else None,
         "cones are round" if is_same_shape else "",
     )
-    hard, has_soft_friction = _harden_friction(own_disk)
+    hard, has_soft_friction = _replace_soft_friction(own_disk)
     start = add("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
         UNDEFINED_LAW if hard.cones.has_round else ""
     )  # fmt: skip
     rigid = hard if law_note else hard.relaxed("coulomb")
     start = add("coulomb", rigid, start, law_note)
-    variants[-1] = replace(variants[-1], speed_range=_speed_range(rigid, slip))
+    variants[-1] = replace(variants[-1], speed_range=_find_speed_range(rigid, slip))
     names = tuple(measured.block_name(k) for k in blocks)
     return SlipExplanation(names, tuple(variants))
 
@@ -283,7 +283,7 @@ def _as_disk(problem: Problem) -> Problem:
     return replace(problem, cones=problem.cones.shaped("disk"))
 
 
-def _harden_friction(problem: Problem) -> tuple[Problem, bool]:
+def _replace_soft_friction(problem: Problem) -> tuple[Problem, bool]:
     """Return the problem with hard friction rows at target velocity 0, and whether a row changed."""
     rows = problem.cones.friction_rows
     free_slip = (problem.jacobian @ problem.velocity(np.zeros(problem.m)))[rows]
@@ -299,7 +299,7 @@ def _harden_friction(problem: Problem) -> tuple[Problem, bool]:
     return replace(problem, b=b, compliance=soft), True
 
 
-def _speed_range(problem: Problem, slip: Any) -> FloatArray | None:
+def _find_speed_range(problem: Problem, slip: Any) -> FloatArray | None:
     """Return the smallest and largest speed of each contact over the solutions that are found, or None for one."""
     if problem.m > MAX_SEARCHED_ROWS:
         return None

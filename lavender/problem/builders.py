@@ -29,7 +29,7 @@ from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
 from lavender.problem.program import convert_program, unpack_program
 from lavender.problem.rows import Rows
-from lavender_ext.core.problem import rows_velocity
+from lavender_ext.core.problem import multiply_body_jacobian
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -345,7 +345,7 @@ class Builders(Operators):
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
         problem, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
-        rows_velocity(problem.data, rows.v_free, jv)
+        multiply_body_jacobian(problem.data, rows.v_free, jv)
         problem._set_rhs(target - jv[:m])
         return problem
 
@@ -490,7 +490,7 @@ class Builders(Operators):
         qp = convert_program(unpack_program((P, q, G, h, A, b, lb, ub)))
         if qp.is_singular:
             n, m = len(qp.q), len(qp.target)
-            more.setdefault("names", Names(n + m, partial(_names_of_program, n, m)))
+            more.setdefault("names", Names(n + m, partial(_make_program_names, n, m)))
         return cls(**qp.problem_fields(), qp=qp, **more)
 
     def updated(
@@ -554,7 +554,7 @@ class Builders(Operators):
         return replace(self, generalized=general, b=rhs, guess=start, qp=qp, copy=False)
 
 
-def _names_of_program(n: int, m: int) -> list[str]:
+def _make_program_names(n: int, m: int) -> list[str]:
     """Return default names of the unknowns and constraints of a quadratic program."""
     return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
 

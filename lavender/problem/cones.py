@@ -52,7 +52,7 @@ from lavender.problem.friction import (
     convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, counts_up
+from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, is_increasing_from_zero
 
 __all__ = [
     "CONTACT",
@@ -185,7 +185,7 @@ class Cones:
     def _convert_fields(self) -> tuple[np.ndarray, ...]:
         """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
-        if not counts_up(ptr):
+        if not is_increasing_from_zero(ptr):
             raise InputError(
                 "cones.ptr must start with 0 and increase: the first row of each block, then the number of "
                 "rows"
@@ -222,7 +222,7 @@ class Cones:
         InputError
             The shapes differ, or no number lies between two bounds.
         """
-        blocks = kernels.bounded_rows(lower, upper)
+        blocks = kernels.make_bounded_rows(lower, upper)
         if blocks is not None:
             return cls._from_blocks(blocks)
         low = as_array("lower", lower, (None,), finite=False, unit="N s")
@@ -235,7 +235,7 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """Build m unbounded rows, each a separate block: a linear system."""
-        return cls._from_blocks(kernels.free_rows(check_int("m", m, high=2**31 - 2)))
+        return cls._from_blocks(kernels.make_free_rows(check_int("m", m, high=2**31 - 2)))
 
     @classmethod
     def contacts(
@@ -309,7 +309,7 @@ class Cones:
             rolling = check_coefficients("rolling", rolling, k, "m")
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
-        blocks = kernels.contacts(k, tangents, mu, patch_radius, rolling, pair_kind)
+        blocks = kernels.make_contact_blocks(k, tangents, mu, patch_radius, rolling, pair_kind)
         if blocks is None:
             if patch_radius is not None:
                 check_nonnegative_magnitudes(

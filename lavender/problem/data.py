@@ -31,9 +31,9 @@ from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
-from lavender_ext.core.checks import MIN_MAGNITUDE, norm_inf
+from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import general_data
+from lavender_ext.core.problem import make_generalized_data
 from lavender_ext.judge import measure
 
 FRICTION_LAWS = tuple(FRICTION_NUMBER)
@@ -203,7 +203,7 @@ class ProblemData:
         if generalized.m != m:
             raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
         self._check_compliance(m)
-        self.derived.view = general_data(
+        self.derived.view = make_generalized_data(
             self.cones._blocks, self.b, generalized.operator, self.compliance, FRICTION_NUMBER[self.friction]
         )
 
@@ -352,7 +352,7 @@ class ProblemData:
 
 def _check_rhs(b: FloatArray) -> None:
     """Raise InputError if the largest |b_i| [m/s] is not 0 but below MIN_MAGNITUDE."""
-    max_abs = norm_inf(b)
+    max_abs = max_abs_of_array(b)
     if 0.0 < max_abs < MIN_MAGNITUDE:
         raise InputError(
             f"b [m/s] is {max_abs:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "

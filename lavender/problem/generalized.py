@@ -31,7 +31,7 @@ from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
-from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked
+from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
 from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
 from lavender_ext.factor.graph import least_degree
 
@@ -267,7 +267,7 @@ class Generalized:
     @cached_property
     def mass(self) -> sp.csr_array:
         """M (nv, nv) in compressed rows, both triangles."""
-        indptr, indices, data = mirrored(*self.operator.mass)
+        indptr, indices, data = mirror_lower_triangle(*self.operator.mass)
         mass = sp.csr_array((data, indices, indptr), shape=(self.nv, self.nv))
         mass.eliminate_zeros()
         if self.order is not None:
@@ -291,24 +291,26 @@ class Generalized:
     def velocity_of(self, v: FloatArray) -> FloatArray:
         """Compute J v (m,) [m/s, rad/s] for velocities v (nv,)."""
         v = as_array("v", v, (self.nv,), finite=False)
-        out: FloatArray = self.operator.times(v if self.order is None else v[self.order])
+        out: FloatArray = self.operator.multiply_jacobian(v if self.order is None else v[self.order])
         return out
 
     def bias(self, target: FloatArray) -> FloatArray:
         """Compute b = target - J v* (m,) [m/s, rad/s] for targets (m,)."""
         v = self.v_free if self.order is None else self.v_free[self.order]
-        b: FloatArray = self.operator.bias(v, as_array("target", target, (self.m,), finite=False))
+        b: FloatArray = self.operator.compute_rhs(v, as_array("target", target, (self.m,), finite=False))
         return b
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """Compute M v (nv,) [kg m/s] for velocities v (nv,)."""
         v = as_array("v", v, (self.nv,), finite=False)
-        return self._in_original_order(self.operator.momentum(v if self.order is None else v[self.order]))
+        return self._in_original_order(
+            self.operator.multiply_mass(v if self.order is None else v[self.order])
+        )
 
     def force(self, impulse: FloatArray) -> FloatArray:
         """Compute J^T impulse (nv,) [N s] for impulses (m,)."""
         impulse = as_array("impulse", impulse, (self.m,), finite=False)
-        return self._in_original_order(self.operator.force(impulse))
+        return self._in_original_order(self.operator.multiply_jacobian_transpose(impulse))
 
     def solve(self, x: Any) -> FloatArray:
         """Compute M^-1 x (nv,)."""
@@ -319,7 +321,7 @@ class Generalized:
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """Compute the velocity change M^-1 J^T impulse (nv,) [m/s, rad/s] by impulses (m,)."""
-        x = self.operator.force(as_array("impulse", impulse, (self.m,), finite=False))
+        x = self.operator.multiply_jacobian_transpose(as_array("impulse", impulse, (self.m,), finite=False))
         self.operator.solve(x)
         return self._in_original_order(x)
 
@@ -407,9 +409,9 @@ def extract_lower_triangle(
     if len(array.shape) != 2 or array.shape[0] != array.shape[1]:
         raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
     lower, (i, j, asymmetry) = (
-        kernels.lower_of_rows(*convert_to_compressed_rows(name, array))
+        kernels.lower_triangle_of_csr(*convert_to_compressed_rows(name, array))
         if sparse
-        else kernels.lower_of_dense(array)
+        else kernels.lower_triangle_of_dense(array)
     )
     if asymmetry > max_asymmetry:
         entries: Any = sp.csr_array(array) if sparse else array
@@ -426,11 +428,13 @@ def convert_to_compressed_rows(name: str, matrix: Any, sign: float = 1.0) -> Com
     """Convert a sparse matrix times a sign to checked compressed rows, without entries that are zero."""
     m, n = matrix.shape
     if matrix.format in ("csr", "csc") and m < 2**31 > n:
-        arrays = stacked(n, [(matrix.indptr, matrix.indices, matrix.data, matrix.format == "csc", sign, m)])
+        arrays = stack_csr_matrices(
+            n, [(matrix.indptr, matrix.indices, matrix.data, matrix.format == "csc", sign, m)]
+        )
         if arrays is not None:
             return arrays
     csr = as_csr(name, matrix)  # converts other types, or raises with a message
-    return stacked(n, [(csr.indptr, csr.indices, csr.data, False, sign, m)])
+    return stack_csr_matrices(n, [(csr.indptr, csr.indices, csr.data, False, sign, m)])
 
 
 # -- orders with little fill-in ------------------------------------------------------------------------
@@ -503,7 +507,7 @@ def _order_trees(jac: Compressed, parent: IntArray) -> IntArray | None:
     lower = sp.csr_array(sp.tril(coupled, -1) + sp.eye_array(len(roots)))
     pattern = lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
     permuted = _permute_lower((*pattern, lower.data), tree_order)
-    if kernels.pattern_fill(*permuted[:2]) >= kernels.pattern_fill(*pattern):
+    if kernels.count_fill_in(*permuted[:2]) >= kernels.count_fill_in(*pattern):
         return None
     position = np.empty(len(roots), np.int64)
     position[tree_order] = np.arange(len(roots))

@@ -14,9 +14,9 @@ from lavender.problem.data import ProblemData
 from lavender.problem.derived import Derived, cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
-from lavender_ext.core.checks import MAX_MAGNITUDE, norm_inf
+from lavender_ext.core.checks import MAX_MAGNITUDE, max_abs_of_array
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, general_data, zero_impulse
+from lavender_ext.core.problem import Data, clip_zero_to_bounds, make_generalized_data
 from lavender_ext.factor import sparse
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.judge import measure
@@ -46,7 +46,7 @@ class Operators(ProblemData):
         """
         problem, derived = object.__new__(cls), Derived()
         fields["derived"], fields["precision"], fields["copy"] = derived, "float64", True
-        derived.view = general_data(
+        derived.view = make_generalized_data(
             fields["cones"]._blocks, fields["b"], fields["generalized"].operator, fields["compliance"],
             FRICTION_NUMBER[fields["friction"]],
         )  # fmt: skip
@@ -55,13 +55,13 @@ class Operators(ProblemData):
 
     def _has_large_entries(self) -> bool:
         """Return whether entries of J and M^-1 are so large that A_ii may exceed MAX_MAGNITUDE."""
-        if self.compliance is not None and norm_inf(self.compliance) > MAX_SAFE_ENTRY:
+        if self.compliance is not None and max_abs_of_array(self.compliance) > MAX_SAFE_ENTRY:
             return True
         if self.generalized is not None:
-            return bool(self.generalized.operator.is_beyond(MAX_SAFE_ENTRY))
+            return bool(self.generalized.operator.has_entry_above(MAX_SAFE_ENTRY))
         r = self.rows
         return r is not None and any(
-            norm_inf(x.reshape(-1)) > MAX_SAFE_ENTRY
+            max_abs_of_array(x.reshape(-1)) > MAX_SAFE_ENTRY
             for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
         )
 
@@ -173,14 +173,14 @@ class Operators(ProblemData):
 
         It is stored because the estimated time of every solver depends on it.
         """
-        return float(assemble.bound(self.data)[0]) if self.rows is not None else 0.0
+        return float(assemble.bound_delassus_entries(self.data)[0]) if self.rows is not None else 0.0
 
     @property
     def max_entries(self) -> float:
         """Number of entries of A, or an upper bound if A is not formed."""
         if self.matrix is not None or "_compressed" in self.__dict__:
             return float(len(self._compressed[1]))
-        bound = self._n_couplings if self.rows is not None else self.metric.entries_of_a
+        bound = self._n_couplings if self.rows is not None else self.metric.entries_of_matrix
         return min(float(bound), float(self.m) ** 2)
 
     @once
@@ -192,21 +192,21 @@ class Operators(ProblemData):
         if self.generalized is not None:
             return self._form_generalized()
         if self.rows is not None:
-            bound, start, blocks = assemble.bound(self.data)
+            bound, start, blocks = assemble.bound_delassus_entries(self.data)
             bound = min(bound, self.m**2)  # Blocks that share both bodies count twice.
             if bound >= MAX_INDEXABLE_ENTRIES:
                 raise TooLarge(
                     f"A would have up to {bound} entries, more than 32-bit indices reach: "
                     "use a solver that reads rows"
                 )
-            indptr, indices, data = assemble.delassus(self.data, bound, start, blocks)
+            indptr, indices, data = assemble.form_delassus_matrix(self.data, bound, start, blocks)
             return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
         return dense_to_csr(self.matrix)
 
     def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
         # Rows of J without entries have a diagonal entry: their compliance.
-        bound = min(self.metric.entries_of_a + self.m, self.m**2)
+        bound = min(self.metric.entries_of_matrix + self.m, self.m**2)
         if bound >= MAX_INDEXABLE_ENTRIES:
             raise TooLarge(
                 f"A would have up to {bound:.3g} entries, more than 32-bit indices reach: use a solver that takes "
@@ -214,7 +214,7 @@ class Operators(ProblemData):
             )
         assert self.generalized is not None
         y = self.metric.whitened()  # without SciPy: a first solve with a time limit has no time to import it
-        indptr, indices, data = assemble.gram(*y, self.generalized.nv, self.compliance)
+        indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
     @once
@@ -285,7 +285,7 @@ class Operators(ProblemData):
     def slack(self, impulse: ArrayLike) -> FloatArray:
         """Compute w = A lambda - b (m,) [m/s] from the problem's data, for `impulse` (m,) [N s]."""
         w = np.empty(self.m)
-        measure.slack(self.metric, self.impulse_array(impulse), w)
+        measure.compute_slack(self.metric, self.impulse_array(impulse), w)
         return w
 
     def velocity(self, impulse: ArrayLike) -> FloatArray:
@@ -306,7 +306,7 @@ class Operators(ProblemData):
                 "Problem.from_rows or Problem.from_jacobian)"
             )
         v = np.zeros((self.rows.n_bodies, 6))
-        measure.velocity_change(self.data, self.impulse_array(impulse), v)
+        measure.write_velocity_change(self.data, self.impulse_array(impulse), v)
         return self.rows.v_free + v
 
     def start(self) -> FloatArray:
@@ -318,7 +318,7 @@ class Operators(ProblemData):
         """Pi(0) (m,) [N s], shared."""
         derived = self.derived
         if derived.start is None:
-            derived.start = zero_impulse(self.cones.lower, self.cones.upper)
+            derived.start = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
         return derived.start
 
 

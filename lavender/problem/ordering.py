@@ -25,9 +25,9 @@ from lavender_ext.core.order import (
     GIVEN,
     RANDOM,
     SYMMETRIC,
-    body_colors,
-    body_order_levels,
-    graph_colors,
+    compute_block_levels,
+    compute_body_colors,
+    compute_matrix_colors,
 )
 from lavender_ext.factor.graph import matrix_components
 
@@ -144,7 +144,7 @@ def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
             raise InputError(
                 "ground= is for problems given as a matrix; with rows the static bodies are known"
             )
-        return body_order_levels(problem.rows.block_bodies, problem.rows.n_bodies)
+        return compute_block_levels(problem.rows.block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
             "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
@@ -209,10 +209,10 @@ def compute_colors(problem: Problem) -> IntArray:
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
     if problem.rows is not None:
-        return body_colors(problem.rows.block_bodies, problem.rows.n_bodies)
+        return compute_body_colors(problem.rows.block_bodies, problem.rows.n_bodies)
     graph = _build_block_graph(problem)
     k = problem.n_blocks
-    return graph_colors(
+    return compute_matrix_colors(
         np.arange(k + 1, dtype=np.int32),
         np.arange(k, dtype=np.int32),
         graph.indptr.astype(np.int32),

@@ -54,9 +54,9 @@ from lavender.problem.generalized import (
     convert_to_compressed_rows,
     extract_lower_triangle,
 )
-from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked
-from lavender_ext.core.checks import norm_inf
-from lavender_ext.judge.measure import all_finite, program_residuals
+from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
+from lavender_ext.core.checks import max_abs_of_array
+from lavender_ext.judge.measure import all_finite, compute_program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
@@ -131,10 +131,10 @@ class QPSolution:
     def _residuals(self) -> tuple[float, ...]:
         """r_p, r_d, gap, the same three relative to their terms, and the largest relative one."""
         qp, multipliers, min_force = self.qp, self.qp.select_row_multipliers(self.impulse), 0.0
-        if norm_inf(qp.q) == 0.0:
+        if max_abs_of_array(qp.q) == 0.0:
             min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
         jac, order = qp.compressed_rows
-        result: tuple[float, ...] = program_residuals(
+        result: tuple[float, ...] = compute_program_residuals(
             self.x, qp.q, self._curvature, qp.multiply_jacobian_transposed(multipliers),
             qp.multiply_jacobian(self.x), qp.target, multipliers,
             qp.free, jac, self.x if order is None else self.x[order], qp.estimate_variable_sizes, min_force,
@@ -405,7 +405,8 @@ def convert_program(arrays: ProgramArrays) -> QuadraticProgram:
     general = _factor_definite(lower, jac, q)
     return QuadraticProgram(
         q=q, target=mark_read_only(target), free=free, generalized=general,
-        singular=None if general is not None else (mirrored(*lower), jac), n_equalities=n_a, n_inequalities=n_g,
+        singular=None if general is not None else (mirror_lower_triangle(*lower), jac),
+        n_equalities=n_a, n_inequalities=n_g,
         kept=finite_rows, fixed=fixed, lower=low, upper=up,
     )  # fmt: skip
 
@@ -433,8 +434,8 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
     _factor_definite(lower, rows, -b[:n])
     return QuadraticProgram(
         q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=None,
-        singular=(mirrored(*lower), rows), n_equalities=free, n_inequalities=len(b) - n - free, kept=None, fixed=None,
-        lower=None, upper=None,
+        singular=(mirror_lower_triangle(*lower), rows), n_equalities=free,
+        n_inequalities=len(b) - n - free, kept=None, fixed=None, lower=None, upper=None,
     )  # fmt: skip
 
 
@@ -497,7 +498,7 @@ class _RowStack:
         if len(self.groups) == 1:
             return self.groups[0], self.targets[0]
         groups = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.groups]
-        return stacked(self.n, groups), np.concatenate([np.zeros(0), *self.targets])
+        return stack_csr_matrices(self.n, groups), np.concatenate([np.zeros(0), *self.targets])
 
     def add_bounds(self, variables: IntpArray, bound: FloatArray, sign: float) -> None:
         """Add the rows sign x_i >= sign bound_i of these variables."""

@@ -138,7 +138,7 @@ class Rows:
         masses, normals = get_shape("inv_mass", self.inv_mass), get_shape("normal", self.normal)
         n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
-        if not checks.counts_up(ptr):
+        if not checks.is_increasing_from_zero(ptr):
             raise InputError(
                 "joint_ptr must start with 0 and increase: the first row of each joint, then the "
                 "number of joint rows"

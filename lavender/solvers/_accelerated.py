@@ -11,7 +11,14 @@ from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_sweep_cost
-from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
+from lavender.solvers.sweeping import (
+    Sweeping,
+    SweepState,
+    choose_sweep_data,
+    form_name,
+    is_sweep_over_jacobian_cheaper,
+    make_order_plan,
+)
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core.order import SYMMETRIC
 
@@ -36,7 +43,7 @@ class AcceleratedState(SweepState):
     def __init__(
         self, problem: Problem, data: Any, order: Order, exact: bool, memory: int, convex: int, keeps: bool
     ) -> None:
-        sweeps = accelerated.AcceleratedSweeps(data, *plan_of(order), exact, memory, convex, keeps)
+        sweeps = accelerated.AcceleratedSweeps(data, *make_order_plan(order), exact, memory, convex, keeps)
         super().__init__(problem, data, order, sweeps, ACCELERATED_PATIENCE)
         self.exact = exact
 
@@ -64,12 +71,12 @@ class Accelerated(Sweeping):
 
     def _estimate_formation_cost(self, problem: Problem) -> float:
         over_a = _max_entries(problem) is not None or not (
-            problem.rows is not None or reads_whitened(problem)
+            problem.rows is not None or is_sweep_over_jacobian_cheaper(problem)
         )
         return estimate_formation_cost(problem) if over_a else 0.0
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the costs; an iteration is a sweep over the data of `operator`."""
+        """Estimate the costs; an iteration is a sweep over the data of `choose_sweep_operator`."""
         setup = partial(self._estimate_setup_cost, problem)
         return Cost(setup, lambda: estimate_sweep_cost(problem, count_sweep_work(problem)))
 
@@ -82,10 +89,12 @@ class Accelerated(Sweeping):
         if not isinstance(self.convex, int) or self.convex < 0:
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
 
-    def _state(self, problem: Problem, order: Order, before: AcceleratedState | None) -> AcceleratedState:
-        return self._over(problem, order, operator(problem))
+    def _build_state(
+        self, problem: Problem, order: Order, before: AcceleratedState | None
+    ) -> AcceleratedState:
+        return self._build_state_over_data(problem, order, choose_sweep_operator(problem))
 
-    def _over(self, problem: Problem, order: Order, data: Any) -> AcceleratedState:
+    def _build_state_over_data(self, problem: Problem, order: Order, data: Any) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = self.convex if problem.law == "coulomb" else 0
         return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
@@ -98,25 +107,25 @@ class Accelerated(Sweeping):
         return replace(claim, work=work, form=f"{sweep} on {form_name(state.data)}")
 
 
-def state_as_given(solver: Accelerated, problem: Problem) -> AcceleratedState:
+def build_state_in_given_form(solver: Accelerated, problem: Problem) -> AcceleratedState:
     """Return the state of sweeps over the form in which the problem was given: A is not formed."""
-    return solver._over(problem, compute_block_order(problem, solver.order), problem.metric)
+    return solver._build_state_over_data(problem, compute_block_order(problem, solver.order), problem.metric)
 
 
-def operator(problem: Problem) -> Any:
+def choose_sweep_operator(problem: Problem) -> Any:
     """Return the data that sweeps run over: rows of A if contacts have one row and few neighbours, else `swept`.
 
     For contacts of one row, rows of A cost as much as body velocities, and mixing does not recompute velocities.
     """
-    return swept_data(problem) if _max_entries(problem) is None else problem.csr_data
+    return choose_sweep_data(problem) if _max_entries(problem) is None else problem.csr_data
 
 
 def count_sweep_work(problem: Problem) -> int:
-    """Estimate the multiply-adds of one sweep over the data of `operator` (`Data.work`), without forming A."""
+    """Estimate the multiply-adds of one sweep over the data of `choose_sweep_operator`, without forming A."""
     entries = _max_entries(problem)
-    if entries is None and problem.generalized is not None and not reads_whitened(problem):
-        entries = min(int(problem.metric.entries_of_a), problem.m**2)
-    return int(swept_data(problem).work) if entries is None else entries + 4 * problem.m
+    if entries is None and problem.generalized is not None and not is_sweep_over_jacobian_cheaper(problem):
+        entries = min(int(problem.metric.entries_of_matrix), problem.m**2)
+    return int(choose_sweep_data(problem).work) if entries is None else entries + 4 * problem.m
 
 
 def _max_entries(problem: Problem) -> int | None:

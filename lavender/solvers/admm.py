@@ -43,8 +43,8 @@ from lavender.solvers.factors import (
     PANELS_WORK_COST,
     PIVOT_TOLERANCE,
     USE_WIDE_LANES,
+    get_sorted_csr_arrays,
     mirror_pattern,
-    rows_of,
 )
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.sweeping import create_stopping_test, make_claim
@@ -85,13 +85,13 @@ class AdmmState:
             problem
         )  # Cost [ns] of the next step: scaling, analysis, or a factor.
         if self.next_cost <= MAX_SETUP_SCALING_COST:
-            self._scale()
+            self._scale_problem()
 
     def open(self) -> None:
         """Scale, analyse and factor; raise TooLate before a step that is expected to end after the deadline."""
         if not self.is_scaled:
             self._check_deadline()
-            self._scale()
+            self._scale_problem()
         if not self.is_analysed:
             self._check_deadline()
             self.next_cost = self._estimate_first_factor_cost()
@@ -103,7 +103,7 @@ class AdmmState:
         if self.deadline.passed(1e-9 * self.next_cost):
             raise TooLate
 
-    def _scale(self) -> None:
+    def _scale_problem(self) -> None:
         """Build the stopping test, the splitting and the scaled form of the problem."""
         problem = self.problem
         self.data = problem.data
@@ -128,7 +128,7 @@ class AdmmState:
         self.is_over_bodies = False
         if problem.m:
             self.matrix = mirror_pattern(self.matrix)
-            self.system = LinearSystem(rows_of(self.matrix)[:2], USE_WIDE_LANES)
+            self.system = LinearSystem(get_sorted_csr_arrays(self.matrix)[:2], USE_WIDE_LANES)
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _estimate_first_factor_cost(self) -> float:
@@ -143,7 +143,7 @@ class AdmmState:
             return float(setup + rates["form row"] * n + PANELS_WORK_COST * work)
         if not problem.m:
             return 0.0
-        work = (1.0 + self.lu) * _analyse(self.system).cost
+        work = (1.0 + self.lu) * _analyse_panels(self.system).cost
         return float(rates["form row"] * problem.m + PANELS_WORK_COST * work)
 
     @property
@@ -185,8 +185,8 @@ class AdmmState:
             e = 1.0 / (self.theta + rho)
             matrix, shift = mirror_pattern(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # The pattern is analysed each time, because entries may cancel for some values of rho.
-            system = LinearSystem(rows_of(matrix)[:2], USE_WIDE_LANES)
-            extra = (*rows_of(k), e)
+            system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
+            extra = (*get_sorted_csr_arrays(k), e)
         done = _factor_system(system, matrix, shift, self.lu)
         if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
             # L L^T needs a definite matrix, and a linear system may be indefinite.
@@ -218,7 +218,7 @@ def _estimate_scaling_cost(problem: Problem) -> float:
     entries, form = problem.max_entries, estimate_formation_cost(problem)
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # One product of dense matrices.
         product = rates["full layout entry"] * entries
-        product += rates["dense factor"] * float(problem.metric.products_of_a)
+        product += rates["dense factor"] * float(problem.metric.products_of_matrix)
         form = min(form, rates["set-up"] + product)
     return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + _SCALING_ENTRY_COST * entries)
 
@@ -229,7 +229,7 @@ def _estimate_setup_cost(problem: Problem) -> float:
     return (scaling if scaling <= MAX_SETUP_SCALING_COST else 0.0) + estimate_import_cost(*SCIPY_MODULES)
 
 
-def _analyse(system: LinearSystem) -> LinearSystem:
+def _analyse_panels(system: LinearSystem) -> LinearSystem:
     try:
         system.analyse()
     except OverflowError as error:
@@ -245,9 +245,9 @@ def _factor_system(system: LinearSystem, matrix: Any, shift: float, lu: bool) ->
     """
     n = matrix.shape[0]
     # L U overwrites a full matrix.
-    values = matrix.copy() if isinstance(matrix, np.ndarray) else rows_of(matrix)[2]
+    values = matrix.copy() if isinstance(matrix, np.ndarray) else get_sorted_csr_arrays(matrix)[2]
     largest = np.abs(values).max()
-    if not np.isfinite(largest) or _analyse(system).factor(values, None, shift, PIVOT_TOLERANCE, lu):
+    if not np.isfinite(largest) or _analyse_panels(system).factor(values, None, shift, PIVOT_TOLERANCE, lu):
         return False
     if not lu:
         return True

@@ -308,7 +308,7 @@ class Tree:
         if p.generalized is not None:
             # A of J and M is formed if no stage did, and factored; the cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
-            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_a))
+            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
         if setup <= cost:
             yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)

@@ -19,7 +19,14 @@ from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.costs import estimate_formation_cost
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
+from lavender.solvers.sweeping import (
+    Sweeping,
+    SweepState,
+    choose_sweep_data,
+    form_name,
+    is_sweep_over_jacobian_cheaper,
+    make_order_plan,
+)
 from lavender_ext.sweep import serial
 
 
@@ -29,12 +36,14 @@ class BlockGaussSeidel(Sweeping):
 
     def _estimate_formation_cost(self, problem: Problem) -> float:
         return (
-            estimate_formation_cost(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
+            estimate_formation_cost(problem)
+            if problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
+            else 0.0
         )
 
-    def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        data = swept_data(problem)
-        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), exact=True))
+    def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
+        data = choose_sweep_data(problem)
+        return SweepState(problem, data, order, serial.Sweeps(data, *make_order_plan(order), exact=True))
 
     def _complete_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))

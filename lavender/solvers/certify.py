@@ -39,7 +39,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
-from lavender_ext.judge.measure import by_island
+from lavender_ext.judge.measure import residuals_by_island
 
 # Linear programs are used up to this many rows of all islands together.
 CERTIFICATE_ROWS = 3000
@@ -224,7 +224,7 @@ def certify_by_linear_programs(log: SolveLog) -> None:
     if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize")):
         return
     total_rows = 0
-    for part, rows in _unsolved_islands(log):
+    for part, rows in _list_unsolved_islands(log):
         total_rows += part.m
         if total_rows > CERTIFICATE_ROWS or log.ends_late(MIN_LINEAR_PROGRAM_COST):
             return
@@ -241,7 +241,7 @@ def certify_by_linear_programs(log: SolveLog) -> None:
             return
 
 
-def _unsolved_islands(log: SolveLog) -> Any:
+def _list_unsolved_islands(log: SolveLog) -> Any:
     """Yield (problem, rows) of each unsolved island, the smallest first, or the whole problem if it is one island."""
     problem = log.problem
     count, label = find_islands(problem)
@@ -249,14 +249,14 @@ def _unsolved_islands(log: SolveLog) -> Any:
         yield problem, slice(None)
         return
     blocks = group_blocks_by_island(count, label)
-    for i in sorted(_unsolved_labels(log, label), key=lambda i: len(blocks[i])):
+    for i in sorted(_find_unsolved_labels(log, label), key=lambda i: len(blocks[i])):
         rows = get_rows_of_blocks(problem, blocks[i])
         yield restrict_to_blocks(problem, blocks[i], rows), rows
 
 
-def _unsolved_labels(log: SolveLog, label: IntArray) -> IntArray:
+def _find_unsolved_labels(log: SolveLog, label: IntArray) -> IntArray:
     """Return the islands with a relative residual above the tolerance."""
-    own, table = by_island(log.problem.metric, log.impulse)
+    own, table = residuals_by_island(log.problem.metric, log.impulse)
     if len(table) == 1:
         return np.unique(label) if table[0, 0] > log.tol else np.zeros(0, np.int32)
     return np.unique(label[(table[:, 0] > log.tol)[own]])

@@ -199,7 +199,7 @@ def estimate_formation_cost(problem: Problem, known: bool | None = None) -> floa
     if is_formed(problem) if known is None else known:
         return 0.0
     if problem.rows is None:
-        entries = RATES["form product"] * float(problem.metric.products_of_a)
+        entries = RATES["form product"] * float(problem.metric.products_of_matrix)
     else:
         entries = RATES["form entry"] * problem.max_entries
     return float(RATES["set-up"] + RATES["form row"] * problem.m + entries)

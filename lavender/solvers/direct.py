@@ -144,7 +144,7 @@ class Direct(Solver):
             return run.claim(Status.MAX_ITERATIONS)
         try:
             if state.general is not None:
-                claim = run.linear_general(state.general)
+                claim = run.solve_linear_with_lu(state.general)
             else:
                 assert state.pivot is not None
                 claim = run.pivoting(state.pivot)
@@ -266,7 +266,7 @@ class _Run:
         work, form = self.work | self.pivot_work, "LU" if state.pivot is None else state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
-    def verdict(self) -> Claim:
+    def make_final_claim(self) -> Claim:
         """Return the claim for the best iterate when no step remains."""
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
@@ -277,7 +277,7 @@ class _Run:
     # -- linear systems that are not symmetric definite -------------------------------------------
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
-    def linear_general(self, factor: GeneralFactor | PanelsLU) -> Claim:
+    def solve_linear_with_lu(self, factor: GeneralFactor | PanelsLU) -> Claim:
         """Solve and refine a linear system with an LU factor; search for a certificate if A is singular."""
         problem = self.problem
         self.iterations = 1
@@ -291,7 +291,7 @@ class _Run:
         w = np.empty(problem.m)
         previous = np.inf
         for k in range(8):
-            measure.slack(problem.csr_data, x, w)
+            measure.compute_slack(problem.csr_data, x, w)
             x = x - factor.solve(w)
             relative = self.judge(x)
             self.work["refinements"] = k
@@ -304,11 +304,11 @@ class _Run:
                 return self.general(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.is_good() and singular:
             # The residual of least squares in the metric of D is orthogonal to the range of A.
-            measure.slack(problem.csr_data, x, w)
+            measure.compute_slack(problem.csr_data, x, w)
             proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
             if proof is not None:
                 return proof
-        return self.verdict()
+        return self.make_final_claim()
 
     def general(self, why: str) -> Claim:
         """Solve a linear system again by LU that reveals the rank."""
@@ -317,7 +317,7 @@ class _Run:
         self.state = _factor_general(self.problem, why)
         self.notes = [self.state.note]
         assert isinstance(self.state.general, GeneralFactor)
-        claim = self.linear_general(self.state.general)
+        claim = self.solve_linear_with_lu(self.state.general)
         return replace(claim, work=sum_work((claim.work, before)))
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
@@ -331,7 +331,7 @@ class _Run:
         if self.state.is_running:
             self.reported = rows.work
         else:
-            late = pivot.too_late_to_sweep(self.deadline)
+            late = pivot.is_too_late_to_sweep(self.deadline)
             rows.begin(self.impulse, self.sufficient_residual, 0 if late else pivot.sweeps)
             self.state.is_running = True
         while True:
@@ -339,7 +339,7 @@ class _Run:
             code, self.late = pivot.advance(self.deadline, max_rounds)
             self.iterations = rows.n_rounds - before
             if code == SMALL_PIVOT and rows.passes == 0:
-                self.note_singular(pivot, self.patient or pivot.symmetric)
+                self.add_singularity_note(pivot, self.patient or pivot.symmetric)
             proof = self.certificate(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
             if proof is not None:
                 return proof
@@ -348,7 +348,7 @@ class _Run:
                 return self.end(pivot, code)
             if self.iterations >= self.max_iter or self.out_of_time:
                 self.offer(rows.best)
-                return self.out_of_budget()
+                return self.make_out_of_budget_claim()
 
     def must_give_up(self, code: int, is_shifted: bool) -> bool:
         """Return whether the solver stops because it is not patient and pivoting makes no progress."""
@@ -359,10 +359,12 @@ class _Run:
         if code == CYCLING:
             return self.end_in_cycle()
         if self.problem.law != "linear":
-            return self.indefinite(pivot.symmetric) if code == INDEFINITE else self.verdict()
+            return (
+                self.make_indefinite_claim(pivot.symmetric) if code == INDEFINITE else self.make_final_claim()
+            )
         met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
         if code == SOLVED or (code == PASSES_USED and pivot.symmetric and met):
-            return self.verdict()
+            return self.make_final_claim()
         return self.general("A is indefinite" if pivot.symmetric else "A is not symmetric")
 
     def end_in_cycle(self) -> Claim:
@@ -370,21 +372,21 @@ class _Run:
         self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
         if not self.best <= 1.0:
             self.judge(self.problem.start())
-        return self.verdict()
+        return self.make_final_claim()
 
-    def out_of_budget(self) -> Claim:
+    def make_out_of_budget_claim(self) -> Claim:
         """Return the claim after the last iteration or the deadline."""
         if not self.best <= 1.0:
             self.judge(self.problem.start())
         return self.claim(Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS)
 
-    def indefinite(self, symmetric: bool = True) -> Claim:
+    def make_indefinite_claim(self, symmetric: bool = True) -> Claim:
         """Return the claim for bounded rows with an A that cannot be factored."""
         why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"
         self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
         return self.claim(Status.NUMERICAL_ERROR)
 
-    def note_singular(self, pivot: PivotState, shifted: bool) -> None:
+    def add_singularity_note(self, pivot: PivotState, shifted: bool) -> None:
         """Add a note that A is singular, with its rank for linear systems."""
         if self.problem.law == "linear":
             rank = pivot.rank()

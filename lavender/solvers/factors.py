@@ -50,11 +50,11 @@ def choose_factorisation(problem: Problem) -> tuple[str, int, IntArray | None]:
     """Return factorisation, half bandwidth and elimination order (None: as given) of a symmetric A by its structure."""
     choice: tuple[str, int, IntArray | None] | None = problem.derived.cache.get(__name__)
     if choice is None:
-        choice = problem.derived.cache[__name__] = _choose(problem)
+        choice = problem.derived.cache[__name__] = _compute_factorisation_choice(problem)
     return choice
 
 
-def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
+def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray | None]:
     """Compute the choice of `choose_factorisation`."""
     m = problem.m
     band = max(problem.bandwidth)
@@ -64,8 +64,8 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
         # Only one factor is needed: the cheapest one is chosen.
         narrow = BAND_WORK_COST * m * float(band + 1) ** 2
-        full = DENSE_CALL_COST + dense_cost(m)
-        if panels_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
+        full = DENSE_CALL_COST + estimate_dense_factor_cost(m)
+        if estimate_panel_factor_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
     if band <= MAX_COMPILED_BAND:
@@ -74,24 +74,24 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
         return "dense", m - 1, None
     # A row of a narrow band has at most 2 band + 1 nonzeros.
     if np.diff(problem._compressed[0]).max() <= 2 * MAX_COMPILED_BAND + 1:
-        order = narrow_order(problem)
-        band = permuted_band(problem, order)
+        order = find_small_bandwidth_order(problem)
+        band = half_bandwidth_in_order(problem, order)
         if band <= MAX_COMPILED_BAND:
             return "band", band, order
     return "sparse", m - 1, None
 
 
-def dense_cost(m: int) -> float:
+def estimate_dense_factor_cost(m: int) -> float:
     """Return the cost of one full Cholesky factor of m rows [ns], without the call."""
     return DENSE_WORK_COST * count_dense_work(m) + DENSE_ENTRY_COST * float(m) ** 2
 
 
-def panels_cost(nnz: int, m: int) -> float:
+def estimate_panel_factor_cost(nnz: int, m: int) -> float:
     """Return the cost of one factor by panels [ns] of a symmetric matrix of m rows and nnz entries."""
     return PANELS_CALL_COST + PANELS_ENTRY_COST * nnz * (1.0 + m / PANELS_GROWTH_ROWS)
 
 
-def narrow_order(problem: Problem) -> IntArray:
+def find_small_bandwidth_order(problem: Problem) -> IntArray:
     """Return an order of the rows of A with small bandwidth: reverse Cuthill-McKee."""
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -99,7 +99,7 @@ def narrow_order(problem: Problem) -> IntArray:
     return np.ascontiguousarray(order, np.int32)
 
 
-def permuted_band(problem: Problem, order: IntArray) -> int:
+def half_bandwidth_in_order(problem: Problem, order: IntArray) -> int:
     """Return the half bandwidth of A with its rows in that order."""
     position = np.empty(problem.m, np.int64)
     position[order] = np.arange(problem.m)
@@ -146,7 +146,7 @@ class SparseFactor:
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
-        self.pattern = rows_of(mirror_pattern(problem.csr))
+        self.pattern = get_sorted_csr_arrays(mirror_pattern(problem.csr))
         self.all_rows = LinearSystem(self.pattern[:2], USE_WIDE_LANES)
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
@@ -163,14 +163,14 @@ class SparseFactor:
 
 def mirror_pattern(matrix: sp.csr_array) -> sp.csr_array:
     """Return the matrix with sorted rows and a symmetric pattern: entries of 0 are added if necessary."""
-    if is_mirrored(*rows_of(matrix)[:2]):
+    if is_mirrored(*get_sorted_csr_arrays(matrix)[:2]):
         return matrix
     a = sp.coo_array(matrix)
     positions = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
     return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), positions), shape=a.shape)
 
 
-def rows_of(matrix: Any) -> tuple[Any, Any, Any]:
+def get_sorted_csr_arrays(matrix: Any) -> tuple[Any, Any, Any]:
     """Return (ptr, index, value) of the sorted rows in the types of the kernels."""
     matrix.sort_indices()
     value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
@@ -178,13 +178,13 @@ def rows_of(matrix: Any) -> tuple[Any, Any, Any]:
     return np.ascontiguousarray(matrix.indptr, np.int32), index, value
 
 
-def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
+def _scale_to_unit_diagonal(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
     """Return D^-1/2 (m,) and D^-1/2 A D^-1/2."""
     scale = 1.0 / np.sqrt(problem.csr_data.d)
     return scale, sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
 
 
-def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
+def _factor_with_superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
     """Return LU with pivoting and the magnitudes of its pivots; (None, [0]) if the matrix is exactly singular."""
     try:
         lu = factor_sparse_lu(a)
@@ -198,7 +198,7 @@ class LUFactor:
 
     def __init__(self, problem: Problem) -> None:
         m = problem.m
-        self.scale, scaled = _scaled(problem)
+        self.scale, scaled = _scale_to_unit_diagonal(problem)
         self.sparse = problem.csr.nnz < MIN_DENSE_FRACTION * m * m or m > MAX_DENSE_ROWS
         self.a: Any = scaled if self.sparse else scaled.toarray()
         if self.sparse:
@@ -221,7 +221,7 @@ class LUFactor:
         a = sp.csc_array(self.a[self.free][:, self.free])
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
-        self.lu, pivot = _superlu(a)
+        self.lu, pivot = _factor_with_superlu(a)
         return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > PIVOT_TOLERANCE)))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -267,7 +267,7 @@ class GeneralFactor:
 
     def __init__(self, problem: Problem) -> None:
         self.rank = m = problem.m
-        self.scale, scaled = _scaled(problem)
+        self.scale, scaled = _scale_to_unit_diagonal(problem)
         self.lu: Any = None
         self.dense: FloatArray | None = None
         if problem.csr.nnz >= MIN_DENSE_FRACTION * m * m or m <= MAX_COMPILED_FACTOR_ROWS:
@@ -285,7 +285,7 @@ class GeneralFactor:
             self.lu = (lu, pivot)
 
     def _factor_sparse(self, a: sp.csc_array) -> None:
-        self.lu, pivot = _superlu(a)
+        self.lu, pivot = _factor_with_superlu(a)
         if pivot.min(initial=np.inf) > PIVOT_TOLERANCE * max(1.0, pivot.max(initial=0.0)):
             return
         self.lu = None

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender_ext.core.checks import MIN_MAGNITUDE, norm_inf
+from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
 from lavender_ext.factor import graph
 
 
@@ -57,7 +57,9 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     cones = problem.cones._select_blocks(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
-    b: FloatArray = problem.b[rows] if norm_inf(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))
+    b: FloatArray = (
+        problem.b[rows] if max_abs_of_array(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))
+    )
     if problem.generalized is not None:
         assert problem.compliance is not None
         trees = problem.generalized.trees

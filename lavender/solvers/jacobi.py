@@ -18,7 +18,7 @@ from lavender.problem import Problem
 from lavender.problem.ordering import compute_block_order
 from lavender.solvers.costs import Cost, estimate_row_sums_cost
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import SweepSolver, SweepState, plan_of
+from lavender.solvers.sweeping import SweepSolver, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
 
@@ -44,8 +44,10 @@ class Jacobi(SweepSolver):
 
     def prepare(self, problem: Problem) -> SweepState:
         data, order = problem.csr_data, compute_block_order(problem)
-        omega = serial.damping(data) if self.omega is None else self.omega
-        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), serial.JACOBI, omega))
+        omega = serial.jacobi_damping_of_matrix(data) if self.omega is None else self.omega
+        return SweepState(
+            problem, data, order, serial.Sweeps(data, *make_order_plan(order), serial.JACOBI, omega)
+        )
 
 
 SPEC = SolverSpec(

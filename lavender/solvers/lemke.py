@@ -44,7 +44,7 @@ PIVOT_ENTRY_TIME = 1e-9  # Time [s] per entry of the dictionary in a pivot.
 DICTIONARY_ENTRY_TIME, ELIMINATION_ENTRY_TIME = 5e-8, 5e-10
 
 
-def _sizes(problem: Problem) -> tuple[int, int]:
+def _count_dictionary_rows(problem: Problem) -> tuple[int, int]:
     """Return the number of rows of the dictionary and the number of free rows."""
     c = problem.cones
     low, high = np.isfinite(c.lower), np.isfinite(c.upper)
@@ -78,7 +78,7 @@ class Lemke(Solver):
         if max_iter == 0 or state.problem.m == 0:
             return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})
         deadline = Deadline(time_limit)
-        n, free = _sizes(state.problem)
+        n, free = _count_dictionary_rows(state.problem)
         if deadline.passed(DICTIONARY_ENTRY_TIME * n**2 + ELIMINATION_ENTRY_TIME * free * n**2):
             return Claim(
                 Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
@@ -87,7 +87,7 @@ class Lemke(Solver):
         paths = lemke.Lemke(state.rows)
         paths.begin(impulse)
         try:
-            claim = self._follow(
+            claim = self._follow_paths(
                 state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (PIVOT_ENTRY_TIME * n * n)))
             )
         finally:
@@ -97,7 +97,7 @@ class Lemke(Solver):
                 impulse[:] = best.impulse
         return replace(claim, judged=best)
 
-    def _follow(
+    def _follow_paths(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
         """Do at most `max_iter` pivots, `chunk` of them between two checks of the clock, and return the claim."""
@@ -107,7 +107,7 @@ class Lemke(Solver):
             code = paths.run(min(chunk, max_iter - paths.pivots))
             if code == RAY:
                 message = RAY_MESSAGE
-                certificate = _direction(paths.ray)
+                certificate = _normalise_ray(paths.ray)
             if (
                 certificate is not None
                 and check_certificate(state.problem, certificate, tol, deadline) is None
@@ -124,7 +124,7 @@ class Lemke(Solver):
             else:
                 continue
             if status is Status.STALLED:
-                proof = _certificate(state.problem, tol, deadline)
+                proof = _find_certificate_by_linear_program(state.problem, tol, deadline)
                 if proof is not None:
                     status, certificate, message = (
                         Status.INFEASIBLE,
@@ -135,7 +135,9 @@ class Lemke(Solver):
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)
 
 
-def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray | None:
+def _find_certificate_by_linear_program(
+    problem: Problem, tol: float, deadline: Deadline
+) -> FloatArray | None:
     """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
     if problem.m > CERTIFICATE_ROWS or deadline.passed(
         1e-9 * (MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize"))
@@ -145,13 +147,13 @@ def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray
     return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
 
 
-def _direction(y: FloatArray) -> FloatArray | None:
+def _normalise_ray(y: FloatArray) -> FloatArray | None:
     """Return the direction y (m,) of a ray with its largest entry 1, or None if it is zero or not finite."""
     size = np.abs(y).max(initial=0.0)
     return y / size if 0.0 < size < np.inf else None
 
 
-def _refusal(problem: Problem) -> str | None:
+def _get_refusal_reason(problem: Problem) -> str | None:
     """Return a reason not to accept the problem if its dictionary is too large, else None."""
     rows = count_rows(problem)
     if rows > MAX_LEMKE_ROWS:
@@ -173,7 +175,7 @@ SPEC = SolverSpec(
     resumable=False,
     impulse=False,
     max_iter=20_000,
-    refusal=_refusal,
+    refusal=_get_refusal_reason,
     summary="Lemke's complementary pivoting, dense, any A",
     reference="Lemke 1965; Cottle, Pang, Stone 1992, section 4.4, and 4.9 for degeneracy",
 )

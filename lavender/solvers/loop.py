@@ -36,7 +36,7 @@ from lavender.judge.solution import (
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import Solver, State
-from lavender_ext.judge.measure import same_bits
+from lavender_ext.judge.measure import are_bit_identical
 from lavender_ext.judge.stopping_test import StoppingTest
 
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
@@ -146,14 +146,14 @@ class Loop:
         records = self.records is not None or self.callback is not None
         claim = EMPTY_CLAIM
         if self.deadline.is_set:
-            chunk = max(1, min(chunk, int(self._chunk_time() / self.pace)))
+            chunk = max(1, min(chunk, int(self._choose_chunk_time() / self.pace)))
         try:
             if self.deadline.is_set:
                 watch = Stopwatch()
                 self.solver.set_deadline(self.state, self.deadline)
                 self.time += watch.seconds
-            if records and self._record():
-                return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
+            if records and self._record_residual():
+                return self._add_to_total_work(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
             while self.done < max_iter:
                 n = min(chunk, max_iter - self.done)
                 if records:
@@ -164,7 +164,7 @@ class Loop:
                 self.time += elapsed
                 self.done += claim.iterations
                 self.work = sum_work((self.work, claim.work))
-                stopped = records and self.done == self.next_record and self._record()
+                stopped = records and self.done == self.next_record and self._record_residual()
                 if claim.status is not MAX_ITERATIONS:
                     break
                 if claim.iterations < 1:
@@ -178,15 +178,15 @@ class Loop:
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
-                    chunk = self._next_chunk(n, elapsed)
+                    chunk = self._choose_chunk_size(n, elapsed)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        return self._total(claim)
+        return self._add_to_total_work(claim)
 
-    def _next_chunk(self, n: int, elapsed: float) -> int:
-        return max(1, min(8 * n, int(n * self._chunk_time() / max(elapsed, 1e-7))))
+    def _choose_chunk_size(self, n: int, elapsed: float) -> int:
+        return max(1, min(8 * n, int(n * self._choose_chunk_time() / max(elapsed, 1e-7))))
 
-    def _chunk_time(self) -> float:
+    def _choose_chunk_time(self) -> float:
         """Return the intended time of the next chunk [s]."""
         left = self.deadline.remaining()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
@@ -199,7 +199,7 @@ class Loop:
         problem = self.problem
         result = judge_once(problem, self.impulse, self.judged)
         if result.relative > self.tol:
-            result = best_of(problem, result, start, self.tol, or_zero)
+            result = select_best_impulse(problem, result, start, self.tol, or_zero)
         self.judged = result
         self.impulse[:] = result.impulse
 
@@ -220,7 +220,7 @@ class Loop:
         if self.judged.relative > self.tol:
             self.impulse[:] = combine_best_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
-    def _record(self) -> bool:
+    def _record_residual(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
         watch = Stopwatch()
         r = residual(self.problem, self.impulse, "float64")
@@ -230,7 +230,7 @@ class Loop:
         self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then steps of an eighth.
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
-    def _total(self, claim: Claim) -> Claim:
+    def _add_to_total_work(self, claim: Claim) -> Claim:
         if claim.iterations == self.done and claim.work == self.work:
             return claim  # There was only one chunk.
         return replace(claim, iterations=self.done, work=self.work)
@@ -245,7 +245,7 @@ class Loop:
         ):  # The result of `auto` is the best impulse of all stages.
             self.records.pop()
         if not self.records or self.records[-1][0] != self.done:
-            self._record()
+            self._record_residual()
         if solvers:
             solvers = [*solvers, solvers[-1]][: len(self.records)]
         done, time, relative, energy, velocity = (np.array(c) for c in zip(*self.records, strict=True))
@@ -255,7 +255,9 @@ class Loop:
         )  # fmt: skip
 
 
-def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:
+def select_best_impulse(
+    problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True
+) -> Any:
     """Return the judge's pass over the best of `result`, the start (m,) and the zero impulse in each island.
 
     A result within the round-off floor of tol is returned unchanged. An impulse outside its bounds is projected first.
@@ -268,4 +270,4 @@ def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float,
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
     best = combine_best_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
-    return result if same_bits(best, result.impulse) else judge_impulse(problem, best)
+    return result if are_bit_identical(best, result.impulse) else judge_impulse(problem, best)

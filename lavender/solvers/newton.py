@@ -168,17 +168,17 @@ class Newton(Solver):
             return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem.law)
         if self.form != "impulse":
             return estimate_velocity_cost(problem, 0.0)
-        entries = min(float(problem.metric.entries_of_a), m * m)
+        entries = min(float(problem.metric.entries_of_matrix), m * m)
         work = 0.0 if entries < 0.5 * m * m else count_dense_work(problem.m)
         count = Count("dense", work, entries, m, estimate_formation_cost(problem, False))
         return estimate_newton_cost(count, problem.law)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """Build the linear system of a problem, or the driver over its velocities."""
-        return self._prepare(problem, None)
+        return self._prepare_form(problem, None)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
-    def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
+    def _prepare_form(self, problem: Problem, like: System | None) -> NewtonState:
         """Choose the form and build the state; `like` is a system whose layout may be reused.
 
         Raises
@@ -199,7 +199,9 @@ class Newton(Solver):
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            max_cost = VELOCITY_MAX_COST_RATIO * _full_row_form_cost(problem) if self.form == "auto" else inf
+            max_cost = (
+                VELOCITY_MAX_COST_RATIO * _estimate_full_matrix_cost(problem) if self.form == "auto" else inf
+            )
             fixed = estimate_velocity_cost(problem, 0.0)
             kernel = general.prepare(
                 problem, (max_cost - fixed) / (estimate_velocity_cost(problem, 1.0) - fixed)
@@ -225,7 +227,7 @@ class Newton(Solver):
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
         """Build the state for new numbers; the elimination order is reused between the same bodies."""
-        return self._prepare(problem, state.system)
+        return self._prepare_form(problem, state.system)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
@@ -341,7 +343,7 @@ class Newton(Solver):
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
 
 
-def _full_row_form_cost(problem: Problem) -> float:
+def _estimate_full_matrix_cost(problem: Problem) -> float:
     """Return the estimated cost [ns] of Newton's method over a full A of J and M; inf if that is not possible."""
     m = float(problem.m)
     if m > MAX_FORMED_ROWS or problem.cones.has_round:
@@ -428,7 +430,7 @@ def _run_stages(
     return _ENDS[end], certificate
 
 
-def _refusal(problem: Problem) -> str | None:
+def _get_refusal_reason(problem: Problem) -> str | None:
     """Return a reason not to accept round cones without J and M, else None."""
     if problem.cones.has_round and problem.generalized is None:
         return "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
@@ -443,7 +445,7 @@ SPEC = SolverSpec(
     operators=frozenset(OPERATORS),
     round_cones=True,
     supports_rolling=True,
-    refusal=_refusal,
+    refusal=_get_refusal_reason,
     small=NEWTON,
     resumable=False,
     max_iter=2500,

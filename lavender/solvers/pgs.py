@@ -25,8 +25,8 @@ from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
     form_name,
-    plan_of,
-    reads_whitened,
+    is_sweep_over_jacobian_cheaper,
+    make_order_plan,
 )
 from lavender_ext.sweep import serial
 
@@ -41,12 +41,12 @@ class PGS(Sweeping):
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
     def _estimate_formation_cost(self, problem: Problem) -> float:
-        return 0.0 if reads_whitened(problem) else estimate_formation_cost(problem)
+        return 0.0 if is_sweep_over_jacobian_cheaper(problem) else estimate_formation_cost(problem)
 
-    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
-        if reads_whitened(problem):
+    def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+        if is_sweep_over_jacobian_cheaper(problem):
             return SweepState(problem, problem.metric, order)
-        data, (blocks, *rest) = problem.csr_data, plan_of(order)
+        data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
         # The bits are the same with and without an order; without one, the kernel skips two lookups per row.
         row_by_row = data.single_rows and order.is_given
         return SweepState(problem, data, order, serial.Sweeps(data, _NONE if row_by_row else blocks, *rest))

@@ -24,9 +24,9 @@ from lavender.solvers.factors import (
     LUFactor,
     SparseFactor,
     choose_factorisation,
-    dense_cost,
-    narrow_order,
-    permuted_band,
+    estimate_dense_factor_cost,
+    find_small_bandwidth_order,
+    half_bandwidth_in_order,
 )
 from lavender_ext.pivot.direct import Pivoting
 
@@ -75,7 +75,7 @@ class PivotState:
             import_numerics()  # Factors and certificates need it.
         factor: Factor | None = None
         if self.symmetric:
-            same = like is not None and like.symmetric and _same_pattern(like.problem, problem)
+            same = like is not None and like.symmetric and _have_same_pattern(like.problem, problem)
             self.chosen = like.chosen if like is not None and same else choose_factorisation(problem)
             self.form, band, order = self.chosen
             if self.form != "band":
@@ -115,14 +115,14 @@ class PivotState:
         if self.outside is None:
             return MIN_GUESS_SWEEPS
         m, data = self.problem.m, self.problem.csr_data
-        factor = dense_cost(m)
+        factor = estimate_dense_factor_cost(m)
         if self.is_sparse:
             factor = min(factor, estimate_sparse_work(self.problem.csr.nnz, m))
         return int(
             min(max(MIN_GUESS_SWEEPS, GUESS_COST_FRACTION * factor / (2.0 * data.work)), MAX_GUESS_SWEEPS)
         )
 
-    def too_late_to_sweep(self, deadline: Deadline) -> bool:
+    def is_too_late_to_sweep(self, deadline: Deadline) -> bool:
         """Return whether the sweeps before the first factor would end after the deadline."""
         return deadline.passed(self.sweeps * SWEEP_ENTRY_TIME * self.problem.csr_data.work)
 
@@ -159,12 +159,12 @@ class PivotState:
 
 def _estimate_filled_factor_cost(problem: Problem) -> float:
     """Estimate the cost [ns] of a banded LU in an order of small bandwidth, which includes the fill."""
-    width = float(permuted_band(problem, narrow_order(problem)) + 1)
+    width = float(half_bandwidth_in_order(problem, find_small_bandwidth_order(problem)) + 1)
     work = problem.m * min(width * width, count_dense_work(problem.m) / problem.m)
     return float(RATES["dense factor"] * work)
 
 
-def _same_pattern(p: Problem, q: Problem) -> bool:
+def _have_same_pattern(p: Problem, q: Problem) -> bool:
     """Return whether A has the same sparsity pattern in both problems."""
     a, b = p.csr, q.csr
     return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)

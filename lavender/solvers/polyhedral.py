@@ -57,7 +57,7 @@ class AsRows:
         """Return a z (n,) of a feasible impulse (m,), or of its projection."""
         c, out = self.problem.cones, []
         x, contact = project_impulse(c, impulse), c.is_contact
-        for i, sides in _blocks(self.problem):
+        for i, sides in _list_rows_bounded_by_normals(self.problem):
             j = c.ptr[i]
             if not sides:
                 out += list(x[j : j + 1] if contact[i] else x[j : c.ptr[i + 1]])
@@ -74,7 +74,7 @@ class AsRows:
         return np.clip(np.array(out, float), self.rows.cones.lower, self.rows.cones.upper)
 
 
-def _blocks(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
+def _list_rows_bounded_by_normals(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
     """Return (block, [(row offset, c_i)]) with the rows of each block that its normal impulse bounds and c_i > 0."""
     c = problem.cones
     friction_bound = c.friction_coefficient
@@ -97,7 +97,7 @@ def as_rows(problem: Problem) -> AsRows:
     couplings: list[tuple[int, int, float]] = []  # Couplings of s.
     low: list[float] = []
     high: list[float] = []
-    for i, sides in _blocks(problem):
+    for i, sides in _list_rows_bounded_by_normals(problem):
         j, n = int(c.ptr[i]), len(low)
         if not contact[i]:
             size = int(c.ptr[i + 1]) - j
@@ -120,9 +120,9 @@ def as_rows(problem: Problem) -> AsRows:
         low += [0.0] * count
         high += [np.inf] * count
     n = len(low)
-    e = _sparse(entries, (problem.m, n))
+    e = _make_sparse_matrix(entries, (problem.m, n))
     with np.errstate(all="ignore"):
-        a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(couplings, (n, n))
+        a = sp.csr_array(e.T @ (problem.csr @ e)) + _make_sparse_matrix(couplings, (n, n))
         b = e.T @ problem.b
     try:
         rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
@@ -141,12 +141,12 @@ def count_rows(problem: Problem) -> int:
     return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.is_contact].sum()) if problem.law == "coulomb" else 0)
 
 
-def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:
+def _make_sparse_matrix(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:
     i, j, x = (list(part) for part in zip(*entries, strict=True)) if entries else ([], [], [])
     return sp.csr_array((np.array(x, float), (np.array(i, int), np.array(j, int))), shape=shape)
 
 
-def _normalise(y: FloatArray) -> FloatArray:
+def _normalise_direction(y: FloatArray) -> FloatArray:
     """Return a direction with its largest entry scaled to 1 and rounding noise below 1e-13 set to 0."""
     size = np.abs(y).max(initial=0.0)
     y = y / size if size > 0.0 else y
@@ -257,7 +257,7 @@ class ThroughRows(Solver):
         elif above <= tol:
             status = Status.ROUNDOFF_LIMIT
         elif status is Status.INFEASIBLE and claim.certificate is not None:
-            proof = _normalise(form.to_impulse @ claim.certificate)
+            proof = _normalise_direction(form.to_impulse @ claim.certificate)
             if check_certificate(form.problem, proof, tol) is not None:
                 status, proof = Status.STALLED, None
                 message += ": of the friction as rows, which proves nothing of the problem itself"

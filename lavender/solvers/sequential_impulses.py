@@ -20,7 +20,7 @@ from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.layout import Layout, copy_in_order, is_copy_faster
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import Sweeping, SweepState, plan_of
+from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
 
@@ -40,7 +40,7 @@ class ImpulseState(SweepState):
         if self.layout is not None:
             data = self.layout.data
             swept = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        sweeps = serial.Sweeps(data, *plan_of(swept), before=sweeps)
+        sweeps = serial.Sweeps(data, *make_order_plan(swept), before=sweeps)
         super().__init__(problem, data, swept, sweeps)
         self.plan = order
 
@@ -68,10 +68,10 @@ class ImpulseState(SweepState):
 class SequentialImpulses(Sweeping):
     """Matrix-free projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _forming(self, problem: Problem) -> float:
+    def _get_formation_time(self, problem: Problem) -> float:
         return 0.0
 
-    def _state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
+    def _build_state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
         return ImpulseState(problem, order, earlier)
 
     def run(

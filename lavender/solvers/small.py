@@ -33,7 +33,7 @@ from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS, get
-from lavender_ext.batch.many import Limits, solve_first
+from lavender_ext.batch.many import Limits, solve_new_generalized_problem
 from lavender_ext.small.call import Islands, Rules, Small
 
 # Key of `Derived.cache`: a `Small` or `Islands`; False if the problem has no compiled call.
@@ -117,7 +117,7 @@ def prepare_call(problem: Problem) -> Any:
 
 def _make_call(problem: Problem) -> Small | None:
     """Build the compiled call; None for round cones, rolling or torsional friction, large islands and empty rows."""
-    cones, count, label, bounded = problem.cones, 1, None, uses_pivots(problem)
+    cones, count, label, bounded = problem.cones, 1, None, call_uses_pivots(problem)
     if cones.has_round or cones.has_more_components:
         return None
     if problem.m > SMALL_ROWS:
@@ -137,7 +137,7 @@ def _make_call(problem: Problem) -> Small | None:
     return Islands(data, data if bodies else problem.csr_data, label, count)
 
 
-def uses_pivots(problem: Problem) -> bool:
+def call_uses_pivots(problem: Problem) -> bool:
     """Return whether the compiled call over A or bodies uses pivots: all rows are bounded or free."""
     return problem.law in ("linear", "lcp")
 
@@ -153,7 +153,7 @@ def describe_call(problem: Problem) -> str:
     small = prepare_call(problem)
     if small is None:
         return ""
-    if uses_pivots(problem):
+    if call_uses_pivots(problem):
         return "direct (block pivots), then lemke if these do not end"
     count = find_islands(problem)[0] if problem.m > SMALL_ROWS else 1
     return "sweeps (anderson), then newton" + (f", on each of {count} islands" if count > 1 else "")
@@ -221,12 +221,14 @@ class SmallCall:
         if problem.generalized is not None:
             if self.limits is None:
                 return None, ()
-            result: tuple[Any, Any] = solve_first(problem.derived.view, impulse, tol, self.limits, max_cost)
+            result: tuple[Any, Any] = solve_new_generalized_problem(
+                problem.derived.view, impulse, tol, self.limits, max_cost
+            )
             return result
         small = problem.derived.cache.get(COMPILED_CALL_KEY)
         if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
             small = prepare_call(problem)
-        if not small or not (self.pivots if uses_pivots(problem) else self.hands_over):
+        if not small or not (self.pivots if call_uses_pivots(problem) else self.hands_over):
             return None, ()
         result = small.run(impulse, tol, self.rules, max_cost)
         return result
@@ -237,7 +239,7 @@ class SmallCall:
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]
-        done = (_pivot_counts if uses_pivots(problem) else _stage_counts)(counts)
+        done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(counts)
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def claim(
@@ -260,7 +262,7 @@ class SmallCall:
             if not any(claim.work.values()):
                 return Claim(status, done, {}, no_work)
         else:
-            done, ran = (_pivot_counts if uses_pivots(problem) else _stage_counts)(counts)
+            done, ran = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(counts)
         if self.name == "direct":
             rank, shifts = ran[0][1].get("rank"), ran[0][1].get("shifts")
             symmetric = problem.is_symmetric
@@ -283,7 +285,7 @@ class SmallCall:
 SolverWork = list[tuple[str, dict[str, int]]]  # (name of the solver, {kind of work: count}) of each stage.
 
 
-def _pivot_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
+def _split_pivoting_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
     """Return the iterations and the work of each solver from the counts of a call with pivots."""
     done, swept, refined, factored, exchanged, shifts, rank, path = counts
     work = {
@@ -294,7 +296,7 @@ def _pivot_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
     return done, [direct, ("lemke", {"pivots": path})] if path else [direct]
 
 
-def _stage_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
+def _split_stage_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
     """Return the iterations and the work of each solver from the counts of a call with sweeps and Newton's method."""
     done, sweeps, restarts, factorisations, driven, count, *_ = counts
     suffix = f" on {count} islands" if count > 1 else ""

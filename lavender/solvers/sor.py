@@ -13,7 +13,7 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import Sweeping, SweepState, plan_of
+from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
 
@@ -33,9 +33,11 @@ class SOR(Sweeping):
         if not 0.0 < check_float("omega", self.omega) < 2.0:
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
-    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+    def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         data = problem.csr_data
-        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), serial.SOR, self.omega))
+        return SweepState(
+            problem, data, order, serial.Sweeps(data, *make_order_plan(order), serial.SOR, self.omega)
+        )
 
 
 SPEC = SolverSpec(

@@ -13,7 +13,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers._accelerated import state_as_given
+from lavender.solvers._accelerated import build_state_in_given_form
 from lavender.solvers.costs import Cost, estimate_formation_cost
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
@@ -202,7 +202,7 @@ class Sweeps(Iterations):
         too_late = self.log.deadline.is_set and self.log.deadline.passed(
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
-        self.state = state_as_given(self.solver, p) if too_late else self.solver.prepare(p)
+        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
         self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 
     def iterate(self, loop: Loop, n: int) -> Claim:

@@ -49,7 +49,7 @@ class SweepState:
         data.share_reference(problem.metric)  # Residuals in every form are relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)
         # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
-        self.sweeps = serial.Sweeps(data, *plan_of(order)) if sweeps is None else sweeps
+        self.sweeps = serial.Sweeps(data, *make_order_plan(order)) if sweeps is None else sweeps
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -67,22 +67,22 @@ def make_claim(status: int, done: int) -> Claim:
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
-def plan_of(order: Order) -> tuple[Any, ...]:
+def make_order_plan(order: Order) -> tuple[Any, ...]:
     """Return (blocks, split, mode, rng) of an order, as the kernels expect them."""
     return order.blocks, order.split, order.mode, order.rng
 
 
-def reads_whitened(problem: Problem) -> bool:
+def is_sweep_over_jacobian_cheaper(problem: Problem) -> bool:
     """Return whether a sweep over J and M (twice the entries of Y) costs less than one over A, without forming A."""
     if problem.generalized is None:
         return False
     data = problem.metric
-    return bool(data.work - 4 * problem.m < data.entries_of_a)  # `work` counts Y twice.
+    return bool(data.work - 4 * problem.m < data.entries_of_matrix)  # `work` counts Y twice.
 
 
-def swept_data(problem: Problem) -> Any:
+def choose_sweep_data(problem: Problem) -> Any:
     """Return the data that sweeps use: rows or a matrix as given; for J and M, the cheaper of J and M and A."""
-    return problem.metric if reads_whitened(problem) else problem.data
+    return problem.metric if is_sweep_over_jacobian_cheaper(problem) else problem.data
 
 
 def form_name(data: Any) -> str:
@@ -131,14 +131,14 @@ class Sweeping(SweepSolver):
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
         order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
-        return self._state(problem, order, None)
+        return self._build_state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:
         """Build the state for new numbers; levels, colours and permutations of a fixed order are reused."""
         if not state.plan.is_fixed:
             return self.prepare(problem)
-        return self._state(problem, state.plan, state)
+        return self._build_state(problem, state.plan, state)
 
-    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+    def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         """Build the state; `before` is the state of a problem of the same structure and order, or None."""
         return SweepState(problem, problem.csr_data, order)

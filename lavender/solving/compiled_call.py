@@ -13,7 +13,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import make_residual
 from lavender.judge.solution import CONFIRMED, CONVERGED, TIME_LIMIT, Claim, Solution, SolverRun, Status
 from lavender.problem import Problem
-from lavender.solvers.loop import best_of
+from lavender.solvers.loop import select_best_impulse
 from lavender.solvers.registry import SMALL_ROWS, SolverSpec
 from lavender.solvers.small import time_fraction
 from lavender_ext.judge.measure import all_finite
@@ -73,7 +73,7 @@ def solve_small(
     if judged.relative > tol:
         if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
             return None, counts  # Time remains, or rounding hides b next to such impulses.
-        status, judged = TIME_LIMIT, best_of(problem, judged, first, tol)
+        status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol)
     # The caller may change an impulse array of their own later.
     start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)

@@ -58,7 +58,7 @@ from lavender.solving.limits import (
 )
 from lavender.solving.outcome import create_unjudged, decide_empty_rows, finish, name_lost_row
 from lavender.solving.velocity import accept_velocity, relative_tolerance
-from lavender_ext.judge.measure import by_island
+from lavender_ext.judge.measure import residuals_by_island
 from lavender_ext.judge.stopping_test import StoppingTest
 
 if TYPE_CHECKING:
@@ -363,7 +363,7 @@ class Prepared:
         proof = prove_infeasibility(self.problem, claim.certificate, loop.tol)
         if proof.reason:
             return claim
-        _, table = by_island(self.problem.metric, loop.impulse)
+        _, table = residuals_by_island(self.problem.metric, loop.impulse)
         row_label = np.repeat(label, np.diff(self.problem.cones.ptr))
         infeasible = np.bincount(row_label, proof.y != 0.0, minlength=count) > 0
         if np.all(infeasible | (table[:, 0] <= loop.tol)):

@@ -19,10 +19,10 @@ cdef struct acceleration_t:
 
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
-cdef void forget_all(void* context, const double* lam) noexcept nogil
-cdef double undone_of(const acceleration_t* c) noexcept nogil
+cdef void restart_acceleration(void* context, const double* lam) noexcept nogil
+cdef double count_undone_steps(const acceleration_t* c) noexcept nogil
 cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil
-cdef void accelerate(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
+cdef void begin_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil
 
 

@@ -18,13 +18,17 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 from lavender_ext.accelerate.accelerated cimport acceleration_t
-from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, store_evaluation
-from lavender_ext.core.block cimport clip, length
+from lavender_ext.accelerate.mixing cimport (
+    CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
+)
+from lavender_ext.core.block cimport clip, euclidean_norm
 from lavender_ext.core.order cimport SYMMETRIC
-from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
-from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, sweep_context_t, sweep_run_t, velocities_of
+from lavender_ext.sweep.serial cimport (
+    Sweeps, compute_sweep_velocities, sweep_over_form, sweep_context_t, sweep_run_t, count_sweep_velocities,
+)
 
 cdef enum:
     # Number of nncg iterations after which v is recomputed, because rounding errors accumulate in it.
@@ -35,7 +39,7 @@ cdef enum:                      # indices in `control` of nncg
     RESTARTS = 1                # number of dropped directions p
 
 
-cdef inline void iterate(acceleration_t* c, double* lam, int32_t first) noexcept nogil:
+cdef inline void sweep_once_in_order(acceleration_t* c, double* lam, int32_t first) noexcept nogil:
     """Sweep once, or with the symmetric order forwards and backwards."""
     cdef const blocks_t* p = c.sweeps.blocks
     cdef bint exact = c.sweeps.exact
@@ -44,15 +48,15 @@ cdef inline void iterate(acceleration_t* c, double* lam, int32_t first) noexcept
         p = &c.cone
         exact = True
     for k in range(2 if c.sweeps.mode == SYMMETRIC else 1):
-        sweep(c.sweeps, p, exact, lam, first and k == 0)
+        sweep_over_form(c.sweeps, p, exact, lam, first and k == 0)
 
 
-cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
+cdef inline void project_block_to_bounds(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
     """Project lam of block i to its bounds, normal first."""
     cdef int32_t j = p.ptr[i], g, k
     cdef double bound, size
     cdef friction_components_t q
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             lam[k] = clip(lam[k], p.lower[k], p.upper[k])
         return
@@ -61,13 +65,13 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
     get_friction_components(p, i, &q)
     for g in range(q.n):
         bound = q.friction_coefficient[g] * lam[j]
-        size = length(lam + j + q.first[g], q.size[g])
+        size = euclidean_norm(lam + j + q.first[g], q.size[g])
         if size > bound:
             for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
                 lam[k] *= bound / size
 
 
-cdef inline double energy(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
+cdef inline double weighted_dot(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
     """Return x.D y."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
@@ -83,8 +87,8 @@ cdef inline double energy(const double* d, const double* x, const double* y, int
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double step_energy(const double* d, double* x, const double* y, int32_t m) noexcept nogil:
-    """Subtract y from x and return x.D x, summed as in `energy`."""
+cdef inline double subtract_and_weighted_norm(const double* d, double* x, const double* y, int32_t m) noexcept nogil:
+    """Subtract y from x and return x.D x, summed as in `weighted_dot`."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= m:
@@ -104,7 +108,7 @@ cdef inline double step_energy(const double* d, double* x, const double* y, int3
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline void extrapolate(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
+cdef inline void extrapolate_nesterov(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
     """Set y and x to y + beta p, and p to beta p - x with the old x, in one pass."""
     cdef int32_t i
     cdef double q
@@ -129,10 +133,10 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
     cdef double norm, beta = 0.0
     for s in range(n):
         if c.iterations > 0 and c.iterations % VELOCITY_REFRESH_INTERVAL == 0:
-            form_velocity(c.sweeps, lam)
+            compute_sweep_velocities(c.sweeps, lam)
         if s > 0:
-            extrapolate(lam, x, p, beta, m)
-            extrapolate(v, x + m, p + m, beta, n_v)
+            extrapolate_nesterov(lam, x, p, beta, m)
+            extrapolate_nesterov(v, x + m, p + m, beta, n_v)
         else:
             for i in range(m):
                 lam[i] += q[i]
@@ -140,13 +144,13 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
             for i in range(n_v):
                 v[i] += q[m + i]
                 x[m + i] = v[i]
-        iterate(c, lam, first_sweep and s == 0)
-        norm = step_energy(d, x, lam, m)
+        sweep_once_in_order(c, lam, first_sweep and s == 0)
+        norm = subtract_and_weighted_norm(d, x, lam, m)
         for i in range(n_v):
             x[m + i] -= v[i]
         beta = norm / control[NORM] if control[NORM] > 0.0 else 0.0
         if not beta <= 1.0:
-            if c.keeps and beta > 1.0 and energy(d, x, p, m) <= 0.0:
+            if c.keeps and beta > 1.0 and weighted_dot(d, x, p, m) <= 0.0:
                 beta = 1.0                              # (3)
             else:
                 beta = 0.0
@@ -182,24 +186,25 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
-        mixed = mix(&mixing, lam, 1.0 / 0.0)  # No limit on sum |gamma|: recorded rockfalls need large ones for 1e-10.
+        # No limit on sum |gamma|: recorded rockfalls need large ones for 1e-10.
+        mixed = mix_anderson_iterates(&mixing, lam, 1.0 / 0.0)
         if mixed:
             for i in range(p.n_blocks):
-                project_block(p, i, lam)
-            form_velocity(c.sweeps, lam)
+                project_block_to_bounds(p, i, lam)
+            compute_sweep_velocities(c.sweeps, lam)
         for i in range(m):
             x[i] = lam[i]
-        iterate(c, lam, first_sweep and s == 0)
+        sweep_once_in_order(c, lam, first_sweep and s == 0)
         for i in range(m):
             x[i] = root[i] * (lam[i] - x[i])
         if not store_evaluation(&mixing, mixed, lam, x):
-            form_velocity(c.sweeps, lam)
+            compute_sweep_velocities(c.sweeps, lam)
         c.iterations += 1
         if c.iterations == c.convex:
-            forget(&mixing)                             # the law changes
+            clear_mixing_memory(&mixing)                             # the law changes
 
 
-cdef void forget_all(void* context, const double* lam) noexcept nogil:
+cdef void restart_acceleration(void* context, const double* lam) noexcept nogil:
     """Restart from lam (m) without memory; the counts are kept."""
     cdef acceleration_t* c = <acceleration_t*>context
     cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
@@ -211,7 +216,7 @@ cdef void forget_all(void* context, const double* lam) noexcept nogil:
         for i in range(CONTROL):
             if i != UNDONE:
                 c.control[i] = 0.0
-    form_velocity(c.sweeps, lam)
+    compute_sweep_velocities(c.sweeps, lam)
 
 
 cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
@@ -219,14 +224,14 @@ cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) 
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
-cdef void accelerate(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
+cdef void begin_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil:
     """Turn a started run of sweeps x into an accelerated one, before its first iteration.
 
     memory = 0 is nncg. workspace (`accelerated_workspace_size`) must be zero-initialised.
     """
     cdef sweep_context_t* sweeps = &x.context
-    x.step, x.step_context, x.forget = lav_nncg if memory == 0 else lav_anderson, c, forget_all
+    x.step, x.step_context, x.forget = lav_nncg if memory == 0 else lav_anderson, c, restart_acceleration
     c.sweeps, c.cone = sweeps, sweeps.blocks[0]
     c.cone.law = CONE
     c.memory, c.convex, c.keeps, c.iterations = memory, convex, keeps, 0
@@ -235,7 +240,7 @@ cdef void accelerate(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t 
     c.control = c.gram + MAX_MEMORY * MAX_MEMORY
 
 
-cdef double undone_of(const acceleration_t* c) noexcept nogil:
+cdef double count_undone_steps(const acceleration_t* c) noexcept nogil:
     """Return the number of dropped directions or undone mixed steps."""
     return c.control[RESTARTS if c.memory == 0 else UNDONE]
 
@@ -256,11 +261,11 @@ cdef class AcceleratedSweeps(Sweeps):
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,
                  int convex=0, bint keeps=False):
         cdef view_t v = p.view()
-        cdef int64_t n = accelerated_workspace_size(v.p.n_rows, velocities_of(&v), memory)
+        cdef int64_t n = accelerated_workspace_size(v.p.n_rows, count_sweep_velocities(&v), memory)
         self.x.packing.single = True
-        accelerate(&self.x, &self.acceleration, memory, convex, keeps,
+        begin_accelerated_sweeps(&self.x, &self.acceleration, memory, convex, keeps,
                    self.allocate(p, order, split, mode, rng, exact, exact or convex > 0, n))
 
     cdef double undone(self) noexcept:
         """Return the number of restarts."""
-        return undone_of(&self.acceleration)
+        return count_undone_steps(&self.acceleration)

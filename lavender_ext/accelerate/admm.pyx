@@ -26,12 +26,19 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, store_evaluation
-from lavender_ext.core.block cimport clip, length, norm2, row_group, locate_in_round_cone, round_scale, projected_normal
-from lavender_ext.core.block_types cimport CONE, blocks_t, is_round, is_rows, get_friction_components, friction_components_t
+from lavender_ext.accelerate.mixing cimport (
+    CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
+)
+from lavender_ext.core.block cimport (
+    clip, euclidean_norm, norm2, index_of_row_group, classify_in_round_cone, compute_round_cone_scale,
+    project_cone_normal,
+)
+from lavender_ext.core.block_types cimport (
+    CONE, blocks_t, is_round_cone_contact, has_independent_rows, get_friction_components, friction_components_t,
+)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.linear cimport LinearSystem, linear_solve, linear_t
-from lavender_ext.judge.reference cimport is_inactive_contact, is_inactive_row
+from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_strictly_inactive_row
 
 
 cdef enum:
@@ -70,7 +77,7 @@ cdef struct admm_t:
     mixing_t mixing
 
 
-cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
+cdef inline void solve_shifted_system(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
     """Overwrite x (m) with (B + rho)^-1 x (1); t (velocities) is scratch over bodies."""
     cdef int32_t i, k
     cdef double s
@@ -91,7 +98,7 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
         x[i] = f.e[i] * s
 
 
-cdef inline void project_round(int32_t n, const double* root, double mu, const double* u, double* z) noexcept nogil:
+cdef inline void project_round_cone(int32_t n, const double* root, double mu, const double* u, double* z) noexcept nogil:
     """Compute z = Pi_K(u) of a round cone of n rows by core/block.pxd (8)."""
     cdef double t[3]
     cdef double a[3]
@@ -100,59 +107,59 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
     for i in range(1, n):
-        g = row_group(i)
+        g = index_of_row_group(i)
         t[g] = norm2(t[g], u[i])
         a[g] = mu * root[i] / root[0]
-    zone = locate_in_round_cone(t, a, u[0], &r, &size)
+    zone = classify_in_round_cone(t, a, u[0], &r, &size)
     z[0] = (u[0] if u[0] > 0.0 else 0.0) + r if zone == 0 else (u[0] if zone > 0 else 0.0)
     for i in range(1, n):
-        z[i] = (round_scale(a[row_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
+        z[i] = (compute_round_cone_scale(a[index_of_row_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
-cdef inline void scaled_components(const blocks_t* p, const double* root, int32_t i, const double* x, friction_components_t* q,
-                              double* t) noexcept nogil:
+cdef inline void scale_friction_components(const blocks_t* p, const double* root, int32_t i, const double* x,
+                                           friction_components_t* q, double* t) noexcept nogil:
     """Write the friction components of contact i with coefficients in the scale of x, and |x_g| in t."""
     cdef int32_t j = p.ptr[i], g
     get_friction_components(p, i, q)
     for g in range(q.n):
         q.friction_coefficient[g] = q.friction_coefficient[g] * root[j + q.first[g]] / root[j]
-        t[g] = length(x + j + q.first[g], q.size[g])
+        t[g] = euclidean_norm(x + j + q.first[g], q.size[g])
 
 
-cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
+cdef inline void project_scaled_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
     """Compute z = Pi_K(u) of block i by core/block.pxd (7); u and z are scaled vectors of all rows."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g
     cdef friction_components_t q
     cdef double t[3]
     cdef double s
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         for k in range(j, end):
             z[k] = clip(u[k], p.lower[k] * root[k], p.upper[k] * root[k])
         return
-    if is_round(p, i):
-        project_round(end - j, root + j, p.mu[i], u + j, z + j)
+    if is_round_cone_contact(p, i):
+        project_round_cone(end - j, root + j, p.mu[i], u + j, z + j)
         return
-    scaled_components(p, root, i, u, &q, t)
-    z[j] = s = projected_normal(q.n, q.friction_coefficient, t, u[j])
+    scale_friction_components(p, root, i, u, &q, t)
+    z[j] = s = project_cone_normal(q.n, q.friction_coefficient, t, u[j])
     for g in range(q.n):
         for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
             z[k] = q.friction_coefficient[g] * s / t[g] * u[k] if t[g] > q.friction_coefficient[g] * s else u[k]
 
 
-cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
+cdef inline double friction_shift_of_normal(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
     """Return the shift s of the normal of contact i."""
     cdef friction_components_t q
     cdef double t[3]
     cdef double s = 0.0
     cdef int32_t g
-    scaled_components(p, root, i, y, &q, t)
+    scale_friction_components(p, root, i, y, &q, t)
     for g in range(q.n):
         s += q.friction_coefficient[g] * t[g]
     return s
 
 
-cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
+cdef inline double compute_residual_imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
     """Compute the imbalances (3) and return the larger one."""
     cdef int32_t i, m = c.blocks.n_rows
     cdef double x = 0.0, y = 0.0, s, t
@@ -173,10 +180,10 @@ cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noex
     return primal[0] if primal[0] > dual[0] else dual[0]
 
 
-cdef inline double next_rho(const admm_t* c) noexcept nogil:
+cdef inline double update_rho(const admm_t* c) noexcept nogil:
     """Return the rho that balances the last iteration, or the present one if the imbalance is small."""
     cdef double primal, dual, s
-    imbalance(c, &primal, &dual)
+    compute_residual_imbalance(c, &primal, &dual)
     if not primal > 0.0:
         return c.rho
     s = clip(sqrt(primal / dual) if dual > 0.0 else 10.0, 0.1, 10.0)
@@ -189,7 +196,7 @@ cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept n
     return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
-cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha,
+cdef public void lav_begin_admm(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha,
                               double* workspace) noexcept nogil:
     """Initialise a run over p before its first iteration; workspace (`lav_admm_workspace_size`) must be zero-initialised."""
     cdef int64_t m = p.n_rows
@@ -210,21 +217,21 @@ cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, doub
         c.root[i] = sqrt(p.d[i])
         c.c[i] = p.b[i] / c.root[i]
         c.x[i] = -p.b[i]
-    limit_inactive(p, c.x, c.c)
+    limit_scale_of_inactive_blocks(p, c.x, c.c)
 
 
-cdef inline bint is_inactive(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
+cdef inline bint is_strictly_inactive_block(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
     """Return whether all rows of block i are strictly inactive at zero impulse with slack w (m)."""
     cdef int32_t k
-    if not is_rows(p, i):
-        return is_inactive_contact(p, i, w)
+    if not has_independent_rows(p, i):
+        return is_strictly_inactive_contact(p, i, w)
     for k in range(p.ptr[i], p.ptr[i + 1]):
-        if not is_inactive_row(p, k, 0.0, w[k]):
+        if not is_strictly_inactive_row(p, k, 0.0, w[k]):
             return False
     return True
 
 
-cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) noexcept nogil:
+cdef inline void limit_scale_of_inactive_blocks(const blocks_t* p, const double* w, double* c) noexcept nogil:
     """Reduce c of blocks inactive at zero impulse, slack w, to MAX_INACTIVE_RATIO times the largest c of the others.
 
     A distant limit or a placeholder bound would otherwise dominate the rounding errors of the active rows, and rho.
@@ -232,7 +239,7 @@ cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) n
     cdef double size = 0.0, own
     cdef int32_t i, k
     for i in range(p.n_blocks):
-        if not is_inactive(p, i, w):
+        if not is_strictly_inactive_block(p, i, w):
             for k in range(p.ptr[i], p.ptr[i + 1]):
                 size = fabs(c[k]) if fabs(c[k]) > size else size
     if not size > 0.0:
@@ -241,7 +248,7 @@ cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) n
         own = 0.0
         for k in range(p.ptr[i], p.ptr[i + 1]):
             own = fabs(c[k]) if fabs(c[k]) > own else own
-        if own > MAX_INACTIVE_RATIO * size and is_inactive(p, i, w):
+        if own > MAX_INACTIVE_RATIO * size and is_strictly_inactive_block(p, i, w):
             for k in range(p.ptr[i], p.ptr[i + 1]):
                 c[k] *= MAX_INACTIVE_RATIO * size / own
 
@@ -255,15 +262,15 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         n[0] -= 1
         mixed = c.mixed
         for i in range(p.n_blocks):
-            project_block(p, c.root, i, c.u, c.z)
+            project_scaled_block(p, c.root, i, c.u, c.z)
         for i in range(m):
             c.y[i] = rho * (c.u[i] - c.z[i])
             c.x[i] = c.c[i] + rho * c.z[i] - c.y[i]
         if p.law != CONE and c.shifted:
             for i in range(p.n_blocks):
-                if not is_rows(p, i):
-                    c.x[p.ptr[i]] -= shift(p, c.root, i, c.y)
-        solve_shifted(f, m, c.x, c.work)
+                if not has_independent_rows(p, i):
+                    c.x[p.ptr[i]] -= friction_shift_of_normal(p, c.root, i, c.y)
+        solve_shifted_system(f, m, c.x, c.work)
         c.done += 1.0
         for i in range(m):
             c.g[i] = c.alpha * (c.x[i] - c.z[i])
@@ -271,12 +278,12 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         if not store_evaluation(&c.mixing, mixed, c.u, c.g):
             c.mixed = 0
             continue
-        if not c.shifted and (c.done >= MAX_CONVEX_ITERATIONS or imbalance(c, &primal, &dual) <= 1e-3):
+        if not c.shifted and (c.done >= MAX_CONVEX_ITERATIONS or compute_residual_imbalance(c, &primal, &dual) <= 1e-3):
             c.shifted = 1
-            forget(&c.mixing)
+            clear_mixing_memory(&c.mixing)
         if c.done >= c.next:
             if c.next > 0.0:
-                rho = next_rho(c)
+                rho = update_rho(c)
             c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_UPDATE_INTERVAL else RHO_UPDATE_INTERVAL)
         for i in range(m):
             c.before[i] = c.z[i]
@@ -284,10 +291,11 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         if rho != c.rho:
             for i in range(m):
                 c.u[i] = c.z[i] + c.y[i] / rho
-            forget(&c.mixing)
+            clear_mixing_memory(&c.mixing)
             c.mixed = 0
             return rho
-        c.mixed = mix(&c.mixing, c.u, 1e4)    # Without a limit, impulses on rows of low rank reach 1e15; 1e3 and 1e5 also work.
+        # Without a limit, impulses on rows of low rank reach 1e15; 1e3 and 1e5 also work.
+        c.mixed = mix_anderson_iterates(&c.mixing, c.u, 1e4)
     return 0.0
 
 
@@ -297,14 +305,14 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
     cdef int32_t i
     for i in range(p.n_rows):
         c.y[i] = -w[i] / c.root[i]
-        if c.c[i] != p.b[i] / c.root[i]:                # c was reduced by `limit_inactive`
+        if c.c[i] != p.b[i] / c.root[i]:                # c was reduced by `limit_scale_of_inactive_blocks`
             c.y[i] = c.c[i] - (w[i] + p.b[i]) / c.root[i]
     for i in range(p.n_rows):
         c.u[i] = c.y[i]
     if p.law != CONE:
         for i in range(p.n_blocks):
-            if not is_rows(p, i):
-                c.u[p.ptr[i]] -= shift(p, c.root, i, c.y)
+            if not has_independent_rows(p, i):
+                c.u[p.ptr[i]] -= friction_shift_of_normal(p, c.root, i, c.y)
     for i in range(p.n_rows):
         c.u[i] = c.root[i] * lam[i] + c.u[i] / c.rho
 
@@ -329,7 +337,7 @@ cdef class Splitting:
             raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
         workspace = np.zeros(<Py_ssize_t>lav_admm_workspace_size(p.blocks.n_rows, memory))
         self.keep = p, workspace
-        lav_admm_lay(&self.c, &p.blocks, memory, rho, alpha, &workspace[0])
+        lav_begin_admm(&self.c, &p.blocks, memory, rho, alpha, &workspace[0])
 
     @property
     def rho(self):

@@ -41,7 +41,7 @@ cdef struct mixing_t:
     double* dg                  # (memory, m) differences of g
 
 
-cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
+cdef inline int32_t solve_mixing_coefficients(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
                                   double* gamma) noexcept nogil:
     """Solve the normal equations over the n newest differences for gamma (memory), by slot; return the number of columns used.
 
@@ -86,7 +86,7 @@ cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const
     return used
 
 
-cdef inline int32_t mix(const mixing_t* c, double* u, double max_weight) noexcept nogil:
+cdef inline int32_t mix_anderson_iterates(const mixing_t* c, double* u, double max_weight) noexcept nogil:
     """Replace u, which holds the last v, by (1) and return 1; return 0 if nothing is mixed, as if sum |gamma| > max_weight."""
     cdef int32_t n_differences = <int32_t>c.control[N_DIFFERENCES], head = <int32_t>c.control[NEXT_SLOT], i, j, k
     cdef double rhs[MAX_MEMORY]
@@ -98,12 +98,12 @@ cdef inline int32_t mix(const mixing_t* c, double* u, double max_weight) noexcep
     for k in range(n_differences):
         j = (head - 1 - k + 2 * c.memory) % c.memory
         rhs[j] = dot(c.dg + j * c.m, c.g, c.m)
-    if least_squares(n_differences, head, c.memory, c.gram, rhs, gamma) == 0:
+    if solve_mixing_coefficients(n_differences, head, c.memory, c.gram, rhs, gamma) == 0:
         return 0
     for j in range(c.memory):
         weight += fabs(gamma[j])
     if weight > max_weight:
-        forget(c)
+        clear_mixing_memory(c)
         return 0
     for j in range(c.memory):
         a = gamma[j]
@@ -114,7 +114,7 @@ cdef inline int32_t mix(const mixing_t* c, double* u, double max_weight) noexcep
     return 1
 
 
-cdef inline void forget(const mixing_t* c) noexcept nogil:
+cdef inline void clear_mixing_memory(const mixing_t* c) noexcept nogil:
     """Clear the memory."""
     c.control[N_DIFFERENCES] = 0.0
     c.control[HAS_PREVIOUS] = 0.0
@@ -129,7 +129,7 @@ cdef inline int32_t store_evaluation(const mixing_t* c, int32_t mixed, double* v
     if mixed and not size <= 2.0 * c.control[LAST_NORM]:
         for i in range(c.m):
             v[i] = c.v[i]
-        forget(c)
+        clear_mixing_memory(c)
         c.control[UNDONE] += 1.0
         return 0
     c.control[LAST_NORM] = size
@@ -142,7 +142,7 @@ cdef inline int32_t store_evaluation(const mixing_t* c, int32_t mixed, double* v
         if c.control[WINDOW_STEPS] >= WINDOW:
             if c.control[WINDOW_NORM] > 0.0 and c.control[LOWEST_NORM] > 0.9 * c.control[WINDOW_NORM]:
                 c.control[N_UNMIXED] = WINDOW
-                forget(c)
+                clear_mixing_memory(c)
                 n_differences = 0
             c.control[WINDOW_NORM] = c.control[LOWEST_NORM]
             c.control[WINDOW_STEPS] = 0.0

@@ -11,23 +11,26 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles, ints, ndarray
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
-from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small
-from lavender_ext.batch.task cimport (copy_judgement, ensure_derived, judge_task, judge_zero, judging_size, prepare_small,
+from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
+from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived, judge_task, judge_zero_impulse_of_task,
+                                      judge_task_workspace_size, prepare_small_problem,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
-from lavender_ext.small.limits cimport allowed, cost_of, limits_t
-from lavender_ext.small.workspace cimport has_workspace_size, free_workspace
-from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
-                                       READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
-                                       worker_scratch_t, lay_bodies, lay_matrix, lay_world, worlds_t)
-from lavender_ext.judge.measure cimport set_zero_impulse, judged_from, scratch_of
-from lavender_ext.judge.rounding cimport floor_in_float32, squares32
-from lavender_ext.judge.tally cimport norms_of_rhs
+from lavender_ext.small.limits cimport max_newton_cost, estimate_newton_cost, limits_t
+from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
+from lavender_ext.batch.world cimport (
+    BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY, AT_ROW, FIELDS, ROWS,
+    SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t, convert_body_world, convert_matrix_world,
+    convert_generalized_world, worlds_t,
+)
+from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
+from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
+from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms
 from lavender_ext.velocity_newton.soft cimport is_soft
 
 cdef object new = np.empty
@@ -54,20 +57,21 @@ cdef int set_problem_task(task_t* j, problem) except -1:
     cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
     rows, matrix = problem.rows, problem.matrix
     j.p, j.has_derived, j.zero_residual[0], j.factored = blocks.at, False, -1.0, rows is not None
-    j.p.law, j.p.b = LAWS[problem.friction], doubles(problem.b, m)
+    j.p.law, j.p.b = LAWS[problem.friction], as_double_pointer(problem.b, m)
     if j.factored:
         n, c, joints = len(rows.inv_mass), len(rows.normal), len(rows.joint_body)
         j.r.n_bodies, j.r.n_joints, j.r.n_contacts = <int32_t>n, <int32_t>joints, <int32_t>c
-        j.r.jac, j.r.joint_body = doubles(rows.jac, 12 * j.p.ptr[joints]), ints(rows.joint_body, 2 * joints)
-        j.r.normal, j.r.tangent = doubles(rows.normal, 3 * c), doubles(rows.tangent, 3 * c)
-        j.r.arm_a, j.r.arm_b = doubles(rows.arm_a, 3 * c), doubles(rows.arm_b, 3 * c)
-        j.r.contact_body, j.r.compliance = ints(rows.contact_body, 2 * c), doubles(problem.compliance, m)
-        j.r.inv_mass, j.r.inv_inertia = doubles(rows.inv_mass, n), doubles(rows.inv_inertia, 9 * n)
+        j.r.jac, j.r.joint_body = as_double_pointer(rows.jac, 12 * j.p.ptr[joints]), as_int_pointer(rows.joint_body, 2 * joints)
+        j.r.normal, j.r.tangent = as_double_pointer(rows.normal, 3 * c), as_double_pointer(rows.tangent, 3 * c)
+        j.r.arm_a, j.r.arm_b = as_double_pointer(rows.arm_a, 3 * c), as_double_pointer(rows.arm_b, 3 * c)
+        j.r.contact_body, j.r.compliance = as_int_pointer(rows.contact_body, 2 * c), as_double_pointer(problem.compliance, m)
+        j.r.inv_mass, j.r.inv_inertia = as_double_pointer(rows.inv_mass, n), as_double_pointer(rows.inv_inertia, 9 * n)
     elif isinstance(matrix, ndarray):
-        j.dense, j.row = doubles(matrix, m * m), m
+        j.dense, j.row = as_double_pointer(matrix, m * m), m
     else:
         indptr, indices, data = problem._compressed
-        j.a.indptr, j.a.indices, j.a.data = ints(indptr, m + 1), ints(indices, len(indices)), doubles(data, len(data))
+        j.a.indptr, j.a.indices = as_int_pointer(indptr, m + 1), as_int_pointer(indices, len(indices))
+        j.a.data = as_double_pointer(data, len(data))
     return 0
 
 
@@ -79,10 +83,10 @@ cdef int set_data_task(task_t* j, Data p, start, double* lam, double* slack_erro
     if not p.is_general:
         j.made.n_empty = <int32_t>len(p.empty)
     j.zero_residual[0], j.zero_residual[1], j.zero_residual[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
-    return set_start(j, start, lam, slack_error)
+    return set_task_start(j, start, lam, slack_error)
 
 
-cdef int set_start(task_t* j, start, double* lam, double* slack_error) except -1:
+cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) except -1:
     """Set the task's start and output arrays, and reset its result."""
     cdef const double[::1] values
     j.lam, j.slack_error = lam, slack_error
@@ -96,18 +100,18 @@ cdef int set_start(task_t* j, start, double* lam, double* slack_error) except -1
     return 0
 
 
-cdef make_result(task_t* j, Data p, impulse, both):
+cdef make_task_result(task_t* j, Data p, impulse, both):
     """Return (judged result or None, counters as of `Newton.run`)."""
     judged = None
     if j.solved or j.limit_reached:
-        judged = judged_from(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
+        judged = make_judged(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
     return judged, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
 cdef void store_zero_residual(task_t* j, Data p):
     """Store the residual of the zero impulse in the data, unless it has one."""
     if p.reference_energy < 0.0 and j.zero_residual[0] >= 0.0:
-        p.keep_reference(j.p.islands, j.zero_residual)
+        p.store_reference(j.p.islands, j.zero_residual)
 
 
 cdef class Limits:
@@ -120,11 +124,11 @@ cdef class Limits:
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
         cdef bint soft = is_soft(&p.blocks, &p.general)
-        return (cost_of(&p.blocks, &p.general, &self.at, work),
-                allowed(&p.blocks, &p.general, &self.at, islands, soft))
+        return (estimate_newton_cost(&p.blocks, &p.general, &self.at, work),
+                max_newton_cost(&p.blocks, &p.general, &self.at, islands, soft))
 
 
-def solve_first(Data p, start, double tol, Limits limits, double max_cost=INFINITY):
+def solve_new_generalized_problem(Data p, start, double tol, Limits limits, double max_cost=INFINITY):
     """Set up, solve and judge a problem of J and M with at least one row and without derived data, in one call.
 
     Returns (judged result, counters). The result is None if it is above tol, if an empty row violates its target, or if the
@@ -136,19 +140,19 @@ def solve_first(Data p, start, double tol, Limits limits, double max_cost=INFINI
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint had_derived = p.ready
     impulse, results = new(m), new(2 * m + 1)
-    set_data_task(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
+    set_data_task(&j, p, start, as_double_pointer(impulse, m), as_double_pointer(results, 2 * m + 1))
     j.cost_limit = max_cost
     with nogil:
         solve_task(&j, &workspace, &islands, &limits.at, tol)
         free_workspace(&workspace)
     if not had_derived and j.has_derived:
-        p.adopt(&j.made)
+        p.adopt_derived(&j.made)
     elif not had_derived:
         free(j.made.marks)
         free(j.made.numbers)
     store_zero_residual(&j, p)
     free_workspace(&islands)
-    return make_result(&j, p, impulse, results)
+    return make_task_result(&j, p, impulse, results)
 
 
 cdef enum:                      # rows of `Worlds.numbers`: results of each world
@@ -182,7 +186,7 @@ cdef enum:                      # results of `Worker.run` other than the index o
     CHECK_CLOCK = -2            # the caller must check the time limit
 
 
-def data_of(list problems, kind):
+def list_problem_data(list problems, kind):
     """Return (per problem its Data, True without derived data, or None if the loop does not support it; rows of each (n,))."""
     cdef Py_ssize_t i, n = len(problems)
     cdef list data = [None] * n
@@ -214,7 +218,7 @@ cdef struct worker_t:             # memory of one thread
 cdef inline bint judge_world_zero(task_t* j, worker_t* h) noexcept nogil:
     """Judge the zero impulse of a world of J and M; return False without memory."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
-    return judge_zero(j, &v, &h.small.islands, h.workspace.real)
+    return judge_zero_impulse_of_task(j, &v, &h.small.islands, h.workspace.real)
 
 
 cdef class Worlds:
@@ -226,7 +230,7 @@ cdef class Worlds:
     Parameters
     ----------
     problems, data : list
-        Problems that are objects, and their `data_of`, with starts (m,) [N s] or None.
+        Problems that are objects, and their `list_problem_data`, with starts (m,) [N s] or None.
     at : (n, PLACES) int64
         Sizes and offsets as in `world.pxd`; for objects only the columns ROWS and AT_ROW.
     arrays : sequence of 6
@@ -281,7 +285,7 @@ cdef class Worlds:
             self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
         self.w.blocks, self.w.asymmetry, self.w.general = blocks.at, asymmetry, arrays[1] is not None
         self.w.blocks.law = law
-        self.w.jac_row, self.w.mass_row = strides
+        self.w.multiply_jacobian_row, self.w.mass_row = strides
         self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
@@ -303,14 +307,14 @@ cdef class Worlds:
         self.references += [blocks, fields, pairs]
         for i in range(FIELDS):
             array, self.w.bodies.step[i] = fields[i]
-            self.w.bodies.field[i] = doubles(array, array.size)
+            self.w.bodies.field[i] = as_double_pointer(array, array.size)
         for i in range(2):
             array, self.w.bodies.pair_step[i] = pairs[i]
-            self.w.bodies.pair[i] = ints(array, array.size)
+            self.w.bodies.pair[i] = as_int_pointer(array, array.size)
         self.w.bodies.n, self.w.bodies.joints, self.w.bodies.contacts = bodies, joints, contacts
 
     def of_objects(self, list problems, list data, list starts):
-        """Set the worlds from problems and their `data_of`; None defers a problem to the caller."""
+        """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
         cdef int64_t i
         cdef task_t* j
         self.tasks = <task_t*>calloc(self.w.n + 1, sizeof(task_t))
@@ -321,7 +325,7 @@ cdef class Worlds:
             p, j = data[i], &self.tasks[i]
             if p is True:
                 set_problem_task(j, problems[i])
-                set_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+                set_task_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
             elif p is not None:
                 set_data_task(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
 
@@ -347,18 +351,18 @@ cdef class Worlds:
         else:
             j.general, j.factored = self.w.general, self.w.factored
             if j.general:
-                code = lay_world(&self.w, i, scratch, &j.p, &j.g)
+                code = convert_generalized_world(&self.w, i, scratch, &j.p, &j.g)
             elif j.factored:
-                code = lay_bodies(&self.w, i, scratch, &j.p, &j.r)
+                code = convert_body_world(&self.w, i, scratch, &j.p, &j.r)
             else:
-                code = lay_matrix(&self.w, i, scratch, &j.p, &j.dense, &j.row)
+                code = convert_matrix_world(&self.w, i, scratch, &j.p, &j.dense, &j.row)
             j.zero_residual[0] = -1.0
             j.by_island = NULL
             j.solved, j.limit_reached, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
         if not j.has_derived and j.general:
             j.made = made[0]
         j.cost_limit = INFINITY
-        if not has_workspace_size(slack_error, 0, 2 * at[ROWS] + 1):
+        if not grow_workspace_to(slack_error, 0, 2 * at[ROWS] + 1):
             return LEFT
         j.slack_error = slack_error.real
         return code
@@ -436,19 +440,19 @@ cdef class Worlds:
             return self.store_empty_world(i, &h.scratch)
         code = LEFT
         if not j.general:
-            if narrow or (late and self.tasks != NULL) or not prepare_small(&j, &s, &h.small):
+            if narrow or (late and self.tasks != NULL) or not prepare_small_problem(&j, &s, &h.small):
                 return LEFT
-            if not has_workspace_size(&h.small.call.work, 0, scratch_of(&s.v)):
+            if not grow_workspace_to(&h.small.call.work, 0, count_judge_scratch(&s.v)):
                 return LEFT
             if j.cold:
                 set_zero_impulse(&j.p, j.lam, j.slack_error)
             code = READY
-            judge_small(&s, j.lam, j.slack_error, h.small.call.work.real)
-            copy_judgement(&j, &s)
+            judge_small_impulse(&s, j.lam, j.slack_error, h.small.call.work.real)
+            copy_small_judgement(&j, &s)
             j.push = h.small.call.work.real
-        elif (ensure_derived(&j) and j.made.n_empty == 0
-              and has_workspace_size(&h.workspace, 0, max(judging_size(&j), 4 * <int64_t>m + 5 * j.g.n))
-              and has_workspace_size(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and judge_world_zero(&j, h)):
+        elif (compute_missing_derived(&j) and j.made.n_empty == 0
+              and grow_workspace_to(&h.workspace, 0, max(judge_task_workspace_size(&j), 4 * <int64_t>m + 5 * j.g.n))
+              and grow_workspace_to(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and judge_world_zero(&j, h)):
             code, x = READY, h.workspace.real
             if j.cold:
                 set_zero_impulse(&j.p, j.lam, j.slack_error)
@@ -456,13 +460,14 @@ cdef class Worlds:
             judge_task(&j, tol, x)
             if narrow:
                 x += j.g.n                              # after M^-1 J^T lam
-                squares32(&j.p, &j.g, &h.scratch.mass, h.scratch.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
+                compute_squared_float32_rounding(&j.p, &j.g, &h.scratch.mass, h.scratch.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
                     x[k] = x[k] + x[m + k] + x[2 * m + k]
-                j.floor = floor_in_float32(&j.p, x, &j.score, j.relative, j.zero_residual[0], j.zero_residual[1], &j.above_floor)
+                j.floor = float32_floor_of_score(&j.p, x, &j.score, j.relative, j.zero_residual[0], j.zero_residual[1],
+                                                 &j.above_floor)
         if code == READY:
             self.store_result(i, &j, &h.scratch)
-            norms_of_rhs(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
+            rhs_energy_and_velocity_norms(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
         if j.general and not had_derived:
             h.made = j.made
         return code

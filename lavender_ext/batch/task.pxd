@@ -8,24 +8,28 @@ from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
-from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
-from lavender_ext.core.validate cimport first_invalid
+from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies, lav_expand_rows
+from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
-from lavender_ext.core.islands cimport islands_index
-from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, islands_t
-from lavender_ext.core.problem cimport DERIVED, lav_rows_diagonal, derived_t, compute_derived, matrix_numbers
+from lavender_ext.core.islands cimport island_workspace_integers
+from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
+from lavender_ext.core.problem cimport DERIVED, lav_compute_body_diagonal, derived_t, compute_derived, compute_csr_derived
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.judge.measure cimport (above_floor_of, set_zero_impulse, floor_of, general_score, judge_zero_impulse, refine_view,
-                                         relative_of, scratch_of)
-from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.judge.slack cimport general_slack
-from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_bounded, lay_few, small_problem_t,
-                                      small_rules_t, solve_small, solve_workspaces_t, supports_blocks)
-from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
-from lavender_ext.small.workspace cimport has_workspace_size
-from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_rows
+from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
+                                         score_given_generalized_slack, judge_zero_impulse, refine_view,
+                                         relative_residual_of_score, count_judge_scratch)
+from lavender_ext.judge.score cimport make_empty_score, score_t
+from lavender_ext.judge.slack cimport compute_generalized_slack
+from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_all_rows_bounded, derive_small_problem,
+                                      small_problem_t,
+                                      small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
+from lavender_ext.small.limits cimport (
+    max_newton_cost, estimate_newton_cost, limits_t, estimate_newton_step_cost, max_factorisation_work,
+)
+from lavender_ext.small.workspace cimport grow_workspace_to
+from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport is_soft
 
 
@@ -66,34 +70,35 @@ cdef struct task_t:
 
 
 cdef struct task_workspaces_t:  # of one thread
-    workspace_t islands         # of `judge_zero`
+    workspace_t islands         # of `judge_zero_impulse_of_task`
     workspace_t made            # A, d, nu and step
-    workspace_t formed          # of `form_matrix`
-    workspace_t bound           # of `lay_few`
+    workspace_t formed          # of `form_matrix_of_bodies`
+    workspace_t bound           # of `derive_small_problem`
     solve_workspaces_t call     # of `solve_small`
 
 
-cdef inline bint judge_zero(task_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
+cdef inline bint judge_zero_impulse_of_task(task_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
     """Judge the zero impulse: E0, V0, relative residual and islands; return False without memory.
 
-    v: view of the task's data; w (3 m + `scratch_of`): scratch.
+    v: view of the task's data; w (3 m + `count_judge_scratch`): scratch.
     """
     cdef ssize_t m = j.p.n_rows
-    if not has_workspace_size(islands, islands_index(v), 2 * <int64_t>j.p.n_blocks):
+    if not grow_workspace_to(islands, island_workspace_integers(v), 2 * <int64_t>j.p.n_blocks):
         return False
     judge_zero_impulse(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.zero_residual)
     j.p.islands = v.p.islands
     return True
 
 
-cdef inline double estimate_cost(const task_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
+cdef inline double estimate_task_cost(const task_t* j, const limits_t* l, double work, int32_t factored,
+                                      double lines) noexcept nogil:
     """Return the estimated cost [ns] of setup, judgement, `factored` factorisations and `lines` line-search evaluations."""
-    cdef double pass_cost = step_cost(&j.p, &j.g, l, 0.0)
+    cdef double pass_cost = estimate_newton_step_cost(&j.p, &j.g, l, 0.0)
     return ((SETUP_PASSES + FACTOR_PASSES * factored) * pass_cost + 0.5 * factored * l.work * work
             + LINE_ROW_ENTRIES * l.entry * j.p.n_rows * lines)
 
 
-cdef inline int32_t step_within_cost(task_t* j, const view_t* v, const options_t* o, const workspace_t* r,
+cdef inline int32_t run_newton_within_cost(task_t* j, const view_t* v, const options_t* o, const workspace_t* r,
                                 const limits_t* l) noexcept nogil:
     """Run Newton's steps while their estimated cost is below the task's limit; set `limit_reached` if the limit ends them.
 
@@ -102,16 +107,16 @@ cdef inline int32_t step_within_cost(task_t* j, const view_t* v, const options_t
     """
     cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
     cdef int32_t code = MORE
-    cdef double each = estimate_cost(j, l, r.work, 1, STEP_EVALUATIONS) - estimate_cost(j, l, r.work, 0, 0.0), fit = 1.0
+    cdef double each = estimate_task_cost(j, l, r.work, 1, STEP_EVALUATIONS) - estimate_task_cost(j, l, r.work, 0, 0.0), fit = 1.0
     while code == MORE and fit >= 1.0:
-        fit = (j.cost_limit - estimate_cost(j, l, r.work, info.factorisations, info.evaluations)) / each
+        fit = (j.cost_limit - estimate_task_cost(j, l, r.work, info.factorisations, info.evaluations)) / each
         code = lav_step(v, o, r, <int32_t>max(fit, 0.0) if fit < o.budget else o.budget, j.lam, &info)
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
     j.limit_reached = code == MORE
     return code
 
 
-cdef inline bint set_empty_rows(const task_t* j, double tol) noexcept nogil:
+cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept nogil:
     """Set empty rows of J to the bound that b requires, like `decide_empty_rows` of lavender/solving/outcome.py.
 
     Returns False if that bound is infinite and b alone is above tol, or if A_ii is 0 only by underflow.
@@ -126,9 +131,9 @@ cdef inline bint set_empty_rows(const task_t* j, double tol) noexcept nogil:
             for q in range(j.g.jptr[k], j.g.jptr[k + 1]):
                 if j.g.jval[q] != 0.0:
                     return False
-            if p.b[k] == 0.0 or (not is_rows(p, i) and k > p.ptr[i]):
+            if p.b[k] == 0.0 or (not has_independent_rows(p, i) and k > p.ptr[i]):
                 continue                                # no impulse required: tangents and spin are bounded by mu lambda_n
-            if p.b[k] < 0.0 and p.law == CONE and not is_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
+            if p.b[k] < 0.0 and p.law == CONE and not has_independent_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
                 # under the cone law a separating normal row supports the friction of a sliding contact
                 continue
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
@@ -139,36 +144,36 @@ cdef inline bint set_empty_rows(const task_t* j, double tol) noexcept nogil:
     return True
 
 
-cdef inline int64_t judging_size(const task_t* j) noexcept nogil:
+cdef inline int64_t judge_task_workspace_size(const task_t* j) noexcept nogil:
     """Return the number of doubles of scratch of `judge_task`."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
-    return j.g.n + scratch_of(&v)
+    return j.g.n + count_judge_scratch(&v)
 
 
 cdef inline void judge_task(task_t* j, double tol, double* x) noexcept nogil:
-    """Judge lam, refined for `tol`, and store M^-1 J^T lam in `push`; x (`judging_size`) is scratch."""
+    """Judge lam, refined for `tol`, and store M^-1 J^T lam in `push`; x (`judge_task_workspace_size`) is scratch."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     cdef int32_t m = j.p.n_rows
-    j.score = new_score()
+    j.score = make_empty_score()
     j.score.by_island = j.by_island
-    general_slack(&j.p, &j.g, j.lam, x, j.slack_error)
-    general_score(&j.p, &j.g, j.lam, j.slack_error, j.slack_error + m, x + j.g.n, &j.score)
+    compute_generalized_slack(&j.p, &j.g, j.lam, x, j.slack_error)
+    score_given_generalized_slack(&j.p, &j.g, j.lam, j.slack_error, j.slack_error + m, x + j.g.n, &j.score)
     j.push = x
-    j.relative = relative_of(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
+    j.relative = relative_residual_of_score(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
     j.float64_relative = NAN
     if refine_view(&v, j.lam, j.slack_error, j.slack_error + m, x + j.g.n, j.zero_residual[0], j.zero_residual[1], tol, j.relative,
                    &j.score):
         j.float64_relative = j.relative
-        j.relative = relative_of(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
-    j.floor = floor_of(&j.score, j.zero_residual[0], j.zero_residual[1])
-    j.above_floor = above_floor_of(&j.score, j.relative, j.floor)
+        j.relative = relative_residual_of_score(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
+    j.floor = relative_floor_of_score(&j.score, j.zero_residual[0], j.zero_residual[1])
+    j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
 
 
-cdef inline bint ensure_derived(task_t* j) noexcept nogil:
+cdef inline bint compute_missing_derived(task_t* j) noexcept nogil:
     """Compute the derived numbers d, Y unless they are known; return whether they are in the valid range."""
     if not j.has_derived:
         j.has_derived = compute_derived(&j.p, &j.g, &j.made) == DERIVED
-    return j.has_derived and first_invalid(j.p.d, j.p.n_rows) < 0
+    return j.has_derived and find_invalid_number(j.p.d, j.p.n_rows) < 0
 
 
 cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* islands, const limits_t* limits,
@@ -180,30 +185,31 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     cdef int32_t m = j.p.n_rows, code = NEEDS_WORKSPACE
     cdef bint soft
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
-    if not ensure_derived(j):
+    if not compute_missing_derived(j):
         return
-    if not has_workspace_size(workspace, 0, 3 * <ssize_t>m + j.g.n):
+    if not grow_workspace_to(workspace, 0, 3 * <ssize_t>m + j.g.n):
         return
     # residual of the zero impulse
     v = view_t(j.p, NULL, NULL, &j.g)
-    if j.zero_residual[0] < 0.0 and not judge_zero(j, &v, islands, workspace.real):
+    if j.zero_residual[0] < 0.0 and not judge_zero_impulse_of_task(j, &v, islands, workspace.real):
         return
     # cost limits, workspace
     soft = is_soft(&j.p, &j.g)
-    o.work = work_within(&j.p, &j.g, limits, soft)
+    o.work = max_factorisation_work(&j.p, &j.g, limits, soft)
     if not o.work > 0.0:
         return
     lav_workspace_size(&v, &o, &r)
     while code == NEEDS_WORKSPACE and not r.is_bound:
-        if not has_workspace_size(workspace, r.n_index, 0):
+        if not grow_workspace_to(workspace, r.n_index, 0):
             return
         r.index = workspace.index
         code = lav_start(&v, &o, &r, j.lam)
-    if code != NEEDS_WORKSPACE or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits, r.islands, soft):
+    if (code != NEEDS_WORKSPACE
+            or estimate_newton_cost(&j.p, &j.g, limits, r.work) > max_newton_cost(&j.p, &j.g, limits, r.islands, soft)):
         return
-    if m > limits.coulomb_rows and cost_of(&j.p, &j.g, limits, r.work) > j.cost_limit:
+    if m > limits.coulomb_rows and estimate_newton_cost(&j.p, &j.g, limits, r.work) > j.cost_limit:
         return                                          # sweeps use a short time limit better
-    if not has_workspace_size(workspace, 0, r.n_real):
+    if not grow_workspace_to(workspace, 0, r.n_real):
         return
     r.real = workspace.real
     # start and empty rows
@@ -211,54 +217,54 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     o.e0, o.v0 = j.zero_residual[0], j.zero_residual[1]
     if j.cold:
         set_zero_impulse(&j.p, j.lam, j.slack_error)
-    if j.made.n_empty and not set_empty_rows(j, tol):
+    if j.made.n_empty and not set_impulse_of_empty_rows(j, tol):
         return
     # steps, judgement
     lav_start(&v, &o, &r, j.lam)
-    code = step_within_cost(j, &v, &o, &r, limits)
+    code = run_newton_within_cost(j, &v, &o, &r, limits)
     if code != REACHED and not j.limit_reached:
         return
-    if not has_workspace_size(workspace, 0, judging_size(j)):
+    if not grow_workspace_to(workspace, 0, judge_task_workspace_size(j)):
         return
     judge_task(j, tol, workspace.real)
     j.solved = j.relative <= tol
 
 
-cdef inline bint derive_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint compute_matrix_derived(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute A in compressed rows, d, nu and step in `workspace`; return False without memory."""
     cdef int64_t m = j.p.n_rows, entries = m * m + THIN_PADDING if j.dense != NULL else 0
     cdef double* x
     cdef int32_t* empty
-    if not has_workspace_size(workspace, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
+    if not grow_workspace_to(workspace, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
         return False
     x, empty = workspace.real, workspace.index
     if j.dense != NULL:
         j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
-        compress_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
+        compress_dense_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.made.n_empty = matrix_numbers(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
+    j.made.n_empty = compute_csr_derived(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
     return True
 
 
-cdef inline bint derive_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint compute_body_derived(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
     cdef double* x
     cdef double* of_joints
-    if not has_workspace_size(workspace, m + 1, n):
+    if not grow_workspace_to(workspace, m + 1, n):
         return False
     x, of_joints = workspace.real, workspace.real + 3 * (m + 1)
     memset(x, 0, n * sizeof(double))
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
     j.r.minv_jac, j.r.coupling, j.r.inv_inertia_arm = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
-    j.made.n_empty = lav_rows_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), workspace.index, of_joints,
+    j.made.n_empty = lav_compute_body_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), workspace.index, of_joints,
                                        of_joints + 12 * joints,
                                        of_joints + 12 * joints + 5 * c)
-    return first_invalid(j.p.d, m) < 0
+    return find_invalid_number(j.p.d, m) < 0
 
 
-cdef inline bint form_matrix(task_t* j, small_problem_t* s, workspace_t* workspace) noexcept nogil:
+cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_t* workspace) noexcept nogil:
     """Form A of bodies in `workspace`, to be solved instead of them, with its own d and the bodies' nu."""
     cdef int64_t m = j.p.n_rows, k = j.p.n_blocks, n_entries
     cdef int32_t* start
@@ -266,24 +272,25 @@ cdef inline bint form_matrix(task_t* j, small_problem_t* s, workspace_t* workspa
     cdef int32_t* near
     cdef int32_t* ptr
     cdef double* x
-    if not has_workspace_size(workspace, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
+    if not grow_workspace_to(workspace, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
         return False
     start, x = workspace.index, workspace.real
     blocks = start + j.r.n_bodies + 1
     near = blocks + 2 * k + 1
     ptr = near + 4 * k + 2 + m
-    lav_body_blocks(&j.p, &j.r, start, blocks, &n_entries)
+    lav_list_blocks_of_bodies(&j.p, &j.r, start, blocks, &n_entries)
     j.a.indptr, j.a.indices, j.a.data = ptr, ptr + 2 * (m + 1), x + 3 * (m + 1) + 24 * m
     lav_expand_rows(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m)
-    lav_assemble(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2,
+    lav_form_delassus_matrix(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m, start, blocks, near, near + 2 * k + 1,
+                             near + 4 * k + 2,
                  ptr, <int32_t*>j.a.indices, <double*>j.a.data)
     s.over = view_t(j.p, &j.a, NULL, NULL)
     s.over.p.d, s.over.p.nu, s.over.p.step = x, j.p.nu, x + 2 * (m + 1)
-    matrix_numbers(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
+    compute_csr_derived(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
     return True
 
 
-cdef inline view_t judge_view_of(task_t* j) noexcept nogil:
+cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
     """Return the view of the task's data for the judge."""
     cdef view_t v = view_t(j.p, NULL, NULL, NULL)
     if j.general:
@@ -295,28 +302,28 @@ cdef inline view_t judge_view_of(task_t* j) noexcept nogil:
     return v
 
 
-cdef inline bint prepare_small(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
+cdef inline bint prepare_small_problem(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
     """Set up A or bodies for a solve or the judge; return False to defer the task, as with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
-        j.has_derived = derive_bodies(j, &workspaces.made) if j.factored else derive_matrix(j, &workspaces.made)
+        j.has_derived = compute_body_derived(j, &workspaces.made) if j.factored else compute_matrix_derived(j, &workspaces.made)
     if not j.has_derived or j.made.n_empty:
         return False
-    s.v = judge_view_of(j)
+    s.v = make_judge_view(j)
     if j.zero_residual[0] < 0.0:
-        if not has_workspace_size(&workspaces.call.work, 0, 3 * m + scratch_of(&s.v)):
+        if not grow_workspace_to(&workspaces.call.work, 0, 3 * m + count_judge_scratch(&s.v)):
             return False
-        if not judge_zero(j, &s.v, &workspaces.islands, workspaces.call.work.real):
+        if not judge_zero_impulse_of_task(j, &s.v, &workspaces.islands, workspaces.call.work.real):
             return False
     s.over = s.v
     s.zero_residual[0], s.zero_residual[1], s.zero_residual[2] = j.zero_residual[0], j.zero_residual[1], j.zero_residual[2]
     return j.zero_residual[2] >= 0.0
 
 
-cdef inline void copy_judgement(task_t* j, const small_problem_t* s) noexcept nogil:
+cdef inline void copy_small_judgement(task_t* j, const small_problem_t* s) noexcept nogil:
     """Copy the judge's result of a small problem to its task."""
     j.score, j.relative, j.floor, j.float64_relative = s.score, s.relative, s.floor, NAN
-    j.above_floor = above_floor_of(&s.score, s.relative, s.floor)
+    j.above_floor = residual_above_floor(&s.score, s.relative, s.floor)
 
 
 cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, const small_rules_t* rules,
@@ -324,15 +331,16 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
     """Solve A or bodies by the call for small problems; return LEFT, TRIED, STARTED or READY."""
     cdef small_problem_t s
     cdef int32_t code
-    cdef bint pivots = are_bounded(&j.p)
-    if j.p.n_rows > rules.rows or not supports_blocks(&j.p) or not (rules.pivots if pivots else rules.follows):
+    cdef bint pivots = are_all_rows_bounded(&j.p)
+    if j.p.n_rows > rules.rows or not can_use_small_call(&j.p) or not (rules.pivots if pivots else rules.follows):
         return LEFT
-    if not prepare_small(j, &s, workspaces) or (pivots and j.factored and not form_matrix(j, &s, &workspaces.formed)):
+    if (not prepare_small_problem(j, &s, workspaces)
+            or (pivots and j.factored and not form_matrix_of_bodies(j, &s, &workspaces.formed))):
         return LEFT
-    if not lay_few(&s, &workspaces.bound):
+    if not derive_small_problem(&s, &workspaces.bound):
         return LEFT
     code = solve_small(&s, rules, j.lam, j.cold, tol, j.cost_limit, j.slack_error, &workspaces.call, j.counts)
-    copy_judgement(j, &s)
+    copy_small_judgement(j, &s)
     j.push = workspaces.call.work.real + (j.p.n_rows if code == RESULT_IS_START else 0)
     if code != RESULT_IS_START and code != RESULT_SOLVED:
         return TRIED

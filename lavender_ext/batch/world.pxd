@@ -8,15 +8,15 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.core.faults cimport NO_FAULT, body_tolerances_t, find_body_fault, find_friction_fault, is_valid_rhs
-from lavender_ext.core.validate cimport first_invalid_magnitude, has_invalid
-from lavender_ext.core.generalized cimport jac_row
-from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_rows, factor_mass, is_worth_ordering
-from lavender_ext.core.tree cimport tree_pattern
+from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number
+from lavender_ext.core.generalized cimport multiply_jacobian_row
+from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_dense_rows, factor_mass, ordering_pays_off
+from lavender_ext.core.tree cimport find_tree_factor_pattern
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.block_types cimport blocks_t, point_to_block
-from lavender_ext.core.rows cimport rows_times
+from lavender_ext.core.block_types cimport blocks_t, offset_block_arrays
+from lavender_ext.core.rows cimport multiply_jacobian
 from lavender_ext.judge.rounding cimport mass_t
-from lavender_ext.small.workspace cimport has_workspace_size
+from lavender_ext.small.workspace cimport grow_workspace_to
 from lavender_ext.core.thin cimport thin
 from lavender_ext.core.view cimport generalized_t, rows_t
 
@@ -83,7 +83,7 @@ cdef struct worlds_t:
     const int64_t* at           # (n, PLACES)
     const void* array[N_ARRAYS]     # J, M, v*, target, compliance, mu (NULL: mu of the blocks)
     int32_t narrow[N_ARRAYS]    # 1 for float32
-    int64_t jac_row             # stride of the rows of J; 0: number of velocities
+    int64_t multiply_jacobian_row             # stride of the rows of J; 0: number of velocities
     int64_t mass_row            # stride of the rows of M
     const int32_t* mass_ptr     # (nv + 1) row pointers of lower triangles with one shared pattern; NULL: M is dense
     const int32_t* mass_col     # columns, ascending in each row, the diagonal last
@@ -100,7 +100,7 @@ cdef struct worker_scratch_t:   # of one thread
     double* free                # v* of the current world
 
 
-cdef inline void read_numbers(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
+cdef inline void read_array_entries(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
     """Copy n entries of an array to float64."""
     cdef int32_t i
     cdef const float* x = <const float*>w.array[which] + first
@@ -111,7 +111,7 @@ cdef inline void read_numbers(const worlds_t* w, int32_t which, int64_t first, i
         memcpy(out, <const double*>w.array[which] + first, n * sizeof(double))
 
 
-cdef inline const double* read_matrix(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n, int64_t* row,
+cdef inline const double* read_matrix_entries(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n, int64_t* row,
                                   double* out) noexcept nogil:
     """Return a matrix (m, n) in place, or converted from float32 in out (m n); row: stride of its rows."""
     cdef int32_t i
@@ -120,12 +120,12 @@ cdef inline const double* read_matrix(const worlds_t* w, int32_t which, int64_t 
     if not w.narrow[which]:
         return <const double*>w.array[which] + first
     for i in range(m):
-        read_numbers(w, which, first + i * row[0], n, out + <int64_t>i * n)
+        read_array_entries(w, which, first + i * row[0], n, out + <int64_t>i * n)
     row[0] = n
     return out
 
 
-cdef inline int32_t drop_zeros(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
+cdef inline int32_t drop_zeros_of_triangle(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
                                int32_t* idx, double* val) noexcept nogil:
     """Copy a lower triangle in compressed rows without its off-diagonal zeros and return the number of entries."""
     cdef int32_t i, k, q = 0
@@ -144,7 +144,7 @@ cdef inline void compute_factor_pattern(int32_t n, int64_t capacity, const int32
                                         int32_t* t) noexcept nogil:
     """Compute the pattern of L in t (5 n + 1 + capacity): row pointers (n + 1), parents (n), columns (capacity), then scratch."""
     cdef int32_t* scratch = t + 2 * n + 1 + capacity
-    tree_pattern(n, ptr, idx, <int32_t>capacity, t, t + 2 * n + 1, t + n + 1, scratch, scratch + n, scratch + 2 * n)
+    find_tree_factor_pattern(n, ptr, idx, <int32_t>capacity, t, t + 2 * n + 1, t + n + 1, scratch, scratch + n, scratch + 2 * n)
 
 
 cdef inline void bind_factor_pattern(const int32_t* t, int32_t n, generalized_t* g) noexcept nogil:
@@ -157,7 +157,7 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
     """Bind the pattern of L, reusing the previous world's if M has the same pattern; return False without memory."""
     cdef int64_t capacity = <int64_t>n * (n + 1) // 2
     cdef int32_t* t
-    if not has_workspace_size(&d.tree, 6 * <int64_t>n + 2 + 2 * capacity, 0):
+    if not grow_workspace_to(&d.tree, 6 * <int64_t>n + 2 + 2 * capacity, 0):
         return False
     bind_factor_pattern(d.tree.index, n, g)
     t = d.tree.index + 5 * n + 1 + capacity                 # pattern of M
@@ -171,7 +171,7 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
     return True
 
 
-cdef inline int32_t count_zeros(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
+cdef inline int32_t mark_new_zeros(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
     """Count the zeros of x (n); new: whether one is not in `known`. Branch-free 64-bit integers, for vectorisation."""
     cdef int64_t zeros = 0, unknown = 0, zero
     cdef int32_t k
@@ -195,7 +195,7 @@ cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d,
     cdef int32_t* other
     cdef int32_t* ptr
     cdef int64_t* known                                 # positions of zeros that do not change the pattern of L
-    if d.splits or not has_workspace_size(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * capacity), 2 * <int64_t>count):
+    if d.splits or not grow_workspace_to(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * capacity), 2 * <int64_t>count):
         return -1
     t, known = d.tree.index, <int64_t*>d.tree.real
     bind_factor_pattern(t, n, g)
@@ -203,12 +203,12 @@ cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d,
         d.n_tree = n
         compute_factor_pattern(n, capacity, w.mass_ptr, w.mass_col, t)
         memset(known, 0, count * sizeof(int64_t))
-    zeros = count_zeros(x, count, known, &new)
+    zeros = mark_new_zeros(x, count, known, &new)
     if new:
         for k in range(count):
             known[count + k] = known[k] | (x[k] == 0.0)
         other, ptr = t + 5 * n + 1 + capacity, t + 10 * n + 2 + 2 * capacity
-        pattern_without(w, n, known + count, ptr, ptr + n + 1)
+        remove_from_shared_pattern(w, n, known + count, ptr, ptr + n + 1)
         compute_factor_pattern(n, capacity, ptr, ptr + n + 1, other)
         d.splits = memcmp(t, other, (n + 1) * sizeof(int32_t)) != 0 \
             or memcmp(g.lidx, other + 2 * n + 1, t[n] * sizeof(int32_t)) != 0
@@ -219,7 +219,8 @@ cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d,
     return count - zeros
 
 
-cdef inline void pattern_without(const worlds_t* w, int32_t n, const int64_t* out, int32_t* ptr, int32_t* idx) noexcept nogil:
+cdef inline void remove_from_shared_pattern(const worlds_t* w, int32_t n, const int64_t* out, int32_t* ptr,
+                                            int32_t* idx) noexcept nogil:
     """Compute the pattern of the shared M without the positions marked in `out`, keeping the diagonal."""
     cdef int32_t i, k, q = 0
     ptr[0] = 0
@@ -230,54 +231,55 @@ cdef inline void pattern_without(const worlds_t* w, int32_t n, const int64_t* ou
         ptr[i + 1] = q
 
 
-cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, generalized_t* g) noexcept nogil:
+cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p,
+                                              generalized_t* g) noexcept nogil:
     """Convert world i of J and M in the worker's scratch; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
     cdef bint shared = True
-    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
+    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.multiply_jacobian_row
     cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1 + THIN_PADDING, wide = all if m > n else <int64_t>n * n
     cdef const double* a
     cdef int32_t* ptr
     cdef int32_t* idx
     cdef double* x
     cdef double* b
-    if n >= MIN_REORDERED_VELOCITIES or not has_workspace_size(&d.workspace, m + 1 + all + n + 1 + half + k + 1 + THIN_PADDING,
-                                                               numbers + wide):
+    if (n >= MIN_REORDERED_VELOCITIES
+            or not grow_workspace_to(&d.workspace, m + 1 + all + n + 1 + half + k + 1 + THIN_PADDING, numbers + wide)):
         return LEFT
     # J in compressed rows
     ptr, x = d.workspace.index, d.workspace.real
     idx = ptr + m + 1
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
-    a = read_matrix(w, 0, at[JAC], m, n, &row, x + numbers)
-    entries = compress_rows(a, row, m, n, ptr, idx, x)
-    if has_invalid(x, entries):
+    a = read_matrix_entries(w, 0, at[JAC], m, n, &row, x + numbers)
+    entries = compress_dense_rows(a, row, m, n, ptr, idx, x)
+    if has_invalid_number(x, entries):
         return BAD
     # lower triangle of M in compressed rows
     ptr, x = idx + all, x + all
     idx = ptr + n + 1
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
-        a = read_matrix(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
-        if has_invalid(a, entries):
+        a = read_matrix_entries(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
+        if has_invalid_number(a, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
         entries = reuse_shared_pattern(w, d, n, a, g)
         if entries < 0:
             d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
-            entries = drop_zeros(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
+            entries = drop_zeros_of_triangle(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
             shared = False
     else:
         row = w.mass_row
-        a = read_matrix(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
+        a = read_matrix_entries(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
         entries = compress_lower_triangle(a, row, w.asymmetry, n, ptr, idx, x)
-        if entries < 0 or has_invalid(x, entries):
+        if entries < 0 or has_invalid_number(x, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
         shared = False
     if not shared and not find_factor_pattern(d, n, ptr, idx, g):
         return LEFT
-    if is_worth_ordering(g, entries):
+    if ordering_pays_off(g, entries):
         return LEFT
     # M = L^T D L
     x += half
@@ -287,36 +289,36 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
     # b = target - J v*
     x += half + 2 * n
     d.free, b, g.compliance = x, x + n, x + n + m
-    read_numbers(w, 2, at[FREE], n, d.free)
-    read_numbers(w, 3, at[TARGET], m, b)
-    read_numbers(w, 4, at[SOFT], m, <double*>g.compliance)
+    read_array_entries(w, 2, at[FREE], n, d.free)
+    read_array_entries(w, 3, at[TARGET], m, b)
+    read_array_entries(w, 4, at[SOFT], m, <double*>g.compliance)
     for j in range(m):
-        b[j] -= jac_row(g, j, d.free)
-    if first_invalid_magnitude(g.compliance, m) >= 0 or has_invalid(d.free, n) or not is_valid_rhs(b, m):
+        b[j] -= multiply_jacobian_row(g, j, d.free)
+    if find_invalid_magnitude(g.compliance, m) >= 0 or has_invalid_number(d.free, n) or not is_valid_rhs(b, m):
         return BAD
-    return lay_blocks(w, at, p, b, idx + half, x + n + 2 * m)
+    return convert_world_blocks(w, at, p, b, idx + half, x + n + 2 * m)
 
 
-cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, const double** a,
+cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, const double** a,
                                int64_t* row) noexcept nogil:
     """Convert world i of A (m, m), with row stride `row`, in the worker's scratch; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
     cdef double* b
-    if not has_workspace_size(&d.workspace, k + 1, m + k + <int64_t>m * m):
+    if not grow_workspace_to(&d.workspace, k + 1, m + k + <int64_t>m * m):
         return LEFT
-    b, row[0] = d.workspace.real, w.jac_row
-    a[0] = read_matrix(w, 0, at[JAC], m, m, row, b + m + k)
+    b, row[0] = d.workspace.real, w.multiply_jacobian_row
+    a[0] = read_matrix_entries(w, 0, at[JAC], m, m, row, b + m + k)
     for j in range(m):
-        if has_invalid(a[0] + j * row[0], m):
+        if has_invalid_number(a[0] + j * row[0], m):
             return BAD
-    read_numbers(w, 3, at[TARGET], m, b)
+    read_array_entries(w, 3, at[TARGET], m, b)
     if not is_valid_rhs(b, m):
         return BAD
-    return lay_blocks(w, at, p, b, d.workspace.index, b + m)
+    return convert_world_blocks(w, at, p, b, d.workspace.index, b + m)
 
 
-cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, rows_t* r) noexcept nogil:
+cdef inline int32_t convert_body_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, rows_t* r) noexcept nogil:
     """Convert world i of bodies; return READY, or LEFT: `Rows` then corrects small errors or raises."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef const bodies_t* o = &w.bodies
@@ -328,31 +330,31 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     cdef double* b
     cdef double* mu
     size[:] = [o.n, 9 * o.n, 6 * o.n, 12 * w.blocks.ptr[kj], 3 * c, 3 * c, 3 * c, 3 * c, m, m, c]
-    if not has_workspace_size(&d.workspace, kj + c + 1, m + kj + c):
+    if not grow_workspace_to(&d.workspace, kj + c + 1, m + kj + c):
         return LEFT
     for k in range(FIELDS):
         x[k] = o.field[k] + i * o.step[k]
-        if has_invalid(x[k], size[k]):
+        if has_invalid_number(x[k], size[k]):
             return LEFT
     r.n_bodies, r.n_joints, r.n_contacts = o.n, kj, c
     r.joint_body, r.contact_body = o.pair[0] + i * o.pair_step[0], o.pair[1] + i * o.pair_step[1]
     r.inv_mass, r.inv_inertia, r.jac, r.compliance = x[INV_MASS], x[INV_INERTIA], x[JOINT_JAC], x[BODY_COMPLIANCE]
     r.normal, r.tangent, r.arm_a, r.arm_b = x[NORMAL], x[TANGENT], x[ARM_A], x[ARM_B]
-    if find_body_fault(r, &tolerances, &index) != NO_FAULT or first_invalid_magnitude(r.compliance, m) >= 0:
+    if find_body_fault(r, &tolerances, &index) != NO_FAULT or find_invalid_magnitude(r.compliance, m) >= 0:
         return LEFT
     b, mu = d.workspace.real, d.workspace.real + m
     memset(mu, 0, kj * sizeof(double))
     memcpy(mu + kj, x[CONTACT_MU], c * sizeof(double))
-    if lay_blocks(w, at, p, b, d.workspace.index, mu, True) != READY:
+    if convert_world_blocks(w, at, p, b, d.workspace.index, mu, True) != READY:
         return LEFT
     d.free = <double*>x[V_FREE]
-    rows_times(p, r, d.free, b)
+    multiply_jacobian(p, r, d.free, b)
     for k in range(m):
         b[k] = x[BODY_TARGET][k] - b[k]
     return READY if is_valid_rhs(b, m) else LEFT
 
 
-cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
+cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
                                double* mu, bint has_mu=False) noexcept nogil:
     """Bind a world's blocks, with rows from 0, and its own mu if given (`has_mu`: already in mu); return READY or BAD."""
     cdef const blocks_t* all = &w.blocks
@@ -362,11 +364,11 @@ cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p
     for k in range(p.n_blocks + 1):
         ptr[k] = all.ptr[block + k] - first
     p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
-    point_to_block(p, all, block)
+    offset_block_arrays(p, all, block)
     if has_mu:
         p.mu = mu
     elif w.array[5] != NULL:
-        read_numbers(w, 5, at[MU], p.n_blocks, mu)
+        read_array_entries(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
     for k in range(p.n_blocks):
         if find_friction_fault(p, p.kind[k], k) != NO_FAULT:

@@ -33,7 +33,7 @@ cdef enum:                          # NumPy's constants
     DOUBLE = 12
 
 
-cdef inline object zeros(Py_ssize_t n):
+cdef inline object allocate_zeros(Py_ssize_t n):
     """Return n + 1 zeros (float64) from `calloc`: its pages are mapped on first use.
 
     NumPy requests huge pages, and mapping a huge page may take long.
@@ -46,13 +46,13 @@ cdef inline object zeros(Py_ssize_t n):
     return np.asarray(array)
 
 
-cdef inline bint is_of(ndarray x, int kind) noexcept:
+cdef inline bint has_element_type(ndarray x, int kind) noexcept:
     """Return whether the array holds aligned, native DOUBLE or 32-bit INT values, as `kind` requires."""
     return x.flags & ALIGNED and x.descr.byteorder == c"=" and (
         x.descr.type_num == kind or kind == INT and sizeof(long) == sizeof(int32_t) and x.descr.type_num == LONG)
 
 
-cdef inline char* array_data(object array, Py_ssize_t n, Py_ssize_t width, int kind, Py_ssize_t* stride) except? NULL:
+cdef inline char* get_checked_data_pointer(object array, Py_ssize_t n, Py_ssize_t width, int kind, Py_ssize_t* stride) except? NULL:
     """Return the address of an array (n,) or (n, width) of DOUBLE or 32-bit INT; raise ValueError for other arrays.
 
     The caller keeps the array alive. `stride` receives the number of bytes between rows. If `stride` is NULL, the array must
@@ -64,7 +64,7 @@ cdef inline char* array_data(object array, Py_ssize_t n, Py_ssize_t width, int k
         x = <ndarray>array
         for i in range(x.nd):
             count *= x.dimensions[i]
-        if count == n * width and is_of(x, kind):
+        if count == n * width and has_element_type(x, kind):
             if stride == NULL:
                 if x.flags & C_CONTIGUOUS:
                     return x.data
@@ -74,25 +74,25 @@ cdef inline char* array_data(object array, Py_ssize_t n, Py_ssize_t width, int k
     raise ValueError(f"{n * width} numbers of {size} bytes are needed")
 
 
-cdef inline double* doubles(object array, Py_ssize_t n) except? NULL:
+cdef inline double* as_double_pointer(object array, Py_ssize_t n) except? NULL:
     """Return the address of n contiguous float64 values."""
-    return <double*>array_data(array, n, 1, DOUBLE, NULL)
+    return <double*>get_checked_data_pointer(array, n, 1, DOUBLE, NULL)
 
 
-cdef inline int32_t* ints(object array, Py_ssize_t n) except? NULL:
+cdef inline int32_t* as_int_pointer(object array, Py_ssize_t n) except? NULL:
     """Return the address of n contiguous int32 values."""
-    return <int32_t*>array_data(array, n, 1, INT, NULL)
+    return <int32_t*>get_checked_data_pointer(array, n, 1, INT, NULL)
 
 
-cdef inline object freeze(object array):
+cdef inline object make_read_only(object array):
     """Clear the WRITEABLE flag of an array and return the array."""
     (<ndarray>array).flags &= ~WRITEABLE
     return array
 
 
-cdef inline void* address(object array) except? NULL:
+cdef inline void* get_data_pointer(object array) except? NULL:
     """Return the address of the first entry of a C-contiguous float64 or int32 array, NULL if it is empty."""
     cdef Py_ssize_t n = array.size
     if n == 0:
         return NULL
-    return <void*>doubles(array, n) if array.itemsize == sizeof(double) else <void*>ints(array, n)
+    return <void*>as_double_pointer(array, n) if array.itemsize == sizeof(double) else <void*>as_int_pointer(array, n)

@@ -11,12 +11,12 @@ import numpy as np
 
 from lavender_ext.core.csr cimport transpose_csr
 from lavender_ext.core.faults cimport NO_FAULT, find_matrix_fault
-from lavender_ext.core.mass cimport THIN_PADDING, compress_rows
-from lavender_ext.core.validate cimport has_invalid
-from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
+from lavender_ext.core.mass cimport THIN_PADDING, compress_dense_rows
+from lavender_ext.core.validate cimport has_invalid_number
+from lavender_ext.core.block_types cimport blocks_t, count_tangent_rows, count_angular_rows
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times
-from lavender_ext.core.view cimport bodies_of, rows_t
+from lavender_ext.core.rows cimport form_contact_jacobian, dot6, multiply_inverse_mass
+from lavender_ext.core.view cimport get_block_bodies, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
@@ -27,19 +27,19 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
     for i in range(p.n_blocks):
         j = p.ptr[i]
         end = p.ptr[i + 1]
-        a = bodies_of(r, i)[0]
-        b = bodies_of(r, i)[1]
+        a = get_block_bodies(r, i)[0]
+        b = get_block_bodies(r, i)[1]
         if i < r.n_joints:
             for k in range(12 * j, 12 * end):
                 jac[k] = r.jac[k]
         else:
             c = i - r.n_joints
-            contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac + 12 * j)
+            form_contact_jacobian(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), jac + 12 * j)
         for k in range(j, end):
-            minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
+            multiply_inverse_mass(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
 
 
-cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
+cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
                                  int64_t* bound) noexcept nogil:
     """List the blocks of body i in increasing order in blocks[start[i]:start[i + 1]]; start (n + 1), blocks (2 k).
 
@@ -51,7 +51,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         start[i] = 0
     for i in range(p.n_blocks):
         for s in range(2):
-            x = bodies_of(r, i)[s]
+            x = get_block_bodies(r, i)[s]
             if x >= 0:
                 start[x] += 1
     for i in range(r.n_bodies + 1):
@@ -60,7 +60,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         sum_ += t
     for i in range(p.n_blocks):
         for s in range(2):
-            x = bodies_of(r, i)[s]
+            x = get_block_bodies(r, i)[s]
             if x >= 0:
                 blocks[start[x]] = i
                 start[x] += 1
@@ -72,7 +72,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
     bound[0] = 0
     for i in range(p.n_blocks):
         n_rows = p.ptr[i + 1] - p.ptr[i]
-        t = (bodies_of(r, i)[0] >= 0) + (bodies_of(r, i)[1] >= 0)
+        t = (get_block_bodies(r, i)[0] >= 0) + (get_block_bodies(r, i)[1] >= 0)
         # The loop over bodies counts a block with itself once for each of its moving bodies; count it once in all.
         bound[0] += n_rows if t == 0 else (1 - t) * n_rows * n_rows
     for i in range(r.n_bodies):
@@ -82,10 +82,10 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         bound[0] += n_rows * n_rows
 
 
-cdef inline int32_t find_neighbors(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks,
+cdef inline int32_t list_coupled_blocks(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks,
                                    int32_t* out) noexcept nogil:
     """List block i and the blocks that share a body with it in `out`, increasing; return their number."""
-    cdef int32_t a = bodies_of(r, i)[0], b = bodies_of(r, i)[1], x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
+    cdef int32_t a = get_block_bodies(r, i)[0], b = get_block_bodies(r, i)[1], x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
     if a >= 0:
         x = start[a]
         xe = start[a + 1]
@@ -105,18 +105,18 @@ cdef inline int32_t find_neighbors(const rows_t* r, int32_t i, const int32_t* st
     return n
 
 
-cdef inline int32_t shared_sides(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
+cdef inline int32_t find_shared_bodies(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
     """Return a bit set: bit 2 s + t means that side s of block i and side t of block j are the same moving body."""
     cdef int32_t s, t, x, bits = 0
     for s in range(2):
-        x = bodies_of(r, i)[s]
+        x = get_block_bodies(r, i)[s]
         for t in range(2):
-            if x >= 0 and x == bodies_of(r, j)[t]:
+            if x >= 0 and x == get_block_bodies(r, j)[t]:
                 bits |= 1 << (2 * s + t)
     return bits
 
 
-cdef inline double coupling_entry(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
+cdef inline double compute_coupling_entry(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
     """Return the entry of A of two rows: the sum over shared bodies; bit 2 s + t is side s of jac and side t of minv_jac."""
     cdef double value = 0.0
     if bits & 1:
@@ -130,7 +130,7 @@ cdef inline double coupling_entry(const double* jac, const double* minv_jac, int
     return value
 
 
-cdef inline int32_t single_bit(int32_t bits) noexcept nogil:
+cdef inline int32_t index_of_single_bit(int32_t bits) noexcept nogil:
     """Return the index (0 to 3) of the only set bit, -1 if not exactly one bit is set."""
     if bits == 1:
         return 0
@@ -141,7 +141,7 @@ cdef inline int32_t single_bit(int32_t bits) noexcept nogil:
     return 3 if bits == 8 else -1
 
 
-cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
+cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
                               const int32_t* start, const int32_t* blocks, int32_t* neighbors, int32_t* sides,
                               int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
     """Write the rows of A into indptr (m + 1), indices, data; neighbors, sides (2 k + 1) and next_ (m) are scratch.
@@ -154,9 +154,9 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
     cdef const double* y
     indptr[0] = 0
     for i in range(p.n_blocks):
-        n = find_neighbors(r, i, start, blocks, neighbors)
+        n = list_coupled_blocks(r, i, start, blocks, neighbors)
         for q in range(n):
-            sides[q] = shared_sides(r, i, neighbors[q]) if i <= neighbors[q] else 0
+            sides[q] = find_shared_bodies(r, i, neighbors[q]) if i <= neighbors[q] else 0
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(n):
                 j = neighbors[q]
@@ -175,14 +175,14 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
                     continue
                 # diagonal and above: J of this row times M^-1 J^T of the column
                 if col == row:
-                    value = (coupling_entry(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
+                    value = (compute_coupling_entry(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
                     if value != 0.0:
                         indices[nnz] = row
                         data[nnz] = value
                         nnz += 1
                     next_[row] = nnz
                     col += 1
-                bit = single_bit(sides[q])
+                bit = index_of_single_bit(sides[q])
                 if bit >= 0:
                     x = jac + 12 * row + 6 * (bit >> 1)
                     y = minv_jac + 6 * (bit & 1)
@@ -194,7 +194,7 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
                         col += 1
                 else:
                     while col < end:
-                        value = coupling_entry(jac + 12 * row, minv_jac + 12 * col, sides[q])
+                        value = compute_coupling_entry(jac + 12 * row, minv_jac + 12 * col, sides[q])
                         indices[nnz] = col
                         data[nnz] = value
                         nnz += value != 0.0
@@ -202,20 +202,20 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
             indptr[row + 1] = nnz
 
 
-def bound(Data p):
-    """Return an upper bound on the entries of A, and the lists (start, blocks) of `lav_body_blocks`."""
+def bound_delassus_entries(Data p):
+    """Return an upper bound on the entries of A, and the lists (start, blocks) of `lav_list_blocks_of_bodies`."""
     start_ = np.empty(p.rows.n_bodies + 1, np.int32)    # Converting a view back to an array costs more than creating the view.
     blocks_ = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
     cdef int32_t[::1] start = start_, blocks = blocks_
     cdef int64_t max_entries
-    lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &max_entries)
+    lav_list_blocks_of_bodies(&p.blocks, &p.rows, &start[0], &blocks[0], &max_entries)
     return max_entries, start_, blocks_
 
 
-def delassus(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] blocks):
+def form_delassus_matrix(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] blocks):
     """Return A as (indptr, indices, data) of compressed rows with sorted columns.
 
-    The arguments after p are the results of `bound(p)`; max_entries must be below 2^31.
+    The arguments after p are the results of `bound_delassus_entries(p)`; max_entries must be below 2^31.
     """
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef int32_t nnz
@@ -226,7 +226,7 @@ def delassus(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] bl
     cdef int32_t[::1] scratch = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
     with nogil:
         lav_expand_rows(&p.blocks, &p.rows, &jac[0], minv_jac)
-        lav_assemble(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &scratch[0],
+        lav_form_delassus_matrix(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &scratch[0],
                      &scratch[2 * p.blocks.n_blocks + 1], &scratch[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
                      &data[0])
     nnz = indptr[m]
@@ -245,7 +245,7 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
     all_indices, values = np.empty(n + 1 + nnz + THIN_PADDING, np.int32), np.empty(nnz + THIN_PADDING)
     cdef int32_t[::1] indices = all_indices
     cdef double[::1] data = values
-    compress_rows(&a[0, 0] if n and m else NULL, m, <int32_t>n, <int32_t>m, &indices[0], &indices[n + 1], &data[0])
+    compress_dense_rows(&a[0, 0] if n and m else NULL, m, <int32_t>n, <int32_t>m, &indices[0], &indices[n + 1], &data[0])
     if sign != 1.0:
         for q in range(nnz):
             data[q] *= sign
@@ -254,7 +254,7 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
     return all_indices[:n + 1], all_indices[n + 1:n + 1 + nnz], values[:nnz]
 
 
-def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
+def transpose_csr_arrays(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
     """Return (indptr, indices, data) of the transpose of a matrix (m, n) in compressed rows."""
     cdef Py_ssize_t nnz = indices.shape[0]
     ptr_array, row_array, value_array = np.empty(n + 2, np.int32), np.empty(max(nnz, 1), np.int32), np.empty(max(nnz, 1))
@@ -265,11 +265,11 @@ def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const doub
     return ptr_array[:n + 1], row_array[:nnz], value_array[:nnz]
 
 
-def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
+def mirror_lower_triangle(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
     """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, with the diagonal entry last in each row."""
     cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
     cdef Py_ssize_t i, q, k = 0
-    upper = transposed(indptr, indices, data, n)
+    upper = transpose_csr_arrays(indptr, indices, data, n)
     cdef const int32_t[::1] above = upper[0], column = upper[1]
     cdef const double[::1] upper_value = upper[2]
     ptr_array, index_array, value_array = np.zeros(n + 1, np.int32), np.empty(2 * nnz - n, np.int32), np.empty(2 * nnz - n)
@@ -288,7 +288,7 @@ def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double
     return ptr_array, index_array, value_array
 
 
-def stacked(int32_t n, matrices):
+def stack_csr_matrices(int32_t n, matrices):
     """Stack several matrices of n columns vertically; return (indptr, indices, data) without zero entries, or None.
 
     A matrix is (indptr, indices, data, whether it is stored by columns, a sign that it is multiplied with, its number of
@@ -315,7 +315,7 @@ def stacked(int32_t n, matrices):
             return None
         nnz = ptr[ptr.shape[0] - 1]
         if idx.shape[0] and (find_matrix_fault(&ptr[0], &idx[0], <int32_t>ptr.shape[0] - 1, rows if columns else n, nnz, False,
-                                               &fault_at) != NO_FAULT or has_invalid(&val[0], nnz)):
+                                               &fault_at) != NO_FAULT or has_invalid_number(&val[0], nnz)):
             return None
         for i in range(<int32_t>ptr.shape[0] - 1):
             for p in range(ptr[i], ptr[i + 1]):
@@ -343,7 +343,7 @@ def stacked(int32_t n, matrices):
     return indptr[:m + 1], indices, data
 
 
-cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
+cdef public void lav_count_gram_entries(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
                                   const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
     """Write the row pointers of the pattern of Y Y^T + D, diagonal included, into count (m + 1); mark (m) is scratch."""
     cdef int32_t i, q, p, k
@@ -361,13 +361,13 @@ cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_
         count[i + 1] = count[i] + k
 
 
-cdef public int32_t lav_gram(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
+cdef public int32_t lav_form_gram_matrix(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
                              const int32_t* ptr, const int32_t* row, const double* value, const double* diagonal,
                              int32_t* next, double* sum_, int32_t* count, int32_t* out, double* entry) noexcept nogil:
     """Compute Y Y^T + D in compressed rows without zero entries; return the number of entries.
 
     Each entry is a sum over the columns of Y in their order, the same for (i, j) and (j, i). count is from
-    `lav_gram_pattern`; next (2 m) and sum_ (m) are scratch.
+    `lav_count_gram_entries`; next (2 m) and sum_ (m) are scratch.
     """
     cdef int32_t i, j, q, p, k, to = 0, begin
     cdef int32_t* list_ = next + m
@@ -416,7 +416,7 @@ cdef enum:
     TILE = 4                    # rows and columns of A that are summed in registers
 
 
-cdef bint is_full(int32_t m, const int32_t* indptr, const int32_t* indices) noexcept nogil:
+cdef bint has_identical_row_columns(int32_t m, const int32_t* indptr, const int32_t* indices) noexcept nogil:
     """Return whether every row has entries in the same columns, in ascending order."""
     cdef int32_t i, q, n = indptr[1]
     for i in range(m):
@@ -428,8 +428,8 @@ cdef bint is_full(int32_t m, const int32_t* indptr, const int32_t* indices) noex
     return True
 
 
-cdef void full_gram(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a) noexcept nogil:
-    """Compute a (m, m) = Y Y^T of a dense Y (m, n); each entry is summed in the order of the columns, as in `lav_gram`."""
+cdef void form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a) noexcept nogil:
+    """Compute a (m, m) = Y Y^T of a dense Y (m, n), summed in the order of the columns, as in `lav_form_gram_matrix`."""
     cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide
     cdef int64_t k
     cdef double x
@@ -456,7 +456,8 @@ cdef void full_gram(int32_t m, int64_t n, const double* y, const double* y_trans
                     a[<int64_t>(i + r) * m + j + c] = a[<int64_t>(j + c) * m + i + r] = s[TILE * r + c]
 
 
-cdef int32_t full_rows(int32_t m, const double* diagonal, int32_t* count, int32_t* out, double* entry) noexcept nogil:
+cdef int32_t compress_dense_gram_matrix(int32_t m, const double* diagonal, int32_t* count, int32_t* out,
+                                        double* entry) noexcept nogil:
     """Add D to the dense A (m, m) and compress it to rows without zero entries; return the number of entries."""
     cdef int32_t i, j, to = 0
     cdef double x
@@ -473,7 +474,8 @@ cdef int32_t full_rows(int32_t m, const double* diagonal, int32_t* count, int32_
     return to
 
 
-def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n, const double[::1] diagonal):
+def form_gram_matrix(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n,
+                     const double[::1] diagonal):
     """Return (indptr, indices, data) of Y Y^T + D, columns sorted, for Y (m, n) in compressed rows and D = diag(diagonal)."""
     cdef int32_t m = <int32_t>indptr.shape[0] - 1, nnz = <int32_t>indices.shape[0], total
     cdef int32_t[::1] whole = np.empty(n + 2 + nnz + 2 * m + 1, np.int32), count, out
@@ -490,18 +492,18 @@ def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] 
     count = count_array
     with nogil:
         transpose_csr(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
-        full = nnz > 0 and <int64_t>m * m < INT32_MAX and is_full(m, &indptr[0], columns)
+        full = nnz > 0 and <int64_t>m * m < INT32_MAX and has_identical_row_columns(m, &indptr[0], columns)
         if full:
             count[m] = m * m
         else:
-            lav_gram_pattern(m, &indptr[0], columns, ptr, row, scratch, &count[0])
+            lav_count_gram_entries(m, &indptr[0], columns, ptr, row, scratch, &count[0])
     out_array, entry_array = np.empty(count[m], np.int32), np.empty(count[m])
     out, entry = out_array, entry_array
     with nogil:
         if full:
-            full_gram(m, nnz // m, numbers, &value[0], &entry[0])
-            total = full_rows(m, &diagonal[0], &count[0], &out[0], &entry[0])
+            form_dense_gram_matrix(m, nnz // m, numbers, &value[0], &entry[0])
+            total = compress_dense_gram_matrix(m, &diagonal[0], &count[0], &out[0], &entry[0])
         else:
-            total = lav_gram(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz],
+            total = lav_form_gram_matrix(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz],
                              &count[0], &out[0], &entry[0])
     return count_array, out_array[:total], entry_array[:total]

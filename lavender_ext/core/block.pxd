@@ -18,7 +18,8 @@ the engine and the WebAssembly build all use these functions.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport (CONE, MAX_FRICTION_COMPONENTS, blocks_t, get_disk_component, is_disk, is_round, is_rows,
+from lavender_ext.core.block_types cimport (CONE, MAX_FRICTION_COMPONENTS, blocks_t, get_disk_component, is_disk_friction_contact,
+                                            is_round_cone_contact, has_independent_rows,
                                             get_friction_components, friction_components_t)
 
 
@@ -31,7 +32,7 @@ cdef inline double norm2(double x, double y) noexcept nogil:
     return sqrt(x * x + y * y)
 
 
-cdef inline double length(const double* x, int32_t n) noexcept nogil:
+cdef inline double euclidean_norm(const double* x, int32_t n) noexcept nogil:
     """Return the Euclidean norm of x (n)."""
     cdef int32_t i
     cdef double s = 0.0
@@ -40,16 +41,16 @@ cdef inline double length(const double* x, int32_t n) noexcept nogil:
     return sqrt(s)
 
 
-cdef inline double relax_row(double lam, double w, double step, double low, double high) noexcept nogil:
+cdef inline double project_row_update(double lam, double w, double step, double low, double high) noexcept nogil:
     return clip(lam - w * step, low, high)              # (1)
 
 
-cdef inline double relax_normal(double lam, double w, double step) noexcept nogil:
+cdef inline double project_normal_update(double lam, double w, double step) noexcept nogil:
     cdef double y = lam - w * step                      # (2)
     return 0.0 if y < 0.0 else y
 
 
-cdef inline void relax_tangents(double* lam, const double* w, double step, double radius,
+cdef inline void project_tangent_update(double* lam, const double* w, double step, double radius,
                                 int32_t n) noexcept nogil:
     """Update the impulses lam of n tangent rows with slacks w by (3); both rows have the same scalar step.
 
@@ -72,7 +73,7 @@ cdef inline void relax_tangents(double* lam, const double* w, double step, doubl
     lam[1] = y
 
 
-cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
+cdef inline double compute_row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     """Return the error (5) of one row, computed as clip(w / d, lam - high, lam - low).
 
     The form lam - clip(lam - w / d) loses digits if no bound is active, and misses a bound that is much larger than w / d.
@@ -80,12 +81,12 @@ cdef inline double row_error(double lam, double w, double d, double low, double 
     return clip(w / d, lam - high, lam - low)
 
 
-cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,
+cdef inline void compute_tangent_error(const double* lam, const double* w, double d, double radius,
                                int32_t n, double* e) noexcept nogil:
     """Compute the error of n tangent rows on the disk of this radius by (6)."""
     cdef double x, y, r
     if n == 1:
-        e[0] = row_error(lam[0], w[0], d, -radius, radius)
+        e[0] = compute_row_error(lam[0], w[0], d, -radius, radius)
     elif n == 2:
         e[0] = w[0] / d
         e[1] = w[1] / d
@@ -98,28 +99,28 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
             e[1] = lam[1] - r * y
 
 
-cdef inline void coulomb_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
+cdef inline void compute_coulomb_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
                                double* e) noexcept nogil:
     """Compute the error (6) of a contact under Coulomb's law."""
     cdef double normal_impulse = lam[0] if lam[0] > 0.0 else 0.0, inf = 1.0 / 0.0
     cdef int32_t g, j
-    e[0] = row_error(lam[0], w[0], d[0], 0.0, inf)
+    e[0] = compute_row_error(lam[0], w[0], d[0], 0.0, inf)
     for g in range(q.n):
         j = q.first[g]
-        tangent_error(lam + j, w + j, d[j], q.friction_coefficient[g] * normal_impulse, q.size[g], e + j)
+        compute_tangent_error(lam + j, w + j, d[j], q.friction_coefficient[g] * normal_impulse, q.size[g], e + j)
 
 
-cdef inline double scaled_residual(double lam, double w, double d, double r) noexcept nogil:
+cdef inline double scale_projection_argument(double lam, double w, double d, double r) noexcept nogil:
     """Return r (lam - w / d) with r = sqrt(d)."""
     return r * (lam - w / d)
 
 
-cdef inline double radius_ratio(double bound, double size) noexcept nogil:
+cdef inline double scale_to_radius(double bound, double size) noexcept nogil:
     """Return bound / size for a vector longer than its bound; 0 if its size underflowed to 0."""
     return bound / size if size > 0.0 else 0.0
 
 
-cdef inline double projected_normal(const int32_t n, const double* a, const double* t, double yn) noexcept nogil:
+cdef inline double project_cone_normal(const int32_t n, const double* a, const double* t, double yn) noexcept nogil:
     """Return the normal s of the projection (7) onto the cone |y_g| <= a_g s of n components, |y_g| = t_g.
 
     s is the largest of the candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over the subsets of the components, which are
@@ -140,45 +141,45 @@ cdef inline double projected_normal(const int32_t n, const double* a, const doub
     return s
 
 
-cdef inline void cone_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
+cdef inline void compute_cone_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
                             double* e) noexcept nogil:
     """Compute the error (7) of a contact under the cone law, in the variables y = sqrt(d) (lam - w / d)."""
     cdef double t[MAX_FRICTION_COMPONENTS]
     cdef double a[MAX_FRICTION_COMPONENTS]
     cdef double y[6]
-    cdef double rn = sqrt(d[0]), yn = scaled_residual(lam[0], w[0], d[0], rn), total = yn, s, r, f
+    cdef double rn = sqrt(d[0]), yn = scale_projection_argument(lam[0], w[0], d[0], rn), total = yn, s, r, f
     cdef int32_t g, i, j, end
     for g in range(q.n):
         j, end = q.first[g], q.first[g] + q.size[g]
         r = sqrt(d[j])
         a[g] = q.friction_coefficient[g] * r / rn
         for i in range(j, end):
-            y[i] = scaled_residual(lam[i], w[i], d[i], r)
-        t[g] = length(y + j, q.size[g])
+            y[i] = scale_projection_argument(lam[i], w[i], d[i], r)
+        t[g] = euclidean_norm(y + j, q.size[g])
         total += t[g]
-    s = projected_normal(q.n, a, t, yn)
+    s = project_cone_normal(q.n, a, t, yn)
     # e = lam - Pi, which is w / d for rows that the projection does not change
     e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
     for g in range(q.n):
         j, end = q.first[g], q.first[g] + q.size[g]
-        f = radius_ratio(a[g] * s, t[g] * sqrt(d[j]))
+        f = scale_to_radius(a[g] * s, t[g] * sqrt(d[j]))
         for i in range(j, end):
             e[i] = lam[i] - f * y[i] if t[g] > a[g] * s else w[i] / d[i]
     if total != total:
         e[0] = total                                    # NaN: comparisons above would hide it
 
 
-cdef inline int32_t row_group(int32_t tangent) noexcept nogil:
+cdef inline int32_t index_of_row_group(int32_t tangent) noexcept nogil:
     """Return the group of tangent row 1 to 5: 0 sliding (rows 1, 2), 1 spin (row 3), 2 rolling (rows 4, 5)."""
     return 0 if tangent < 3 else (1 if tangent == 3 else 2)
 
 
-cdef inline double round_denominator_offset(double a, double yn) noexcept nogil:
+cdef inline double compute_round_denominator_offset(double a, double yn) noexcept nogil:
     """Return q_g of (8) at r = 0."""
     return a * a * yn if yn > 0.0 else -yn
 
 
-cdef inline int32_t locate_in_round_cone(const double* t, const double* a, double yn, double* rise, double* size) noexcept nogil:
+cdef inline int32_t classify_in_round_cone(const double* t, const double* a, double yn, double* rise, double* size) noexcept nogil:
     """Classify y by T_g in t (3) and a_g in a (3): return -1 in the polar cone, 1 in the cone, else 0 with r of (8) in `rise`.
 
     `size` receives the norm of T_g / a_g, which is NaN if y is.
@@ -209,7 +210,7 @@ cdef inline int32_t locate_in_round_cone(const double* t, const double* a, doubl
             slope = 0.0
             for g in range(3):
                 if t[g] > 0.0:
-                    q = (1.0 + a[g] * a[g]) * r + round_denominator_offset(a[g], yn)
+                    q = (1.0 + a[g] * a[g]) * r + compute_round_denominator_offset(a[g], yn)
                     f = a[g] * t[g] / q
                     h += f * f
                     slope += 2.0 * f * f * (1.0 + a[g] * a[g]) / q
@@ -223,19 +224,19 @@ cdef inline int32_t locate_in_round_cone(const double* t, const double* a, doubl
     return 0
 
 
-cdef inline double round_scale(double a, double rise, double yn) noexcept nogil:
+cdef inline double compute_round_cone_scale(double a, double rise, double yn) noexcept nogil:
     """Return Pi_g / y_g of (8)."""
-    cdef double q = (1.0 + a * a) * rise + round_denominator_offset(a, yn)
+    cdef double q = (1.0 + a * a) * rise + compute_round_denominator_offset(a, yn)
     return a * (a * ((yn if yn > 0.0 else 0.0) + rise) / q) if q > 0.0 else 0.0
 
 
-cdef inline double round_scale_complement(double a, double rise, double yn) noexcept nogil:
+cdef inline double compute_round_cone_scale_complement(double a, double rise, double yn) noexcept nogil:
     """Return 1 - Pi_g / y_g of (8) without cancellation."""
-    cdef double q = (1.0 + a * a) * rise + round_denominator_offset(a, yn)
+    cdef double q = (1.0 + a * a) * rise + compute_round_denominator_offset(a, yn)
     return (rise if yn > 0.0 else rise - yn) / q if q > 0.0 else 1.0
 
 
-cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
+cdef inline void compute_round_cone_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
                              double* e) noexcept nogil:
     """Compute the error (7) of a ROUND contact, |lam_T| <= mu lam_n over all its tangents together.
 
@@ -243,51 +244,52 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
     """
     cdef double t[3]
     cdef double a[3]
-    cdef double rn = sqrt(d[0]), yn = scaled_residual(lam[0], w[0], d[0], rn), y, r = 0.0, f, inside = 0.0
+    cdef double rn = sqrt(d[0]), yn = scale_projection_argument(lam[0], w[0], d[0], rn), y, r = 0.0, f, inside = 0.0
     cdef int32_t i, g, zone
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
     for i in range(1, 1 + nt):
-        g = row_group(i)
-        t[g] = norm2(t[g], scaled_residual(lam[i], w[i], d[i], sqrt(d[i])))
+        g = index_of_row_group(i)
+        t[g] = norm2(t[g], scale_projection_argument(lam[i], w[i], d[i], sqrt(d[i])))
         a[g] = mu * sqrt(d[i]) / rn
-    zone = locate_in_round_cone(t, a, yn, &r, &inside)
+    zone = classify_in_round_cone(t, a, yn, &r, &inside)
     for i in range(1 + nt):
         e[i] = lam[i] if zone < 0 else w[i] / d[i]
     if zone == 0:
         # If the projection changes a row little, lam - Pi is w / d plus that change; this avoids cancellation.
         e[0] = (e[0] if yn > 0.0 else lam[0]) - r / rn
         for i in range(1, 1 + nt):
-            f = round_scale(a[row_group(i)], r, yn)
+            f = compute_round_cone_scale(a[index_of_row_group(i)], r, yn)
             y = lam[i] - e[i]
-            e[i] = e[i] + round_scale_complement(a[row_group(i)], r, yn) * y if f > 0.5 else lam[i] - f * y
+            e[i] = e[i] + compute_round_cone_scale_complement(a[index_of_row_group(i)], r, yn) * y if f > 0.5 else lam[i] - f * y
     if not (yn == yn and inside == inside):
         e[0] = yn + inside                              # NaN: comparisons above would hide it
 
 
-cdef inline void contact_error(int32_t law, const double* lam, const double* w, const double* d, const friction_components_t* q,
+cdef inline void compute_contact_error(int32_t law, const double* lam, const double* w, const double* d,
+                                       const friction_components_t* q,
                                double* e) noexcept nogil:
     """Compute the error e of one contact with friction components q under `law`."""
     if law == CONE:
-        cone_error(lam, w, d, q, e)
+        compute_cone_error(lam, w, d, q, e)
     else:
-        coulomb_error(lam, w, d, q, e)
+        compute_coulomb_error(lam, w, d, q, e)
 
 
-cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
+cdef inline void compute_block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
                              double* e) noexcept nogil:
     """Compute the error e [N s] of block i; lam, w, e are vectors of all rows (m)."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1]
     cdef friction_components_t q
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         while j < end:
-            e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
+            e[j] = compute_row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
             j += 1
-    elif is_disk(p, i):                                 # the common case, compiled with constant sizes
+    elif is_disk_friction_contact(p, i):                                 # the common case, compiled with constant sizes
         get_disk_component(p, i, &q)
-        contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
-    elif is_round(p, i):
-        round_error(lam + j, w + j, p.d + j, p.mu[i], end - j - 1, e + j)
+        compute_contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
+    elif is_round_cone_contact(p, i):
+        compute_round_cone_error(lam + j, w + j, p.d + j, p.mu[i], end - j - 1, e + j)
     else:
         get_friction_components(p, i, &q)
-        contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
+        compute_contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)

@@ -24,11 +24,11 @@ solutions (derivative/natural.pxd).
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length, projected_normal
+from lavender_ext.core.block cimport euclidean_norm, project_cone_normal
 from lavender_ext.core.block_types cimport CONE, MAX_FRICTION_COMPONENTS, friction_components_t
 
 
-cdef inline int32_t active_bound(double y, double lower, double upper) noexcept nogil:
+cdef inline int32_t classify_active_bound(double y, double lower, double upper) noexcept nogil:
     """Return -1 if y is not above `lower`, 1 if it is not below `upper`, otherwise 0, where P = 1 in (1); 0 for NaN."""
     return -1 if y <= lower else (1 if y >= upper else 0)
 
@@ -47,7 +47,8 @@ cdef inline void add_tangential_derivative(const double* y, double t, double kap
             p[(j + k) * n + j + l] += kappa * (square - u[k] * u[k] if k == l else -u[k] * u[l])
 
 
-cdef inline void project_components(int32_t law, const int32_t n_components, const int32_t n, const friction_components_t* q,
+cdef inline void project_contact_components(int32_t law, const int32_t n_components, const int32_t n,
+                                            const friction_components_t* q,
                                     const double* y, double* out, double* p) noexcept nogil:
     """Compute Pi(y) and P of `project_contact` for n rows and n_components friction components."""
     cdef double t[MAX_FRICTION_COMPONENTS]
@@ -60,9 +61,9 @@ cdef inline void project_components(int32_t law, const int32_t n_components, con
         out[k] = ray[k] = 0.0
     x = y[0]
     for g in range(n_components):
-        t[g] = length(y + q.first[g], q.size[g])
+        t[g] = euclidean_norm(y + q.first[g], q.size[g])
         x += t[g]
-    s = projected_normal(n_components, q.friction_coefficient, t, y[0]) if law == CONE else y[0] if y[0] > 0.0 else 0.0
+    s = project_cone_normal(n_components, q.friction_coefficient, t, y[0]) if law == CONE else y[0] if y[0] > 0.0 else 0.0
     out[0] = s
     if x != x:
         out[0] = x                                      # NaN: the comparisons below would hide it
@@ -106,11 +107,11 @@ cdef inline void project_contact(int32_t law, const friction_components_t* q, co
     cdef friction_components_t disk
     if q.n == 1 and q.size[0] == 2:                     # one disk: compiled with constant sizes
         disk.n, disk.first[0], disk.size[0], disk.friction_coefficient[0] = 1, 1, 2, q.friction_coefficient[0]
-        project_components(law, 1, 3, &disk, y, out, p)
+        project_contact_components(law, 1, 3, &disk, y, out, p)
     elif q.n:
-        project_components(law, q.n, q.first[q.n - 1] + q.size[q.n - 1], q, y, out, p)
+        project_contact_components(law, q.n, q.first[q.n - 1] + q.size[q.n - 1], q, y, out, p)
     else:
-        project_components(law, 0, 1, q, y, out, p)
+        project_contact_components(law, 0, 1, q, y, out, p)
 
 
 cdef inline void evaluate_natural_map(int32_t law, const friction_components_t* q, int32_t n, const double* z, const double* s,
@@ -140,7 +141,7 @@ cdef inline void differentiate_by_coefficients(int32_t law, const friction_compo
     ray[0] = 1.0
     for g in range(q.n):
         j = q.first[g]
-        t = length(y + j, q.size[g])
+        t = euclidean_norm(y + j, q.size[g])
         if t > q.friction_coefficient[g] * s:
             for k in range(j, j + q.size[g]):
                 ray[k] = q.friction_coefficient[g] * y[k] / t
@@ -148,7 +149,7 @@ cdef inline void differentiate_by_coefficients(int32_t law, const friction_compo
             norm += q.friction_coefficient[g] * q.friction_coefficient[g]
     for g in range(q.n if law == CONE else 0):
         j = q.first[g]
-        t = length(y + j, q.size[g])
+        t = euclidean_norm(y + j, q.size[g])
         if t > q.friction_coefficient[g] * s:
             for k in range(n):
                 edge[k * n + j] += ray[k] * (t - 2.0 * q.friction_coefficient[g] * s) / norm

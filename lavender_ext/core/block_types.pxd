@@ -8,7 +8,7 @@ rows. It differs from (1): it is bounded in the norm of its own metric, and each
 two rolling) has one d.
 
 Kernels that work on a contact use its friction components, not its kind. Only kernels that read or write bodies need the
-meaning of the rows in space (`n_tangents`, `n_angular_rows`).
+meaning of the rows in space (`count_tangent_rows`, `count_angular_rows`).
 """
 from libc.stdint cimport int32_t
 
@@ -77,7 +77,7 @@ cdef inline void get_friction_arrays(const blocks_t* p, const double** x) noexce
     x[0], x[1], x[2] = p.mu, p.patch_radius, p.rolling
 
 
-cdef inline void point_to_block(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
+cdef inline void offset_block_arrays(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
     """Point the arrays of `p` with one entry per block at block i of `all`."""
     p.kind, p.mu, p.patch_radius, p.rolling = all.kind + i, all.mu + i, all.patch_radius + i, all.rolling + i
 
@@ -103,32 +103,32 @@ cdef inline void write_contact_bounds(const blocks_t* p) noexcept nogil:
                 (<double*>p.upper)[j] = 1.0 / 0.0
 
 
-cdef inline bint is_rows(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint has_independent_rows(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether block i is a set of bounded rows."""
     return p.kind[i] == ROW
 
 
-cdef inline bint is_round(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint is_round_cone_contact(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether block i is a round cone: one component of more than two rows."""
     return p.kind[i] == ROUND
 
 
-cdef inline bint is_disk(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint is_disk_friction_contact(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether block i has one component of two rows: the common case, which loops compile with constant sizes."""
     return p.kind[i] == CONTACT and p.ptr[i + 1] - p.ptr[i] == 3
 
 
-cdef inline bint is_box(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint is_box_friction_contact(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether block i has two components of one tangent row each."""
     return p.kind[i] == CONTACT_BOX
 
 
-cdef inline int32_t contact_kind(bint box, bint spins, bint rolls, int32_t tangents) noexcept nogil:
+cdef inline int32_t choose_contact_kind(bint box, bint spins, bint rolls, int32_t tangents) noexcept nogil:
     """Return the kind of a contact with these properties."""
     return CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spins else CONTACT
 
 
-cdef inline void add_component(friction_components_t* q, int32_t size, double friction_coefficient) noexcept nogil:
+cdef inline void append_friction_component(friction_components_t* q, int32_t size, double friction_coefficient) noexcept nogil:
     """Append a component to q, after the rows of the last one."""
     q.first[q.n] = 1 if q.n == 0 else q.first[q.n - 1] + q.size[q.n - 1]
     q.size[q.n] = size
@@ -137,27 +137,27 @@ cdef inline void add_component(friction_components_t* q, int32_t size, double fr
 
 
 cdef inline void get_friction_components(const blocks_t* p, int32_t i, friction_components_t* q) noexcept nogil:
-    """Write the friction components of block i into q, in the order of its rows; none if block i `is_rows`."""
+    """Write the friction components of block i into q, in the order of its rows; none if block i `has_independent_rows`."""
     cdef int32_t kind = p.kind[i], n = p.ptr[i + 1] - p.ptr[i] - 1
     q.n = 0
     if n < 1 or kind == ROW:
         return
     if kind == CONTACT or kind == ROUND:
-        add_component(q, n, p.mu[i])
+        append_friction_component(q, n, p.mu[i])
         return
     if kind == CONTACT_ROLLING:
-        add_component(q, 2, p.mu[i])
+        append_friction_component(q, 2, p.mu[i])
         if n == 5:
-            add_component(q, 1, p.mu[i] * p.patch_radius[i])
-        add_component(q, 2, p.rolling[i])
+            append_friction_component(q, 1, p.mu[i] * p.patch_radius[i])
+        append_friction_component(q, 2, p.rolling[i])
         return
     if n > 1:                                           # all but the last row, which is spin or the second side of a box
-        add_component(q, n - 1, p.mu[i])
-    add_component(q, 1, p.mu[i] * p.patch_radius[i])
+        append_friction_component(q, n - 1, p.mu[i])
+    append_friction_component(q, 1, p.mu[i] * p.patch_radius[i])
 
 
 cdef inline void get_disk_component(const blocks_t* p, int32_t i, friction_components_t* q) noexcept nogil:
-    """Write the friction component of block i, which `is_disk`, into q."""
+    """Write the friction component of block i, which `is_disk_friction_contact`, into q."""
     q.n, q.first[0], q.size[0], q.friction_coefficient[0] = 1, 1, 2, p.mu[i]
 
 
@@ -167,14 +167,14 @@ cdef inline void get_row_groups(const blocks_t* p, int32_t i, friction_component
     The groups are the friction components; for a round cone they are 2 sliding rows, 1 spin row and 1 or 2 rolling rows.
     """
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i] - 1
-    if not is_round(p, i):
+    if not is_round_cone_contact(p, i):
         get_friction_components(p, i, q)
         return
     q.n = 0
-    add_component(q, 2, p.mu[i])
-    add_component(q, 1, p.mu[i])
+    append_friction_component(q, 2, p.mu[i])
+    append_friction_component(q, 1, p.mu[i])
     if n > 3:
-        add_component(q, n - 3, p.mu[i])
+        append_friction_component(q, n - 3, p.mu[i])
 
 
 cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
@@ -189,7 +189,7 @@ cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
     return False
 
 
-cdef inline int32_t n_angular_rows(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline int32_t count_angular_rows(const blocks_t* p, int32_t i) noexcept nogil:
     """Return the number of angular rows of contact i, which follow its tangents.
 
     The number is also a bit set: bit 0 is one spin row, bit 1 is two rolling rows (1, 2 or 3 rows in all).
@@ -197,6 +197,6 @@ cdef inline int32_t n_angular_rows(const blocks_t* p, int32_t i) noexcept nogil:
     return 1 if p.kind[i] == CONTACT_SPIN else p.ptr[i + 1] - p.ptr[i] - 3 if p.kind[i] == CONTACT_ROLLING else 0
 
 
-cdef inline int32_t n_tangents(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline int32_t count_tangent_rows(const blocks_t* p, int32_t i) noexcept nogil:
     """Return the number of tangent rows of contact i."""
-    return p.ptr[i + 1] - p.ptr[i] - 1 - n_angular_rows(p, i)
+    return p.ptr[i + 1] - p.ptr[i] - 1 - count_angular_rows(p, i)

@@ -17,10 +17,10 @@ cdef class Blocks:
     cdef readonly bint has_ellipse                      # some contact bounds its two tangents by an ellipse
     cdef readonly bint single_rows                      # every block is one bounded row
 
-    cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+    cdef bint bind_arrays(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                     const double[::1] upper, const double[::1] mu, const double[::1] radius,
                     const double[::1] rolling)
-    cdef bint check(self) noexcept
+    cdef bint validate(self) noexcept
 
 
 cdef Blocks allocate_blocks(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=*, Py_ssize_t numbers=*)

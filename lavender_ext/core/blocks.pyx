@@ -7,10 +7,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport DOUBLE, INT, freeze, is_of, ndarray
+from lavender_ext.core.arrays cimport DOUBLE, INT, make_read_only, has_element_type, ndarray
 from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault
 from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, bind_friction_arrays,
-                                            blocks_t, contact_kind, write_contact_bounds)
+                                            blocks_t, choose_contact_kind, write_contact_bounds)
 
 #: Kernel numbers of the kinds of blocks.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
@@ -43,7 +43,7 @@ cdef class Blocks:
     def n_rows(self):
         return self.at.n_rows
 
-    cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+    cdef bint bind_arrays(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                     const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling):
         cdef Py_ssize_t k = kind.shape[0], m = lower.shape[0]
         if ptr.shape[0] != k + 1 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m \
@@ -63,7 +63,7 @@ cdef class Blocks:
             self.at.rolling = &rolling[0]
         return m > 0 or k == 0
 
-    cdef bint check(self) noexcept:
+    cdef bint validate(self) noexcept:
         """Set the first fault, or the flags of the blocks; return whether there is no fault."""
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
@@ -96,7 +96,7 @@ cdef Blocks allocate_blocks(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ss
     `ints` int32 and `numbers` float64 of extra memory follow at the end of the arrays.
     """
     cdef Blocks blocks = Blocks.__new__(Blocks)
-    blocks.ints, blocks.numbers = freeze(new(2 * k + 1 + ints, I4)), freeze(new(2 * m + 3 * k + numbers))
+    blocks.ints, blocks.numbers = make_read_only(new(2 * k + 1 + ints, I4)), make_read_only(new(2 * m + 3 * k + numbers))
     blocks.at.n_blocks = <int32_t>k
     blocks.at.n_rows = <int32_t>m
     blocks.at.ptr = <int32_t*>(<ndarray>blocks.ints).data
@@ -168,16 +168,16 @@ def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
     cdef Py_ssize_t j
     for x, type_number in ((ptr, INT), (kind, INT), (lower, DOUBLE), (upper, DOUBLE), (mu, DOUBLE), (patch_radius, DOUBLE),
                            (rolling, DOUBLE)):
-        if type(x) is not ndarray or not is_of(x, type_number) or x.ndim != 1 or not x.flags.c_contiguous:
+        if type(x) is not ndarray or not has_element_type(x, type_number) or x.ndim != 1 or not x.flags.c_contiguous:
             return None
-    if not source.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
+    if not source.bind_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling):
         return None
     for j in range(source.at.n_rows):
         if source.at.lower[j] != source.at.lower[j] or source.at.upper[j] != source.at.upper[j]:
             return None
     blocks = allocate_blocks(source.at.n_blocks, source.at.n_rows)
     copy_blocks(blocks, 0, 0, &source.at)
-    if blocks.check():
+    if blocks.validate():
         write_contact_bounds(&blocks.at)
     return blocks
 
@@ -185,20 +185,20 @@ def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
 def view_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Return blocks that read these arrays in place; raise ValueError if they do not fit each other or have a fault."""
     cdef Blocks blocks = Blocks.__new__(Blocks)
-    if not blocks.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not blocks.check():
+    if not blocks.bind_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling) or not blocks.validate():
         raise ValueError("the arrays do not fit each other, or have a fault")
     blocks._arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
     return blocks
 
 
-def free_rows(Py_ssize_t m):
+def make_free_rows(Py_ssize_t m):
     """Return m unbounded rows, each a block; None if m is negative or exceeds 32-bit indices."""
     if not 0 <= m < 2147483647:
         return None
-    return rows_between(m, NULL, NULL)
+    return make_equally_bounded_rows(m, NULL, NULL)
 
 
-def bounded_rows(lower, upper):
+def make_bounded_rows(lower, upper):
     """Return one row per pair of bounds; `upper` may be inf for all rows. Return None if the arrays need detailed validation."""
     cdef const double[::1] low, high
     cdef Py_ssize_t m
@@ -210,10 +210,10 @@ def bounded_rows(lower, upper):
     m = low.shape[0]
     if high.shape[0] != m or m >= 2147483647:
         return None
-    return rows_between(m, &low[0] if m else NULL, &high[0] if m and not open_ else NULL)
+    return make_equally_bounded_rows(m, &low[0] if m else NULL, &high[0] if m and not open_ else NULL)
 
 
-cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper):
+cdef Blocks make_equally_bounded_rows(Py_ssize_t m, const double* lower, const double* upper):
     """Return m single-row blocks with these bounds, or None if a bound is invalid; NULL means unbounded."""
     cdef Blocks blocks = allocate_blocks(m, m)
     cdef Py_ssize_t i
@@ -224,10 +224,10 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
         (<double*>blocks.at.mu)[i] = (<double*>blocks.at.patch_radius)[i] = (<double*>blocks.at.rolling)[i] = 0.0
         (<double*>blocks.at.lower)[i] = -INF if lower == NULL else lower[i]
         (<double*>blocks.at.upper)[i] = INF if upper == NULL else upper[i]
-    return blocks if blocks.check() else None
+    return blocks if blocks.validate() else None
 
 
-def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
+def make_contact_blocks(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
     """Return k contacts, or None if the arguments need detailed validation.
 
     Each contact has `tangents` tangent rows, a spin row if `radius` (k,) is given, and two rolling rows if `rolling` (k,)
@@ -239,7 +239,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i
-    kind = sides if sides else contact_kind(False, spin, has_rolling, tangents)
+    kind = sides if sides else choose_contact_kind(False, spin, has_rolling, tangents)
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -265,4 +265,4 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
         (<double*>blocks.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         (<double*>blocks.at.rolling)[i] = moment[i] if has_rolling else 0.0
     write_contact_bounds(&blocks.at)
-    return blocks if blocks.check() else None
+    return blocks if blocks.validate() else None

@@ -5,9 +5,9 @@ These functions report no reasons. If a check fails, the caller validates again 
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core cimport validate
-from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, doubles, ints, is_of, ndarray
+from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, as_double_pointer, as_int_pointer, has_element_type, ndarray
 from lavender_ext.core.faults cimport body_tolerances_t, find_body_fault as find_body_fault_of
-from lavender_ext.core.validate cimport first_invalid_magnitude, has_invalid, max_magnitude, min_magnitude
+from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number, max_magnitude, min_magnitude
 from lavender_ext.core.view cimport rows_t
 
 #: Names of the faults of core/faults.pxd, by number.
@@ -30,36 +30,36 @@ def as_plain_array(value, tuple shape, bint finite, bint copy):
     if type(value) is not ndarray:
         return None
     array = <ndarray>value
-    if array.nd != len(shape) or not array.flags & C_CONTIGUOUS or not is_of(array, DOUBLE):
+    if array.nd != len(shape) or not array.flags & C_CONTIGUOUS or not has_element_type(array, DOUBLE):
         return None
     for i in range(array.nd):
         length = shape[i]
         n *= array.dimensions[i]
         if length is not None and length != array.dimensions[i]:
             return None
-    if finite and has_invalid(<const double*>array.data, n):
+    if finite and has_invalid_number(<const double*>array.data, n):
         return None
     result = value.copy() if copy else value
     result.setflags(False)
     return result
 
 
-def all_valid(x):
+def all_in_valid_range(x):
     """Return whether every number of a float64 array satisfies core/validate.pxd (1): no NaN, at most MAX_MAGNITUDE."""
-    return not has_invalid(doubles(x, x.size), x.size)
+    return not has_invalid_number(as_double_pointer(x, x.size), x.size)
 
 
-def first_invalid_magnitude_of(const double[::1] x):
+def find_invalid_magnitude_in_array(const double[::1] x):
     """Return the index of the first number that is neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE], or -1."""
-    return first_invalid_magnitude(&x[0], x.shape[0]) if x.shape[0] else -1
+    return find_invalid_magnitude(&x[0], x.shape[0]) if x.shape[0] else -1
 
 
-def norm_inf(x):
+def max_abs_of_array(x):
     """Return max |x_i| of a float64 array: 0 if it is empty, NaN if any entry is NaN."""
-    return validate.norm_inf(doubles(x, x.size), x.size)
+    return validate.norm_inf(as_double_pointer(x, x.size), x.size)
 
 
-def has_negative(const double[::1] x):
+def has_negative_number(const double[::1] x):
     """Return whether any number is below 0."""
     cdef Py_ssize_t i
     for i in range(x.shape[0]):
@@ -68,7 +68,7 @@ def has_negative(const double[::1] x):
     return False
 
 
-def counts_up(const int32_t[::1] ptr):
+def is_increasing_from_zero(const int32_t[::1] ptr):
     """Return whether the pointers begin with 0 and strictly increase."""
     cdef Py_ssize_t i
     if ptr.shape[0] == 0 or ptr[0] != 0:
@@ -90,8 +90,8 @@ def find_body_fault(inv_mass, inv_inertia, joint_body, contact_body, normal, tan
     cdef double loose = 0.0 if checks_inertia else 1.0 / 0.0
     cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10 + loose, loose, 1e-6)
     r.n_bodies, r.n_joints, r.n_contacts = <int32_t>len(inv_mass), <int32_t>len(joint_body), <int32_t>len(contact_body)
-    r.inv_mass, r.inv_inertia = doubles(inv_mass, r.n_bodies), doubles(inv_inertia, 9 * r.n_bodies)
-    r.joint_body, r.contact_body = ints(joint_body, 2 * r.n_joints), ints(contact_body, 2 * r.n_contacts)
-    r.normal, r.tangent = doubles(normal, 3 * r.n_contacts), doubles(tangent, 3 * r.n_contacts)
+    r.inv_mass, r.inv_inertia = as_double_pointer(inv_mass, r.n_bodies), as_double_pointer(inv_inertia, 9 * r.n_bodies)
+    r.joint_body, r.contact_body = as_int_pointer(joint_body, 2 * r.n_joints), as_int_pointer(contact_body, 2 * r.n_contacts)
+    r.normal, r.tangent = as_double_pointer(normal, 3 * r.n_contacts), as_double_pointer(tangent, 3 * r.n_contacts)
     cdef int32_t fault = find_body_fault_of(&r, &tolerances, &index)
     return FAULT_NAMES[fault], index if fault else -1

@@ -10,11 +10,13 @@ successive contacts, 1.3 times as fast.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get_friction_components, is_box, is_disk,
-                                            n_angular_rows, n_tangents)
+from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get_friction_components, is_box_friction_contact,
+                                            is_disk_friction_contact,
+                                            count_angular_rows, count_tangent_rows)
 from lavender_ext.core.joint cimport relax_joint_block
-from lavender_ext.core.numbers cimport (apply_contact_changes, clip_below_zero, clip_to_bound, constant, dot_numbers, number_t,
-                                        project_disk, relative_angular_velocity)
+from lavender_ext.core.numbers cimport (apply_contact_changes, clip_below_zero, clip_to_bound, constant_of_type, dot_numbers,
+                                        number_t,
+                                        project_disk, compute_relative_angular_velocity)
 from lavender_ext.core.rows cimport cross
 from lavender_ext.core.view cimport rows_t
 
@@ -88,7 +90,7 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
     cdef int32_t k, spin_row = 1 + nt, rolling_row = 1 + nt + spins
     # relative velocity
     for k in range(3):
-        u[k] = constant(lam, 0.0)
+        u[k] = constant_of_type(lam, 0.0)
     if body_b >= 0:
         u[0] = vb[0] + (vb[4] * arm_b[2] - vb[5] * arm_b[1])
         u[1] = vb[1] + (vb[5] * arm_b[0] - vb[3] * arm_b[2])
@@ -98,12 +100,12 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
         u[1] = u[1] - (va[1] + (va[5] * arm_a[0] - va[3] * arm_a[2]))
         u[2] = u[2] - (va[2] + (va[3] * arm_a[1] - va[4] * arm_a[0]))
     if spins:
-        relative_angular_velocity(va, vb, body_a, body_b, omega)
+        compute_relative_angular_velocity(va, vb, body_a, body_b, omega)
     # normal
     slack = dot_numbers(normal, u) + (compliance[0] * lam[0] - b[0])
     normal_impulse = clip_below_zero(lam[0] - slack * step[0])
     change[0] = normal_impulse - lam[0]
-    change[1] = change[2] = change[3] = constant(lam, 0.0)
+    change[1] = change[2] = change[3] = constant_of_type(lam, 0.0)
     lam[0] = normal_impulse
     for k in range(3):
         impulse[k] = change[0] * normal[k]
@@ -148,7 +150,7 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
         apply_contact_changes(vb, <const number_t*>c.inv_mass_b, inv_inertia_arm + 3, impulse, change, nt, spins, 1)
     # rolling rows
     if rolls:
-        relative_angular_velocity(va, vb, body_a, body_b, omega)
+        compute_relative_angular_velocity(va, vb, body_a, body_b, omega)
         friction_bound = (<const number_t*>c.rolling_mu)[0] * normal_impulse
         compliance += rolling_row
         b += rolling_row
@@ -169,7 +171,7 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
                 vb[3 + k] = vb[3 + k] + (change[0] * inv_inertia_arm[3 + k] + change[1] * inv_inertia_arm[9 + k])
 
 
-cdef inline void bind_contact(const blocks_t* p, const rows_t* r, int32_t i, contact_t* out) noexcept nogil:
+cdef inline void bind_contact_arrays(const blocks_t* p, const rows_t* r, int32_t i, contact_t* out) noexcept nogil:
     """Point `out` at the arrays of contact block i, without its second tangent and friction coefficients."""
     cdef int32_t c = i - r.n_joints, j = p.ptr[i], a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
     out.normal, out.tangent1 = r.normal + 3 * c, r.tangent + 3 * c
@@ -180,12 +182,13 @@ cdef inline void bind_contact(const blocks_t* p, const rows_t* r, int32_t i, con
     out.inv_inertia_arm, out.coupling = r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints]), r.coupling + 5 * c
 
 
-cdef inline void bind_friction(const blocks_t* p, int32_t i, friction_components_t* components, double* tangent2,
+cdef inline void bind_contact_friction(const blocks_t* p, int32_t i, friction_components_t* components, double* tangent2,
                                contact_t* out) noexcept nogil:
     """Add the friction of contact block i to `out`, and compute its `components` and second tangent (3)."""
-    cdef int32_t n_angular = n_angular_rows(p, i)
+    cdef int32_t n_angular = count_angular_rows(p, i)
     get_friction_components(p, i, components)
-    out.n_tangents, out.box, out.spins, out.rolls = n_tangents(p, i), is_box(p, i), n_angular & 1, n_angular >> 1
+    out.n_tangents, out.box = count_tangent_rows(p, i), is_box_friction_contact(p, i)
+    out.spins, out.rolls = n_angular & 1, n_angular >> 1
     out.mu = components.friction_coefficient
     out.second_mu = components.friction_coefficient + (1 if out.n_tangents else 0)
     out.rolling_mu = components.friction_coefficient + components.n - 1
@@ -203,17 +206,17 @@ cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t
     cdef friction_components_t components
     cdef contact_t contact
     # Each branch binds only the arrays that its kind reads.
-    if is_disk(p, i):
-        bind_contact(p, r, i, &contact)
+    if is_disk_friction_contact(p, i):
+        bind_contact_arrays(p, r, i, &contact)
         cross(contact.normal, contact.tangent1, tangent2)
         contact.tangent2, contact.mu = tangent2, p.mu + i
         relax_contact(<const disk_t*>&contact, lam + j, va, vb)
     elif p.ptr[i + 1] - j == 1:
-        bind_contact(p, r, i, &contact)
+        bind_contact_arrays(p, r, i, &contact)
         relax_contact(<const normal_t*>&contact, lam + j, va, vb)
     else:
-        bind_contact(p, r, i, &contact)
-        bind_friction(p, i, &components, tangent2, &contact)
+        bind_contact_arrays(p, r, i, &contact)
+        bind_contact_friction(p, i, &components, tangent2, &contact)
         relax_contact(<const other_contact_t*>&contact, lam + j, va, vb)
 
 

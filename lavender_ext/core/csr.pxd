@@ -10,7 +10,7 @@ cdef enum:
     LONG_ROW = 128
 
 
-cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept nogil:
+cdef inline double csr_row_dot(const csr_t* a, int32_t i, const double* x) noexcept nogil:
     """Return sum_j A_ij x_j, in four running sums: a fixed order of additions with four times the throughput of one sum."""
     cdef int32_t p = a.indptr[i], end = a.indptr[i + 1]
     cdef const int32_t* idx = a.indices
@@ -31,8 +31,8 @@ cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept 
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const double* x, double* size) noexcept nogil:
-    """Return the sum over entries [p, end) in the order of csr_dot; write the sum of absolute values to `size`."""
+cdef inline double csr_range_dot_with_abs_sum(const csr_t* a, int32_t p, int32_t end, const double* x, double* size) noexcept nogil:
+    """Return the sum over entries [p, end) in the order of csr_row_dot; write the sum of absolute values to `size`."""
     cdef const int32_t* idx = a.indices
     cdef const double* val = a.data
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, f0 = 0.0, f1 = 0.0, f2 = 0.0, f3 = 0.0, t
@@ -66,20 +66,20 @@ cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const 
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double csr_dot_long(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
+cdef inline double csr_row_dot_with_abs_sum(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
     """Return sum_j A_ij x_j and write sum_j |A_ij x_j| to `size`.
 
-    A row of at most LONG_ROW entries gets the bits of csr_dot. A longer row is summed in pieces of LONG_ROW entries, and the
+    A row of at most LONG_ROW entries gets the bits of csr_row_dot. A longer row is summed in pieces of LONG_ROW entries, and the
     sum of the pieces is compensated.
     """
     cdef int32_t p = a.indptr[i], last = a.indptr[i + 1], end
     cdef double high = 0.0, low = 0.0, term, piece_size, total, added
     if last - p <= LONG_ROW:
-        return range_dot_size(a, p, last, x, size)
+        return csr_range_dot_with_abs_sum(a, p, last, x, size)
     size[0] = 0.0
     while p < last:
         end = p + LONG_ROW if last - p > LONG_ROW else last
-        term = range_dot_size(a, p, end, x, &piece_size)
+        term = csr_range_dot_with_abs_sum(a, p, end, x, &piece_size)
         size[0] += piece_size
         total = high + term
         added = total - high
@@ -107,12 +107,12 @@ cdef inline void transpose_csr(int32_t m, int32_t n, const int32_t* indptr, cons
             ptr[j] += 1
 
 
-cdef inline double scaled_gap(double gap, double d_i, double d_j) noexcept nogil:
+cdef inline double scale_asymmetry(double gap, double d_i, double d_j) noexcept nogil:
     """Return gap / sqrt(d_i d_j) for gap = |A_ij - A_ji|: also meaningful for heavy bodies with small entries."""
     return gap / sqrt(d_i) / sqrt(d_j) if gap > 0.0 else 0.0
 
 
-cdef inline double scan_entries(const csr_t* a, const double* d, int32_t n, int32_t* cursor,
+cdef inline double measure_asymmetry_and_bandwidth(const csr_t* a, const double* d, int32_t n, int32_t* cursor,
                                 int32_t* band) noexcept nogil:
     """Return the asymmetry of A and write its lower and upper bandwidth to band[2]; columns must be sorted.
 
@@ -143,18 +143,18 @@ cdef inline double scan_entries(const csr_t* a, const double* d, int32_t n, int3
             if j < i:
                 if q >= cursor[i]:                      # no mirror image above the diagonal
                     gap = max(gap, x)
-                    scaled = max(scaled, scaled_gap(x, d[i], d[j]))
+                    scaled = max(scaled, scale_asymmetry(x, d[i], d[j]))
                 continue
             if j == i:
                 continue
             while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
                 gap = max(gap, fabs(a.data[cursor[j]]))
-                scaled = max(scaled, scaled_gap(fabs(a.data[cursor[j]]), d[j], d[a.indices[cursor[j]]]))
+                scaled = max(scaled, scale_asymmetry(fabs(a.data[cursor[j]]), d[j], d[a.indices[cursor[j]]]))
                 cursor[j] += 1
             if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
                 x = fabs(a.data[q] - a.data[cursor[j]])
                 cursor[j] += 1
             gap = max(gap, x)
-            scaled = max(scaled, scaled_gap(x, d[i], d[j]))
+            scaled = max(scaled, scale_asymmetry(x, d[i], d[j]))
     gap = gap / big if big > 0.0 else 0.0
     return scaled if gap <= 1e-14 and scaled > 1e-10 else gap

@@ -7,7 +7,8 @@ from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport CONTACT_BOX, ROW, blocks_t, allows_rows
-from lavender_ext.core.validate cimport (first_invalid_magnitude, has_invalid, is_definite, is_frame, is_number,
+from lavender_ext.core.validate cimport (find_invalid_magnitude, has_invalid_number, is_zero_or_definite_inertia,
+                                         is_orthonormal_pair, is_valid_number,
                                          is_valid_magnitude, min_magnitude, norm_inf)
 from lavender_ext.core.view cimport rows_t
 
@@ -48,8 +49,8 @@ cdef struct body_tolerances_t:
 
 # -- blocks ------------------------------------------------------------------------------------------------------
 
-cdef inline bint is_bound(double x) noexcept nogil:
-    return is_number(x) or fabs(x) == INFINITY
+cdef inline bint is_valid_bound(double x) noexcept nogil:
+    return is_valid_number(x) or fabs(x) == INFINITY
 
 
 cdef inline int32_t find_bound_fault(const double* lower, const double* upper, int32_t j) noexcept nogil:
@@ -57,7 +58,7 @@ cdef inline int32_t find_bound_fault(const double* lower, const double* upper, i
     cdef double low = lower[j] if lower != NULL else -INFINITY, high = upper[j] if upper != NULL else INFINITY
     if not (low <= high and low < INFINITY and high > -INFINITY):
         return FAULT_BOUNDS
-    return FAULT_LOWER if not is_bound(low) else FAULT_UPPER if not is_bound(high) else NO_FAULT
+    return FAULT_LOWER if not is_valid_bound(low) else FAULT_UPPER if not is_valid_bound(high) else NO_FAULT
 
 
 cdef inline int32_t find_friction_fault(const blocks_t* p, int32_t kind, int32_t i) noexcept nogil:
@@ -124,7 +125,7 @@ cdef inline int32_t find_pair_fault(const int32_t* pair, int64_t k, int32_t n, b
 cdef inline double measure_frame_error(const double* n, const double* t) noexcept nogil:
     """Return the largest deviation of |n| and |t| from 1 and of n.t from 0, or 0 if it is within rounding."""
     cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
-    if is_frame(n, t, 5e-10):
+    if is_orthonormal_pair(n, t, 5e-10):
         return 0.0
     return max(max(fabs(sqrt(nn) - 1.0), fabs(sqrt(tt) - 1.0)), fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]))
 
@@ -132,7 +133,7 @@ cdef inline double measure_frame_error(const double* n, const double* t) noexcep
 cdef inline int32_t find_body_fault(const rows_t* r, const body_tolerances_t* tolerances, int64_t* index) noexcept nogil:
     """Return the first fault of bodies, pairs and frames, whose numbers satisfy (1) of core/validate.pxd."""
     cdef int32_t i, fault
-    i = <int32_t>first_invalid_magnitude(r.inv_mass, r.n_bodies)
+    i = <int32_t>find_invalid_magnitude(r.inv_mass, r.n_bodies)
     index[0] = i
     if i >= 0:
         return FAULT_MASS
@@ -148,7 +149,7 @@ cdef inline int32_t find_body_fault(const rows_t* r, const body_tolerances_t* to
         return FAULT_CONTACT_BODY if fault == 1 else FAULT_CONTACT_PAIR
     for i in range(r.n_bodies):
         index[0] = i
-        if not is_definite(r.inv_inertia + 9 * i, tolerances.skew, tolerances.shift, tolerances.pivot):
+        if not is_zero_or_definite_inertia(r.inv_inertia + 9 * i, tolerances.skew, tolerances.shift, tolerances.pivot):
             return FAULT_INERTIA
     for i in range(r.n_contacts):
         index[0] = i
@@ -161,7 +162,7 @@ cdef inline int32_t find_body_fault(const rows_t* r, const body_tolerances_t* to
 
 cdef inline bint is_valid_rhs(const double* b, int64_t m) noexcept nogil:
     """Return whether every |b_i| satisfies (1) and the largest (2) of core/validate.pxd."""
-    return not has_invalid(b, m) and not 0.0 < norm_inf(b, m) < min_magnitude()
+    return not has_invalid_number(b, m) and not 0.0 < norm_inf(b, m) < min_magnitude()
 
 
 cdef inline int32_t find_matrix_fault(const int32_t* ptr, const int32_t* column, int32_t n_rows, int32_t n_columns,

@@ -12,7 +12,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.bits cimport lowest
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport ldl_solve, axpy_subtract, axpy_subtract_2
+from lavender_ext.core.tree cimport solve_tree_factor, axpy_subtract, axpy_subtract_2
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -23,15 +23,15 @@ cdef enum:
     MAX_GATHERED_COLUMNS = 64
 
 
-cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
+cdef inline void solve_mass_matrix(const generalized_t* g, double* x) noexcept nogil:
     """Overwrite x (n) with M^-1 x."""
-    ldl_solve(g.n, g.lptr, g.lidx, g.lval, g.inv_pivot, x)
+    solve_tree_factor(g.n, g.lptr, g.lidx, g.lval, g.inv_pivot, x)
 
 
 # -- J ---------------------------------------------------------------------------------------------------
 
 
-cdef inline void jac_transpose_times(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+cdef inline void multiply_jacobian_transpose(const generalized_t* g, const double* lam, double* x) noexcept nogil:
     """Compute x (n) = J^T lam."""
     cdef int32_t i, q, first, end, m = g.m
     cdef const int32_t* jptr = g.jptr
@@ -49,7 +49,7 @@ cdef inline void jac_transpose_times(const generalized_t* g, const double* lam, 
                 x[jidx[q]] += jval[q] * s
 
 
-cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
+cdef inline double multiply_jacobian_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
     """Return row i of J times x."""
     cdef int32_t q, first = g.jptr[i], end = g.jptr[i + 1]
     cdef const int32_t* jidx = g.jidx
@@ -63,7 +63,7 @@ cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) n
 # -- Y ---------------------------------------------------------------------------------------------------
 
 
-cdef inline int32_t collect_columns(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t previous,
+cdef inline int32_t collect_panel_columns(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t previous,
                                     int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
     """List the columns of Y in rows [first, last), unsorted, in out (n); return their number.
 
@@ -98,10 +98,10 @@ cdef inline void sort_descending_runs(int32_t* x, int32_t n) noexcept nogil:
         x[j + 1] = t
 
 
-cdef inline int32_t panel_pattern_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* ancestors,
+cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* ancestors,
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                int32_t* n_cols, double* n_values) noexcept nogil:
-    """Compute `panel_pattern` for at most 64 velocities, with column sets as bits; ancestors (n) is scratch."""
+    """Compute `find_panel_pattern` for at most 64 velocities, with column sets as bits; ancestors (n) is scratch."""
     cdef int32_t i, q, k, first, last, count = 0, previous_entries = -1, at = 0, n = 0, nv = g.n, end, entries, differs
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
@@ -155,7 +155,7 @@ cdef inline int32_t panel_pattern_bits(const generalized_t* g, int32_t n_blocks,
     return n
 
 
-cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
+cdef inline int32_t find_panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
                                   int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                   int32_t* n_cols, double* n_values) noexcept nogil:
     """Group consecutive blocks with the same columns of Y into panels; return the number of panels.
@@ -166,7 +166,7 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
     cdef int32_t i, first, last, count, same, previous = -1, panel_columns = 0, at = 0, n = 0, stamp = 0
     cdef int32_t* out = mark + g.n
     if g.n <= 64:
-        return panel_pattern_bits(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
+        return find_panel_pattern_by_bits(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
     n_values[0] = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -176,7 +176,7 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
     for i in range(n_blocks):
         first = ptr[i]
         last = ptr[i + 1]
-        count = collect_columns(g, first, last, stamp, previous, mark, out, &same)
+        count = collect_panel_columns(g, first, last, stamp, previous, mark, out, &same)
         n_values[0] += <double>count * (last - first)
         if n > 0 and count == panel_columns and same == count and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                                  # append to the panel
@@ -200,7 +200,7 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
     return n
 
 
-cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
+cdef inline void whiten_panel(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
     """Compute the rows of Y of one panel: solve L^T y = J^T on its columns, then scale by D^-1/2. place (n) is scratch."""
     cdef int32_t first = g.prow[panel], rows = g.prow[panel + 1] - first, c0 = g.pcol[panel]
     cdef int32_t nc = g.pcol[panel + 1] - c0, a, k, q, i, _i, p, count, end, before
@@ -285,7 +285,7 @@ cdef inline double contiguous_dot(const double* y, const double* x, int32_t n) n
     return s0 + s1
 
 
-cdef inline void panel_times(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
+cdef inline void multiply_whitened_panel(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
     """Compute out (m) = Y x on the rows of a panel."""
     cdef int32_t i, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
@@ -303,8 +303,8 @@ cdef inline void panel_times(const generalized_t* g, int32_t panel, const double
         y += nc
 
 
-cdef inline double whitened_dot(const generalized_t* g, int32_t panel, int32_t row, const double* x) noexcept nogil:
-    """Return Y_row x, with the bits of `panel_times`."""
+cdef inline double whitened_row_dot(const generalized_t* g, int32_t panel, int32_t row, const double* x) noexcept nogil:
+    """Return Y_row x, with the bits of `multiply_whitened_panel`."""
     cdef int32_t nc = g.pcol[panel + 1] - g.pcol[panel]
     return indexed_dot(g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc, g.cols + g.pcol[panel], x, nc)
 
@@ -320,16 +320,16 @@ cdef inline void add_scaled_whitened_row(const generalized_t* g, int32_t panel, 
             x[cols[a]] += y[a] * change
 
 
-cdef inline void whitened_transpose_times(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+cdef inline void multiply_whitened_transpose(const generalized_t* g, const double* lam, double* x) noexcept nogil:
     """Compute x (n) = Y^T lam."""
     cdef int32_t a
     for a in range(g.n):
         x[a] = 0.0
     for a in range(g.n_panels):
-        panel_transpose_add(g, a, lam, x)
+        add_panel_transpose_product(g, a, lam, x)
 
 
-cdef inline void panel_transpose_add(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+cdef inline void add_panel_transpose_product(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
     """Add Y^T lam of the rows of a panel to x (n)."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
@@ -364,7 +364,8 @@ cdef inline void axpy_add(double* x, const double* y, double z, int32_t n) noexc
         x[i] += y[i] * z
 
 
-cdef inline void panel_transpose_add_abs(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+cdef inline void add_abs_panel_transpose_product(const generalized_t* g, int32_t panel, const double* lam,
+                                                 double* x) noexcept nogil:
     """Add |Y|^T |lam| of the rows of a panel to x (n)."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
@@ -376,7 +377,7 @@ cdef inline void panel_transpose_add_abs(const generalized_t* g, int32_t panel, 
         y += nc
 
 
-cdef inline void panel_times_abs(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
+cdef inline void multiply_abs_whitened_panel(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
     """Compute out (m) = |Y| x on the rows of a panel, for x >= 0."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
@@ -421,7 +422,7 @@ cdef inline double estimate_condition(const generalized_t* g, double* x) noexcep
         return 1.0 / 0.0 if n else 1.0
     for i in range(n):
         x[i] = s[i] * (x[i] / first)
-    tree_solve(g, x)
+    solve_mass_matrix(g, x)
     for i in range(n):
         x[i] *= s[i]
     second = sqrt(dot(x, x, n))
@@ -436,7 +437,7 @@ cdef inline double get_condition(const generalized_t* g, double* x) noexcept nog
     return g.condition if g.condition > 0.0 else estimate_condition(g, x)
 
 
-cdef inline double bound_condition(const generalized_t* g) noexcept nogil:
+cdef inline double bound_condition_by_determinant(const generalized_t* g) noexcept nogil:
     """Return the upper bound e / det H of |H^-1|, which follows from trace H = n and is very loose for large n."""
     cdef int32_t i
     cdef double det = 1.0

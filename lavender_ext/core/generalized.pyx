@@ -5,19 +5,20 @@ from libc.string cimport memcmp, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles, ints
-from lavender_ext.core.validate cimport is_beyond
-from lavender_ext.core.generalized cimport estimate_condition, jac_transpose_times, jac_row, tree_solve
-from lavender_ext.core.mass cimport (THIN_PADDING, asymmetry, compress_lower_triangle, factor_mass, factor_work,
-                                     is_symmetric, is_worth_ordering)
-from lavender_ext.core.tree cimport tree_pattern
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
+from lavender_ext.core.validate cimport any_magnitude_above
+from lavender_ext.core.generalized cimport estimate_condition, multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix
+from lavender_ext.core.mass cimport (THIN_PADDING, relative_entry_asymmetry, compress_lower_triangle, factor_mass,
+                                     count_mass_factor_work,
+                                     is_symmetric, ordering_pays_off)
+from lavender_ext.core.tree cimport find_tree_factor_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
 cdef int64_t MAX_INDEX = 2**31 - 1      # largest number of entries of L with 32-bit indices
 
 
-cdef object factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t max_entries=MAX_INDEX):
+cdef object allocate_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t max_entries=MAX_INDEX):
     """Return the pattern of L in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
     cdef int64_t workspace = mptr[n] + 1
     cdef int32_t count = -1
@@ -27,7 +28,7 @@ cdef object factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, 
     while True:
         marks = new(5 * <int64_t>n + 1 + workspace, I4)
         whole = marks
-        count = tree_pattern(n, mptr, midx, <int32_t>workspace, &whole[0], &whole[5 * n + 1], &whole[n + 1],
+        count = find_tree_factor_pattern(n, mptr, midx, <int32_t>workspace, &whole[0], &whole[5 * n + 1], &whole[n + 1],
                              &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
         if count >= 0:
             return marks
@@ -59,24 +60,24 @@ cdef class Operator:
 
     def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None, int64_t max_entries=MAX_INDEX):
         cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1
-        cdef const int32_t* mptr = ints(mptr_, n + 1)
-        cdef const int32_t* midx = ints(midx_, len(midx_))
+        cdef const int32_t* mptr = as_int_pointer(mptr_, n + 1)
+        cdef const int32_t* midx = as_int_pointer(midx_, len(midx_))
         self.jac = (jptr_, jidx_, jval_)
         self.mass = (mptr_, midx_, mval_)
-        self.g.mptr, self.g.midx, self.g.mval = mptr, midx, doubles(mval_, len(mval_))
+        self.g.mptr, self.g.midx, self.g.mval = mptr, midx, as_double_pointer(mval_, len(mval_))
         self.g.n = n
         self.g.m = m
-        self.g.jptr = ints(jptr_, m + 1)
-        self.g.jidx = ints(jidx_, len(jidx_))
-        self.g.jval = doubles(jval_, len(jval_))
+        self.g.jptr = as_int_pointer(jptr_, m + 1)
+        self.g.jidx = as_int_pointer(jidx_, len(jidx_))
+        self.g.jval = as_double_pointer(jval_, len(jval_))
         if like is not None and like.has_pattern(n, mptr, midx):
             marks = like.keep[0]
             self.g.lptr = like.g.lptr
             self.g.lidx = like.g.lidx
             self.g.parent = like.g.parent
         else:
-            marks = factor_pattern(n, mptr, midx, max_entries)
-            self.g.lptr = ints(marks, len(marks))
+            marks = allocate_factor_pattern(n, mptr, midx, max_entries)
+            self.g.lptr = as_int_pointer(marks, len(marks))
             self.g.parent = self.g.lptr + n + 1
             self.g.lidx = self.g.parent + 4 * n
         self.keep, self.failed = [marks], -1
@@ -87,7 +88,7 @@ cdef class Operator:
         cdef int64_t used = 2 * <int64_t>n + self.g.lptr[n] + 1, size = used + 2 * <int64_t>n
         cdef double* numbers
         factor = new(size)
-        numbers = doubles(factor, size)
+        numbers = as_double_pointer(factor, size)
         self.keep.append(factor)
         self.failed = factor_mass(&self.g, numbers + 2 * n, numbers, numbers + n)
         if self.failed < 0:
@@ -135,20 +136,21 @@ cdef class Operator:
             smallest = min(smallest, 1.0 / (self.g.inv_pivot[i] * mval[mptr[i + 1] - 1]))
         return smallest
 
-    def is_beyond(self, double bound):
+    def has_entry_above(self, double bound):
         """Return whether any |J_ij|, |L_ij| or 1 / D_i is above `bound`."""
-        return (is_beyond(self.g.jval, self.g.jptr[self.g.m], bound) or is_beyond(self.g.inv_pivot, self.g.n, bound)
-                or is_beyond(self.g.lval, self.g.lptr[self.g.n], bound))
+        return (any_magnitude_above(self.g.jval, self.g.jptr[self.g.m], bound)
+                or any_magnitude_above(self.g.inv_pivot, self.g.n, bound)
+                or any_magnitude_above(self.g.lval, self.g.lptr[self.g.n], bound))
 
     @property
     def work(self):
         """Multiply-adds of the factorisation."""
-        return factor_work(&self.g)
+        return count_mass_factor_work(&self.g)
 
     @property
     def is_worth_ordering(self):
         """Whether the search of an order with less fill-in takes less time than it saves (core/mass.pxd)."""
-        return is_worth_ordering(&self.g, self.g.mptr[self.g.n])
+        return ordering_pays_off(&self.g, self.g.mptr[self.g.n])
 
     @property
     def parents(self):
@@ -162,29 +164,29 @@ cdef class Operator:
     def solve(self, x):
         """Overwrite x (n,) with M^-1 x."""
         if self.g.n:
-            tree_solve(&self.g, doubles(x, self.g.n))
+            solve_mass_matrix(&self.g, as_double_pointer(x, self.g.n))
 
-    def force(self, lam):
+    def multiply_jacobian_transpose(self, lam):
         """Return J^T lam (n,), a new array."""
-        cdef const double* at = doubles(lam, self.g.m)
+        cdef const double* at = as_double_pointer(lam, self.g.m)
         cdef double* x
         result = new(self.g.n)
-        x = doubles(result, self.g.n)
+        x = as_double_pointer(result, self.g.n)
         memset(x, 0, self.g.n * sizeof(double))
         if self.g.n and self.g.m:
-            jac_transpose_times(&self.g, at, x)
+            multiply_jacobian_transpose(&self.g, at, x)
         return result
 
-    def momentum(self, velocity):
+    def multiply_mass(self, velocity):
         """Return M v (n,), a new array."""
         cdef const int32_t* mptr = self.g.mptr
         cdef const int32_t* midx = self.g.midx
         cdef const double* mval = self.g.mval
-        cdef const double* v = doubles(velocity, self.g.n)
+        cdef const double* v = as_double_pointer(velocity, self.g.n)
         cdef int32_t i, p
         cdef double* x
         result = new(self.g.n)
-        x = doubles(result, self.g.n)
+        x = as_double_pointer(result, self.g.n)
         for i in range(self.g.n):
             p = mptr[i + 1] - 1
             x[i] = mval[p] * v[i]
@@ -193,34 +195,34 @@ cdef class Operator:
                 x[midx[p]] += mval[p] * v[i]
         return result
 
-    def times(self, velocity):
+    def multiply_jacobian(self, velocity):
         """Return J v (m,), a new array."""
-        cdef const double* x = doubles(velocity, self.g.n)
+        cdef const double* x = as_double_pointer(velocity, self.g.n)
         cdef int32_t i
         cdef double* out
         result = new(self.g.m)
-        out = doubles(result, self.g.m)
+        out = as_double_pointer(result, self.g.m)
         for i in range(self.g.m):
-            out[i] = jac_row(&self.g, i, x) if self.g.n else 0.0
+            out[i] = multiply_jacobian_row(&self.g, i, x) if self.g.n else 0.0
         return result
 
-    def bias(self, velocity, target):
+    def compute_rhs(self, velocity, target):
         """Return b = target - J v (m,), a new array; the caller checks its range."""
-        cdef const double* v = doubles(velocity, self.g.n)
-        cdef const double* t = doubles(target, self.g.m)
+        cdef const double* v = as_double_pointer(velocity, self.g.n)
+        cdef const double* t = as_double_pointer(target, self.g.m)
         cdef int32_t i
         cdef double* out
         result = new(self.g.m)
-        out = doubles(result, self.g.m)
+        out = as_double_pointer(result, self.g.m)
         for i in range(self.g.m):
-            out[i] = t[i] - (jac_row(&self.g, i, v) if self.g.n else 0.0)
+            out[i] = t[i] - (multiply_jacobian_row(&self.g, i, v) if self.g.n else 0.0)
         return result
 
 
-def lower_of_dense(const double[:, ::1] a):
+def lower_triangle_of_dense(const double[:, ::1] a):
     """Return (indptr, indices, data) of the lower triangle with diagonal, and the largest asymmetry.
 
-    The asymmetry is (i, j, `asymmetry` of core/mass.pxd) of the pair with the largest value.
+    The asymmetry is (i, j, `relative_entry_asymmetry` of core/mass.pxd) of the pair with the largest value.
     """
     cdef int32_t n = <int32_t>a.shape[0], i, j, nnz = n, at_i = 0, at_j = 0
     cdef double worst = 0.0, x
@@ -236,14 +238,14 @@ def lower_of_dense(const double[:, ::1] a):
     if n and not is_symmetric(entries, n, n):
         for i in range(n):
             for j in range(i):
-                x = asymmetry(entries, n, i, j)
+                x = relative_entry_asymmetry(entries, n, i, j)
                 if x > worst:
                     worst, at_i, at_j = x, i, j
     return (whole[:n + 1], whole[n + 1:n + 1 + nnz], values[:nnz]), (at_i, at_j, worst)
 
 
-def lower_of_rows(const int32_t[::1] ptr, const int32_t[::1] idx, const double[::1] val):
-    """Return the result of `lower_of_dense` for a matrix in compressed rows with ascending columns.
+def lower_triangle_of_csr(const int32_t[::1] ptr, const int32_t[::1] idx, const double[::1] val):
+    """Return the result of `lower_triangle_of_dense` for a matrix in compressed rows with ascending columns.
 
     A mirror image that is not stored counts as 0.
     """
@@ -285,7 +287,7 @@ def lower_of_rows(const int32_t[::1] ptr, const int32_t[::1] idx, const double[:
     return (whole[:n + 1], whole[n + 1:n + 1 + nnz], values[:nnz]), (at_i, at_j, worst)
 
 
-def pattern_fill(const int32_t[::1] mptr, const int32_t[::1] midx):
+def count_fill_in(const int32_t[::1] mptr, const int32_t[::1] midx):
     """Return the number of entries of L that a matrix with this lower triangle does not have."""
     cdef int32_t n = <int32_t>mptr.shape[0] - 1
-    return int(factor_pattern(n, &mptr[0], &midx[0] if midx.shape[0] else NULL)[n]) - (midx.shape[0] - n)
+    return int(allocate_factor_pattern(n, &mptr[0], &midx[0] if midx.shape[0] else NULL)[n]) - (midx.shape[0] - n)

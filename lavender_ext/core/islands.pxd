@@ -6,16 +6,16 @@ path halving; islands are numbered in the order of their first block.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.order cimport sort_by_level
+from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport blocks_t, islands_t
-from lavender_ext.core.roots cimport root_of
-from lavender_ext.core.view cimport bodies_of, csr_t, generalized_t, rows_t, view_t
+from lavender_ext.core.roots cimport find_root
+from lavender_ext.core.view cimport get_block_bodies, csr_t, generalized_t, rows_t, view_t
 
 
-cdef inline int32_t join(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
+cdef inline int32_t merge_components(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
     """Connect i and j; return 1 if they were in different components. The smaller number stays the root."""
-    i = root_of(parent, i)
-    j = root_of(parent, j)
+    i = find_root(parent, i)
+    j = find_root(parent, j)
     if i < j:
         parent[j] = i
     else:
@@ -27,7 +27,7 @@ cdef inline int32_t number_components(int32_t k, int32_t* parent, int32_t* label
     """Write the component of each of k blocks into label (k); return the number of components."""
     cdef int32_t i, root, count = 0
     for i in range(k):
-        root = root_of(parent, i)
+        root = find_root(parent, i)
         if root == i:
             label[i] = count
             count += 1
@@ -36,29 +36,29 @@ cdef inline int32_t number_components(int32_t k, int32_t* parent, int32_t* label
     return count
 
 
-cdef inline int32_t join_at(int32_t* first, int32_t place, int32_t i, int32_t* parent) noexcept nogil:
+cdef inline int32_t merge_with_first_at(int32_t* first, int32_t place, int32_t i, int32_t* parent) noexcept nogil:
     """Connect block i with the first block seen at `place`; return 1 if that merged two components."""
     if first[place] < 0:
         first[place] = i
         return 0
-    return join(parent, first[place], i)
+    return merge_components(parent, first[place], i)
 
 
-cdef inline int32_t connect_bodies(const rows_t* r, int32_t k, int32_t* parent, int32_t* first) noexcept nogil:
+cdef inline int32_t connect_blocks_by_bodies(const rows_t* r, int32_t k, int32_t* parent, int32_t* first) noexcept nogil:
     """Connect k blocks that share a moving body; return the number of components. first (n_bodies) is scratch."""
     cdef int32_t i, side, body, count = k
     cdef const int32_t* pair
     for body in range(r.n_bodies):
         first[body] = -1
     for i in range(k):
-        pair = bodies_of(r, i)
+        pair = get_block_bodies(r, i)
         for side in range(2):
             if pair[side] >= 0:
-                count -= join_at(first, pair[side], i, parent)
+                count -= merge_with_first_at(first, pair[side], i, parent)
     return count
 
 
-cdef inline int32_t connect_entries(const blocks_t* p, const csr_t* a, int32_t* parent, int32_t* block) noexcept nogil:
+cdef inline int32_t connect_blocks_by_matrix(const blocks_t* p, const csr_t* a, int32_t* parent, int32_t* block) noexcept nogil:
     """Connect blocks that share a stored entry of A; return the number of components. block (m) is scratch."""
     cdef int32_t i, j, q, count = p.n_blocks
     for i in range(p.n_blocks):
@@ -68,13 +68,14 @@ cdef inline int32_t connect_entries(const blocks_t* p, const csr_t* a, int32_t* 
         for j in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(a.indptr[j], a.indptr[j + 1]):
                 if block[a.indices[q]] != i:
-                    count -= join(parent, i, block[a.indices[q]])
+                    count -= merge_components(parent, i, block[a.indices[q]])
         if count == 1:
             break
     return count
 
 
-cdef inline int32_t connect_trees(const blocks_t* p, const generalized_t* g, int32_t* parent, int32_t* first) noexcept nogil:
+cdef inline int32_t connect_blocks_by_trees(const blocks_t* p, const generalized_t* g, int32_t* parent,
+                                            int32_t* first) noexcept nogil:
     """Connect blocks with rows of J that touch a common tree of M; return the number of components. first (2 n) is scratch."""
     cdef int32_t i, q, t, last, count = p.n_blocks
     cdef int32_t* tree = first + g.n
@@ -86,14 +87,14 @@ cdef inline int32_t connect_trees(const blocks_t* p, const generalized_t* g, int
         for q in range(g.jptr[p.ptr[i]], g.jptr[p.ptr[i + 1]]):
             t = tree[g.jidx[q]]
             if t != last:
-                count -= join_at(first, t, i, parent)
+                count -= merge_with_first_at(first, t, i, parent)
                 last = t
         if count == 1:
             break
     return count
 
 
-cdef inline int64_t islands_index(const view_t* v) noexcept nogil:
+cdef inline int64_t island_workspace_integers(const view_t* v) noexcept nogil:
     """Return the number of int32 that `find_islands` needs."""
     cdef int64_t k = v.p.n_blocks
     cdef int64_t scratch = 2 * <int64_t>v.g.n if v.g != NULL else v.r.n_bodies if v.r != NULL else v.p.n_rows
@@ -101,7 +102,7 @@ cdef inline int64_t islands_index(const view_t* v) noexcept nogil:
 
 
 cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out) noexcept nogil:
-    """Return the number of islands; with more than one, `out` has them in `index` (`islands_index`), without references."""
+    """Return the number of islands; if there are several, `out` has them in `index` (`island_workspace_integers`)."""
     cdef int32_t i, k = v.p.n_blocks, count
     cdef int32_t* label = index
     cdef int32_t* order = index + k
@@ -112,26 +113,26 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
     for i in range(k):
         parent[i] = i
     if v.g != NULL:
-        count = connect_trees(&v.p, v.g, parent, parent + k)
+        count = connect_blocks_by_trees(&v.p, v.g, parent, parent + k)
     elif v.r != NULL:
-        count = connect_bodies(v.r, k, parent, parent + k)
+        count = connect_blocks_by_bodies(v.r, k, parent, parent + k)
     else:
-        count = connect_entries(&v.p, v.a, parent, parent + k)
+        count = connect_blocks_by_matrix(&v.p, v.a, parent, parent + k)
     if count == 1:
         return 1
     number_components(k, parent, label)
-    sort_by_level(k, label, count, ptr, order)
+    sort_blocks_by_level(k, label, count, ptr, order)
     out.n, out.label, out.ptr, out.order = count, label, ptr, order
     return count
 
 
-cdef inline bint is_immovable(const view_t* v, int32_t i) noexcept nogil:
+cdef inline bint has_no_moving_body(const view_t* v, int32_t i) noexcept nogil:
     """Return whether no impulse changes a slack of block i: its bodies are static, or its rows of J or A are empty."""
     cdef const int32_t* pair
     if v.g != NULL:
         return v.g.jptr[v.p.ptr[i + 1]] == v.g.jptr[v.p.ptr[i]]
     if v.r != NULL:
-        pair = bodies_of(v.r, i)
+        pair = get_block_bodies(v.r, i)
         return pair[0] < 0 and pair[1] < 0
     return v.a.indptr[v.p.ptr[i + 1]] == v.a.indptr[v.p.ptr[i]]
 
@@ -146,6 +147,6 @@ cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noex
     out.n, out.label, out.order, out.ptr = 1, index, index + k, index + 2 * k
 
 
-cdef inline int32_t first_row_of(const blocks_t* p, int32_t island) noexcept nogil:
+cdef inline int32_t first_row_of_island(const blocks_t* p, int32_t island) noexcept nogil:
     """Return the first row of an island."""
     return p.ptr[p.islands.order[p.islands.ptr[island]]]

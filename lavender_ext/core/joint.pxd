@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.numbers cimport clip_number, constant, number_t
+from lavender_ext.core.numbers cimport clip_number, constant_of_type, number_t
 from lavender_ext.core.view cimport rows_t
 
 
@@ -32,8 +32,8 @@ cdef inline void relax_joint(const joint_t* joint, number_t* lam, number_t* va, 
     cdef int32_t row, k
     for row in range(joint.n_rows):
         # slack
-        velocity_a = constant(lam, 0.0)
-        velocity_b = constant(lam, 0.0)
+        velocity_a = constant_of_type(lam, 0.0)
+        velocity_b = constant_of_type(lam, 0.0)
         if joint.body_a >= 0:
             for k in range(6):
                 velocity_a = velocity_a + jac[k] * va[k]
@@ -56,7 +56,7 @@ cdef inline void relax_joint(const joint_t* joint, number_t* lam, number_t* va, 
         minv_jac += 12
 
 
-cdef inline void bind_joint(const blocks_t* p, const rows_t* r, int32_t i, joint_t* out) noexcept nogil:
+cdef inline void bind_joint_arrays(const blocks_t* p, const rows_t* r, int32_t i, joint_t* out) noexcept nogil:
     """Point `out` at the arrays of joint i."""
     cdef int32_t j = p.ptr[i]
     out.n_rows = p.ptr[i + 1] - j
@@ -69,5 +69,5 @@ cdef inline void bind_joint(const blocks_t* p, const rows_t* r, int32_t i, joint
 cdef inline void relax_joint_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam, double* v) noexcept nogil:
     """Update joint block i; lam (m), v (n_bodies, 6)."""
     cdef joint_t joint
-    bind_joint(p, r, i, &joint)
+    bind_joint_arrays(p, r, i, &joint)
     relax_joint(&joint, lam + p.ptr[i], v + 6 * <ssize_t>r.joint_body[2 * i], v + 6 * <ssize_t>r.joint_body[2 * i + 1])

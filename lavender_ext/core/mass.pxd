@@ -3,7 +3,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.thin cimport thin
-from lavender_ext.core.tree cimport tree_factor
+from lavender_ext.core.tree cimport factor_tree
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -14,7 +14,7 @@ cdef enum:
 
 # -- layout ------------------------------------------------------------------------------------------------------
 
-cdef inline int32_t compress_rows(const double* a, int64_t stride, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
+cdef inline int32_t compress_dense_rows(const double* a, int64_t stride, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
                                   double* val) noexcept nogil:
     """Write a dense matrix (m, n) in compressed rows without zeros; return the number of entries."""
     cdef int32_t i, q = 0
@@ -35,7 +35,7 @@ cdef inline bint is_symmetric(const double* a, int64_t stride, int32_t n) noexce
     return not differs
 
 
-cdef inline double asymmetry(const double* a, int64_t stride, int32_t i, int32_t j) noexcept nogil:
+cdef inline double relative_entry_asymmetry(const double* a, int64_t stride, int32_t i, int32_t j) noexcept nogil:
     """Return |a_ij - a_ji| / sqrt(a_ii a_jj); the denominator is 1 if a_ii a_jj is not positive."""
     cdef double gap = fabs(a[i * stride + j] - a[j * stride + i]), size = a[i * (stride + 1)] * a[j * (stride + 1)]
     return gap / sqrt(size) if gap > 0.0 and size > 0.0 else gap
@@ -56,7 +56,7 @@ cdef inline int32_t compress_lower_triangle(const double* a, int64_t stride, dou
             q += thin(i, row, NULL, idx + q, val + q)
         for j in range(0 if symmetric else i):
             if row[j] != 0.0 or a[j * stride + i] != 0.0:
-                if row[j] != a[j * stride + i] and asymmetry(a, stride, i, j) > max_asymmetry:
+                if row[j] != a[j * stride + i] and relative_entry_asymmetry(a, stride, i, j) > max_asymmetry:
                     return -1
                 idx[q] = j
                 val[q] = row[j]
@@ -71,7 +71,7 @@ cdef inline int32_t compress_lower_triangle(const double* a, int64_t stride, dou
 
 # -- order and factor --------------------------------------------------------------------------------------------
 
-cdef inline double factor_work(const generalized_t* g) noexcept nogil:
+cdef inline double count_mass_factor_work(const generalized_t* g) noexcept nogil:
     """Return the multiply-adds of the factorisation: c (c + 1) / 2 for a row with c entries left of the diagonal."""
     cdef int32_t i, c
     cdef double work = 0.0
@@ -81,7 +81,7 @@ cdef inline double factor_work(const generalized_t* g) noexcept nogil:
     return work
 
 
-cdef inline bint is_worth_ordering(const generalized_t* g, int32_t entries) noexcept nogil:
+cdef inline bint ordering_pays_off(const generalized_t* g, int32_t entries) noexcept nogil:
     """Return whether the search of an order with less fill-in takes less time than the factorisations of M save.
 
     entries: of the lower triangle of M. A factorisation without fill-in needs at least the work of evenly distributed entries,
@@ -92,7 +92,7 @@ cdef inline bint is_worth_ordering(const generalized_t* g, int32_t entries) noex
     cdef double off_diagonal = entries - g.n, work
     if g.lptr[g.n] <= off_diagonal:                     # There is no fill-in.
         return False
-    work = factor_work(g)
+    work = count_mass_factor_work(g)
     return work > off_diagonal * (off_diagonal / g.n + 1.0) and 2.0 * EXPECTED_FACTORISATIONS * work > 4e5 + 130.0 * entries
 
 
@@ -102,7 +102,7 @@ cdef inline int32_t factor_mass(generalized_t* g, double* lval, double* inv_pivo
     g.lval, g.inv_pivot, g.root = lval, inv_pivot, root
     if g.n == 0:
         return -1
-    failed = tree_factor(g.n, g.mptr, g.midx, g.mval, g.lptr, g.lidx, lval, root, inv_pivot)
+    failed = factor_tree(g.n, g.mptr, g.midx, g.mval, g.lptr, g.lidx, lval, root, inv_pivot)
     for i in range(g.n):
         root[i] = sqrt(inv_pivot[i])
     return failed

@@ -87,4 +87,4 @@ cdef class Method:
     cdef info_t info
     cdef method_t own
     cdef readonly int how       # the last outcome: one of `OUTCOMES`
-    cdef void aim(self, double tol, int budget) noexcept
+    cdef void reset_target(self, double tol, int budget) noexcept

@@ -13,7 +13,7 @@ cdef class Method:
     The data must know the judge's reference (the residual of the zero impulse) before a method starts.
     """
 
-    cdef void aim(self, double tol, int budget) noexcept:
+    cdef void reset_target(self, double tol, int budget) noexcept:
         """Reset the options to a relative residual of `tol` and `budget` units of work, and clear the statistics."""
         cdef options_t* o = &self.options
         o.tol, o.budget, o.proven, o.stop = tol, budget, 0, 0
@@ -34,11 +34,11 @@ cdef class Method:
         """Limit the remaining work to at most `units` units."""
         self.options.budget = min(self.options.budget, self.info.work + units)
 
-    def stop(self):
+    def request_stop(self):
         """Make the next step judge the present impulse and end."""
         self.options.stop = 1
 
-    def prove(self):
+    def confirm_certificate(self):
         """Confirm to the method that `direction` proves that no solution exists."""
         self.options.proven = 1
 

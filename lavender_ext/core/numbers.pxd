@@ -15,7 +15,7 @@ ctypedef fused number_t:
     pair_t
 
 
-cdef inline number_t constant(const number_t* like, double x) noexcept nogil:
+cdef inline number_t constant_of_type(const number_t* like, double x) noexcept nogil:
     """Return x as a number of the type that `like` points at."""
     if number_t is double:
         return x
@@ -70,12 +70,12 @@ cdef inline void project_disk(number_t* x, number_t* y, number_t radius) noexcep
             project_disk(<double*>x + k, <double*>y + k, (<double*>&radius)[k])
 
 
-cdef inline void relative_angular_velocity(const number_t* va, const number_t* vb, int32_t body_a, int32_t body_b,
+cdef inline void compute_relative_angular_velocity(const number_t* va, const number_t* vb, int32_t body_a, int32_t body_b,
                                            number_t* omega) noexcept nogil:
     """Compute omega_b - omega_a from the velocities (6) of the bodies; a negative body is static."""
     cdef int32_t k
     for k in range(3):
-        omega[k] = constant(omega, 0.0)
+        omega[k] = constant_of_type(omega, 0.0)
         if body_b >= 0:
             omega[k] = vb[3 + k]
         if body_a >= 0:

@@ -6,7 +6,7 @@ import numpy as np
 from lavender_ext.core.order cimport RANDOM, SYMMETRIC, next_random
 
 
-cdef void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
+cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
     """Shuffle order[first:end] (Fisher-Yates); an index below n is (32 random bits) * n / 2^32."""
     cdef int32_t i = end - 1, j, t
     while i > first:
@@ -17,7 +17,7 @@ cdef void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noe
         i -= 1
 
 
-cdef void reverse(int32_t* order, int32_t first, int32_t end) noexcept nogil:
+cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept nogil:
     """Reverse order[first:end]."""
     cdef int32_t i = first, j = end - 1, t
     while i < j:
@@ -28,16 +28,16 @@ cdef void reverse(int32_t* order, int32_t first, int32_t end) noexcept nogil:
         j -= 1
 
 
-cdef void advance_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
+cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                         uint64_t* rng) noexcept nogil:
     """Update order[first:end] in place for the next sweep."""
     if mode == RANDOM:
-        shuffle(order, first, end, rng)
+        shuffle_blocks(order, first, end, rng)
     elif mode == SYMMETRIC and not first_sweep:
-        reverse(order, first, end)
+        reverse_blocks(order, first, end)
 
 
-cdef int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
+cdef int32_t find_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
     """Compute the breadth-first level of each body from the static ones (body -1); return the number of levels.
 
     Bodies without a path to a static body get the last level + 1. `body` is (n_blocks, 2). Edges are relaxed forwards and
@@ -70,7 +70,7 @@ cdef int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies
     return top + 1
 
 
-cdef void block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
+cdef void find_block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
     """Compute the level of each block: the lower level of its two bodies plus 1, 0 for a block on the ground."""
     cdef int32_t i, la, lb
     for i in range(n_blocks):
@@ -79,7 +79,7 @@ cdef void block_levels(int32_t n_blocks, const int32_t* body, const int32_t* lev
         out[i] = la if la < lb else lb
 
 
-cdef void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
+cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
                         int32_t* order) noexcept nogil:
     """Sort blocks by level (stable counting sort); blocks of level -1 are omitted.
 
@@ -107,7 +107,7 @@ cdef void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels
     start[0] = 0
 
 
-cdef int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
                              int32_t* color) noexcept nogil:
     """Colour blocks greedily so that no two blocks of one colour share a moving body; return the number of colours.
 
@@ -148,7 +148,7 @@ cdef int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bo
     return top
 
 
-cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
+cdef public int32_t lav_color_blocks_by_matrix(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
                                      const int32_t* indptr, const int32_t* indices, int32_t* mark,
                                      int32_t* color) noexcept nogil:
     """Colour blocks greedily so that no two blocks of one colour are coupled in A; return the number of colours.
@@ -175,33 +175,33 @@ cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr,
     return top
 
 
-def body_order_levels(const int32_t[:, ::1] body, int n_bodies):
+def compute_block_levels(const int32_t[:, ::1] body, int n_bodies):
     """Return the level (k,) of each block, counted from the static bodies; `body` is (k, 2)."""
     cdef int32_t k = <int32_t>body.shape[0]
     cdef int32_t[::1] level = np.empty(n_bodies + 1, np.int32), out = np.empty(k + 1, np.int32)
     if k:
-        body_levels(k, &body[0, 0], n_bodies, &level[0])
-        block_levels(k, &body[0, 0], &level[0], &out[0])
+        find_body_levels(k, &body[0, 0], n_bodies, &level[0])
+        find_block_levels(k, &body[0, 0], &level[0], &out[0])
     return np.asarray(out)[:k]
 
 
-def body_colors(const int32_t[:, ::1] body, int n_bodies):
+def compute_body_colors(const int32_t[:, ::1] body, int n_bodies):
     """Return the colour (k,) of each block; no two blocks of one colour share a moving body."""
     cdef int32_t k = <int32_t>body.shape[0]
     cdef uint64_t[::1] used = np.zeros(n_bodies + 1, np.uint64)
     cdef int32_t[::1] color = np.empty(k + 1, np.int32)
     if k:
-        color_by_bodies(k, &body[0, 0], n_bodies, &used[0], &color[0])
+        color_blocks_by_bodies(k, &body[0, 0], n_bodies, &used[0], &color[0])
     return np.asarray(color)[:k]
 
 
-def graph_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, const int32_t[::1] indptr,
+def compute_matrix_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, const int32_t[::1] indptr,
                  const int32_t[::1] indices):
     """Return the colour (k,) of each block; no two blocks of one colour are coupled in the symmetric pattern."""
     cdef int32_t k = <int32_t>block_ptr.shape[0] - 1
     cdef int32_t[::1] mark = np.empty(k + 1, np.int32), color = np.empty(k + 1, np.int32)
     if k and indices.shape[0]:
-        lav_graph_colors(k, &block_ptr[0], &block_of[0], &indptr[0], &indices[0], &mark[0], &color[0])
+        lav_color_blocks_by_matrix(k, &block_ptr[0], &block_of[0], &indptr[0], &indices[0], &mark[0], &color[0])
     elif k:
         color[:] = 0
     return np.asarray(color)[:k]

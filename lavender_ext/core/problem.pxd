@@ -29,13 +29,15 @@ cdef struct derived_t:          # derived numbers in generalised coordinates; th
     double values               # number of values of Y
 
 
-cdef double entries_of(const generalized_t* g, double* on) noexcept nogil
+cdef double count_products(const generalized_t* g, double* on) noexcept nogil
 cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
 
 
-cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step, int32_t* empty,
+cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
+                                              int32_t* empty,
                                       double* minv_jac, double* coupling, double* inv_inertia_arm) noexcept nogil
-cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step, int32_t* empty) noexcept nogil
+cdef int32_t compute_csr_derived(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
+                                 int32_t* empty) noexcept nogil
 
 
 cdef class Data:
@@ -55,6 +57,6 @@ cdef class Data:
     cdef list keep
 
     cdef view_t view(self) noexcept nogil
-    cdef void adopt(self, derived_t* derived)
-    cdef void keep_reference(self, const islands_t* islands, const double* start)
-    cdef object part(self, int which)
+    cdef void adopt_derived(self, derived_t* derived)
+    cdef void store_reference(self, const islands_t* islands, const double* start)
+    cdef object get_derived_array(self, int which)

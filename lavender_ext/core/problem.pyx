@@ -15,18 +15,21 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.validate cimport first_invalid, min_magnitude
+from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport Operator, panel_pattern, panel_whiten
-from lavender_ext.core.islands cimport find_islands, islands_index
-from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box, islands_t, n_tangents,
-                                            n_angular_rows, get_friction_components, friction_components_t)
-from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_times
-from lavender_ext.core.steps cimport block_steps, csr_pair_eigenvalue, pair_means
+from lavender_ext.core.generalized cimport Operator, find_panel_pattern, whiten_panel
+from lavender_ext.core.islands cimport find_islands, island_workspace_integers
+from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box_friction_contact, islands_t,
+                                            count_tangent_rows,
+                                            count_angular_rows, get_friction_components, friction_components_t)
+from lavender_ext.core.rows cimport (
+    compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass, multiply_jacobian,
+)
+from lavender_ext.core.steps cimport compute_block_steps, largest_eigenvalue_of_csr_pair, average_diagonal_of_pairs
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.core.weights cimport block_weights, joint_weights
+from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
 
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
@@ -35,7 +38,7 @@ cdef object new = np.empty, I4 = np.dtype(np.int32)
 LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
-cdef inline void fill_empty(int32_t m, double* d) noexcept nogil:
+cdef inline void replace_empty_diagonal(int32_t m, double* d) noexcept nogil:
     """Replace entries of d (m) that are not above 0 by the mean of the others, or by 1; NaN is kept."""
     cdef int32_t i, count = 0
     cdef double total = 0.0, mean
@@ -49,7 +52,7 @@ cdef inline void fill_empty(int32_t m, double* d) noexcept nogil:
             d[i] = mean
 
 
-cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
+cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
                                      int32_t* empty) noexcept nogil:
     """Compute d (1) and step (3) from the rows of A; mark empty rows and return their number."""
     cdef int32_t i, j, q, g, n_empty = 0
@@ -71,32 +74,32 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             d[i] = 0.0
         n_empty += empty[i]
         step[i] = big                                   # row maximum, used by (3) below
-    fill_empty(p.n_rows, d)
+    replace_empty_diagonal(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        pair_means(p, i, d)
+        average_diagonal_of_pairs(p, i, d)
         get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
-                eigenvalue[g] = csr_pair_eigenvalue(a, j + part.first[g], d, step)
-        block_steps(p, i, &part, eigenvalue, d, step)
+                eigenvalue[g] = largest_eigenvalue_of_csr_pair(a, j + part.first[g], d, step)
+        compute_block_steps(p, i, &part, eigenvalue, d, step)
     return n_empty
 
 
-cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
+cdef public void lav_compute_csr_velocity_weights(const blocks_t* p, double* nu) noexcept nogil:
     """Compute nu (2) if only a matrix is known."""
-    block_weights(p, p.d, nu)
+    compute_velocity_weights(p, p.d, nu)
 
 
-cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
+cdef int32_t compute_csr_derived(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
                             int32_t* empty) noexcept nogil:
     """Compute d (= p.d), nu and step from a matrix; return the number of empty rows."""
-    cdef int32_t n_empty = lav_csr_diagonal(p, a, d, step, empty)
-    lav_matrix_nu(p, nu)
+    cdef int32_t n_empty = lav_compute_csr_diagonal(p, a, d, step, empty)
+    lav_compute_csr_velocity_weights(p, nu)
     return n_empty
 
 
-cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
+cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* inv_inertia_arm) noexcept nogil:
     """Compute d, nu, step, M^-1 J^T of joints, coupling and inv_inertia_arm of contacts from the factored form.
@@ -112,48 +115,49 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            minv_times(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * j)
+            multiply_inverse_mass(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * j)
             d[j] = dot12(r.jac + 12 * j, minv_jac + 12 * j) + r.compliance[j]
             step[j] = 0.0
     # contacts: block of A
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_tangents(p, i)
-        contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
-                         n_angular_rows(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+        nt = count_tangent_rows(p, i)
+        compute_contact_delassus_block(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
+                         count_angular_rows(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                          r.inv_inertia, d + j, off,
                          coupling + 5 * c, inv_inertia_arm + 6 * (j - p.ptr[r.n_joints]))
         for q in range(j, p.ptr[i + 1]):
             d[q] += r.compliance[q]
             step[q] = 0.0
-        if is_box(p, i):                                # The second tangent of a box uses the impulse change of the first.
+        # The second tangent of a box uses the impulse change of the first.
+        if is_box_friction_contact(p, i):
             coupling[5 * c + 2] = off[0]
         get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
                 q = j + part.first[g]
-                step[q] = largest_eigenvalue(d[q], off[part.first[g] > nt], d[q + 1])
+                step[q] = largest_eigenvalue_2x2(d[q], off[part.first[g] > nt], d[q + 1])
     # empty rows
     for j in range(p.n_rows):
         empty[j] = fabs(d[j]) < min_magnitude()
         if empty[j]:
             d[j] = 0.0
         n_empty += empty[j]
-    fill_empty(p.n_rows, d)
+    replace_empty_diagonal(p.n_rows, d)
     # steps
     for i in range(p.n_blocks):
-        pair_means(p, i, d)
+        average_diagonal_of_pairs(p, i, d)
         get_friction_components(p, i, &part)
         for g in range(part.n):
             eigenvalue[g] = step[p.ptr[i] + part.first[g]]
-        block_steps(p, i, &part, eigenvalue, d, step)
-    block_weights(p, d, nu)
-    joint_weights(p, r, nu)
+        compute_block_steps(p, i, &part, eigenvalue, d, step)
+    compute_velocity_weights(p, d, nu)
+    set_angular_joint_weights(p, r, nu)
     return n_empty
 
 
-cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
+cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
                                          int32_t* empty, int32_t* place, double* y) noexcept nogil:
     """Compute Y, d, nu and step in generalised coordinates; return the number of empty rows. place (n) is scratch."""
     cdef int32_t i, j, b, nc, part_, n_empty = 0
@@ -161,7 +165,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
     cdef friction_components_t part
     cdef const double* row
     for b in range(g.n_panels):
-        panel_whiten(g, b, place, y + g.pval[b])
+        whiten_panel(g, b, place, y + g.pval[b])
         nc = g.pcol[b + 1] - g.pcol[b]
         row = y + g.pval[b]
         for i in range(g.prow[b], g.prow[b + 1]):
@@ -172,7 +176,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
                 n_empty += 1
             row += nc
     if n_empty > 0:
-        fill_empty(p.n_rows, d)
+        replace_empty_diagonal(p.n_rows, d)
     b = 0
     for i in range(p.n_blocks):
         j = p.ptr[i]
@@ -184,14 +188,14 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
             if part.size[part_] == 2:
                 j = p.ptr[i] + part.first[part_]
                 row = y + g.pval[b] + (j - g.prow[b]) * nc
-                eigenvalue[part_] = largest_eigenvalue(d[j], dot(row, row + nc, nc), d[j + 1])
-        pair_means(p, i, d)
-        block_steps(p, i, &part, eigenvalue, d, step)
-    block_weights(p, d, nu)
+                eigenvalue[part_] = largest_eigenvalue_2x2(d[j], dot(row, row + nc, nc), d[j + 1])
+        average_diagonal_of_pairs(p, i, d)
+        compute_block_steps(p, i, &part, eigenvalue, d, step)
+    compute_velocity_weights(p, d, nu)
     return n_empty
 
 
-cdef void point_at(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
+cdef void bind_derived(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
     """Point p and g at the derived numbers."""
     cdef ssize_t k = p.n_blocks, m = p.n_rows
     p.d = derived.numbers
@@ -206,8 +210,8 @@ cdef void point_at(blocks_t* p, generalized_t* g, const derived_t* derived) noex
     g.cols = g.home + k
 
 
-cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
-    """Return `Data.entries_of_a`; on (n) is scratch: the number of rows of each tree, stored at its root."""
+cdef double count_products(const generalized_t* g, double* on) noexcept nogil:
+    """Return `Data.entries_of_matrix`; on (n) is scratch: the number of rows of each tree, stored at its root."""
     cdef int32_t b, q, rows
     cdef double out = 0.0, dense = <double>g.m * g.m
     for b in range(g.n):
@@ -243,7 +247,7 @@ cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noex
         w = out.marks
         if w == NULL:
             return NO_MEMORY
-        out.n_panels = panel_pattern(g, k, p.ptr, w, w + 2 * n, w + 2 * n + k + 1, w + 2 * n + 2 * (k + 1), w + head,
+        out.n_panels = find_panel_pattern(g, k, p.ptr, w, w + 2 * n, w + 2 * n + k + 1, w + 2 * n + 2 * (k + 1), w + head,
                                      <int32_t>workspace, &n_cols, &out.values)
         if out.n_panels >= 0:
             break
@@ -266,8 +270,8 @@ cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noex
         while w[2 * <ssize_t>n + b + 1] <= p.ptr[i]:        # prow
             b += 1
         home[i] = b
-    point_at(p, g, out)
-    out.n_empty = lav_general_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
+    bind_derived(p, g, out)
+    out.n_empty = lav_compute_generalized_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
     return DERIVED
 
 
@@ -292,7 +296,7 @@ cdef class Data:
 
     The arrays must be validated, C-contiguous float64 or int32 arrays; they are kept alive. Either `csr` = (indptr, indices,
     data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance)
-    is given. `general_data` creates data in generalised coordinates.
+    is given. `make_generalized_data` creates data in generalised coordinates.
     """
 
     def __init__(self, Blocks blocks, b_, int law, csr=None, rows=None):
@@ -322,7 +326,7 @@ cdef class Data:
         self.single_rows = blocks.single_rows
         if self.factored:
             self._set_rows(rows)
-            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
+            n_empty = lav_compute_body_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
                                         <double*>self.rows.minv_jac, <double*>self.rows.coupling,
                                         <double*>self.rows.inv_inertia_arm)
         else:
@@ -331,7 +335,7 @@ cdef class Data:
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = matrix_numbers(&self.blocks, &self.csr, d, nu, step, empty)
+            n_empty = compute_csr_derived(&self.blocks, &self.csr, d, nu, step, empty)
         self._numbers = numbers_
         self.empty = _NONE
         if n_empty:
@@ -362,7 +366,7 @@ cdef class Data:
             return
         end = compute_derived(&blocks, &general, &derived)
         if end == DERIVED:
-            self.adopt(&derived)
+            self.adopt_derived(&derived)
             return
         free(derived.marks)
         free(derived.numbers)
@@ -370,7 +374,7 @@ cdef class Data:
             raise OverflowError(f"M^-1 J^T has {derived.values:.3g} entries, more than 32-bit indices reach")
         raise MemoryError(f"{derived.values:.3g} entries of M^-1 J^T")
 
-    cdef void adopt(self, derived_t* derived):
+    cdef void adopt_derived(self, derived_t* derived):
         """Take ownership of the result of `compute_derived`; free it if another thread stored the same result first."""
         cdef int32_t m = self.blocks.n_rows, i
         empty = _NONE
@@ -383,7 +387,7 @@ cdef class Data:
                 return
             self.empty = empty
             self.derived = derived[0]
-            point_at(&self.blocks, &self.general, derived)
+            bind_derived(&self.blocks, &self.general, derived)
             self.ready = True
 
     def _set_rows(self, rows):
@@ -420,7 +424,7 @@ cdef class Data:
         if compliance.shape[0]:
             self.rows.compliance = &compliance[0]
 
-    cdef object part(self, int which):
+    cdef object get_derived_array(self, int which):
         """Return d (0), nu (1) or step (2) as an array (m,)."""
         cdef Py_ssize_t m = self.blocks.n_rows, at = which * (m + 1)
         cdef double[::1] x
@@ -436,7 +440,7 @@ cdef class Data:
     def d(self):
         """Diagonal of A with fallbacks (m,) [1/kg]."""
         if self._d is None:
-            self._d = _read_only(self.part(0))
+            self._d = _read_only(self.get_derived_array(0))
         return self._d
 
     def copy_velocity_weight(self, Data other, bint joints=False):
@@ -452,20 +456,20 @@ cdef class Data:
     def nu(self):
         """Velocity weight nu (m,) [1/kg]: velocity error = sqrt(nu d) |e|."""
         if self._nu is None:
-            self._nu = _read_only(self.part(1))
+            self._nu = _read_only(self.get_derived_array(1))
         return self._nu
 
     @property
     def step(self):
         """Steps of a sweep (m,) [kg]."""
         if self._step is None:
-            self._step = _read_only(self.part(2))
+            self._step = _read_only(self.get_derived_array(2))
         return self._step
 
     @property
     def outside(self):
         """First row with a d above the range of core/validate.pxd, or -1."""
-        return first_invalid(self.blocks.d, self.blocks.n_rows)
+        return find_invalid_number(self.blocks.d, self.blocks.n_rows)
 
     @property
     def work(self):
@@ -485,13 +489,13 @@ cdef class Data:
         return self._weight
 
     @property
-    def entries_of_a(self):
+    def entries_of_matrix(self):
         """Upper bound on the entries of A, from J and M: rows on the same tree are coupled; rows on two trees count twice."""
         cdef double[::1] on = np.empty(self.general.n + 1)
-        return entries_of(&self.general, &on[0])
+        return count_products(&self.general, &on[0])
 
     @property
-    def products_of_a(self):
+    def products_of_matrix(self):
         """Multiply-adds of A = Y Y^T, from J and M: the sum over columns of Y of the squared number of entries."""
         cdef const generalized_t* g = &self.general
         cdef double[::1] on = np.zeros(g.n + 1)
@@ -527,7 +531,7 @@ cdef class Data:
                 indptr[i + 1] = at
         return data_[:at], indices_[:at], indptr_
 
-    cdef void keep_reference(self, const islands_t* islands, const double* start):
+    cdef void store_reference(self, const islands_t* islands, const double* start):
         """Store a copy of the islands with their references (or NULL) and the start of `reference_of`, unless known."""
         cdef Py_ssize_t k = self.blocks.n_blocks
         cdef Workspace numbers, marks
@@ -554,14 +558,14 @@ cdef class Data:
         cdef double start[3]
         if other is not self:
             start[0], start[1], start[2] = other.reference_energy, other.reference_velocity, other.relative_at_zero
-            self.keep_reference(other.blocks.islands, start)
+            self.store_reference(other.blocks.islands, start)
 
     def islands(self):
         """Return (number of islands, island of each block (k,)), computed by `find_islands` of core/islands.pxd."""
         cdef view_t v = self.view()
         cdef islands_t islands
         cdef Py_ssize_t i, k = self.blocks.n_blocks
-        cdef Workspace marks = allocate_workspace(islands_index(&v) * sizeof(int32_t))
+        cdef Workspace marks = allocate_workspace(island_workspace_integers(&v) * sizeof(int32_t))
         cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &islands)
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_
@@ -571,7 +575,7 @@ cdef class Data:
         return count if k else 0, label_
 
 
-def general_data(Blocks blocks, b, Operator operator, compliance, int law):
+def make_generalized_data(Blocks blocks, b, Operator operator, compliance, int law):
     """Create the data of a problem in generalised coordinates; `prepare` derives its numbers. law: COULOMB or CONE."""
     cdef Data data = Data.__new__(Data)
     data.keep = [blocks, b, operator, compliance]
@@ -583,12 +587,12 @@ def general_data(Blocks blocks, b, Operator operator, compliance, int law):
     data.reference_energy = data.reference_velocity = data.relative_at_zero = -1.0
     data.empty = _NONE
     if blocks.at.n_rows:
-        data.blocks.b = doubles(b, blocks.at.n_rows)
-        data.general.compliance = doubles(compliance, blocks.at.n_rows)
+        data.blocks.b = as_double_pointer(b, blocks.at.n_rows)
+        data.general.compliance = as_double_pointer(compliance, blocks.at.n_rows)
     return data
 
 
-def zero_impulse(const double[::1] lower, const double[::1] upper):
+def clip_zero_to_bounds(const double[::1] lower, const double[::1] upper):
     """Return Pi(0) (m,) [N s], zero clipped to the bounds, read-only."""
     cdef Py_ssize_t i, m = lower.shape[0]
     out = np.zeros(m)
@@ -610,9 +614,9 @@ def _read_only(x):
     return x
 
 
-def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):
+def multiply_body_jacobian(Data p, const double[:, ::1] v, double[::1] out):
     """Write J v (m,) of a factored problem to `out`, for v (n, 6) [m/s, rad/s]."""
     if p.blocks.n_rows and p.rows.n_bodies:
-        rows_times(&p.blocks, &p.rows, &v[0, 0], &out[0])
+        multiply_jacobian(&p.blocks, &p.rows, &v[0, 0], &out[0])
     else:
         out[:] = 0.0

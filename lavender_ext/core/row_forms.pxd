@@ -8,8 +8,8 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.generalized cimport add_scaled_whitened_row, whitened_dot
+from lavender_ext.core.csr cimport csr_row_dot
+from lavender_ext.core.generalized cimport add_scaled_whitened_row, whitened_row_dot
 from lavender_ext.core.view cimport csr_t, generalized_t
 
 
@@ -30,7 +30,7 @@ ctypedef fused row_form_t:
     generalized_t
 
 
-cdef inline int32_t panel_of(const row_form_t* form, int32_t i) noexcept nogil:
+cdef inline int32_t find_panel(const row_form_t* form, int32_t i) noexcept nogil:
     """Return the panel of block i over J and M, else 0."""
     if row_form_t is generalized_t:
         return form.home[i]
@@ -38,20 +38,20 @@ cdef inline int32_t panel_of(const row_form_t* form, int32_t i) noexcept nogil:
         return 0
 
 
-cdef inline double row_slack(const row_form_t* form, const blocks_t* p, int32_t panel, int32_t row, const double* lam,
+cdef inline double compute_row_slack(const row_form_t* form, const blocks_t* p, int32_t panel, int32_t row, const double* lam,
                              const double* v) noexcept nogil:
     """Return w of a row; panel: that of its block, v: read over J and M only."""
     if row_form_t is csr_t:
-        return csr_dot(form, row, lam) - p.b[row]
+        return csr_row_dot(form, row, lam) - p.b[row]
     elif row_form_t is damped_csr_t:
-        return csr_dot(form.a, row, lam) - p.b[row]
+        return csr_row_dot(form.a, row, lam) - p.b[row]
     elif row_form_t is stored_slack_t:
         return form.w[row]
     else:
-        return whitened_dot(form, panel, row, v) + (form.compliance[row] * lam[row] - p.b[row])
+        return whitened_row_dot(form, panel, row, v) + (form.compliance[row] * lam[row] - p.b[row])
 
 
-cdef inline double row_step(const row_form_t* form, const blocks_t* p, int32_t row) noexcept nogil:
+cdef inline double get_row_step(const row_form_t* form, const blocks_t* p, int32_t row) noexcept nogil:
     """Return the step of a row [kg]."""
     if row_form_t is damped_csr_t or row_form_t is stored_slack_t:
         return form.omega * p.step[row]
@@ -59,7 +59,7 @@ cdef inline double row_step(const row_form_t* form, const blocks_t* p, int32_t r
         return p.step[row]
 
 
-cdef inline void set_impulse(const row_form_t* form, int32_t panel, int32_t row, double impulse, double* lam,
+cdef inline void set_row_impulse(const row_form_t* form, int32_t panel, int32_t row, double impulse, double* lam,
                              double* v) noexcept nogil:
     """Set the impulse of a row and update v."""
     if row_form_t is generalized_t:

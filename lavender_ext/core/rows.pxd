@@ -15,7 +15,7 @@ The update of a contact in a sweep is in core/contact.pxd.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport blocks_t, n_angular_rows, n_tangents
+from lavender_ext.core.block_types cimport blocks_t, count_angular_rows, count_tangent_rows
 from lavender_ext.core.view cimport rows_t
 
 
@@ -29,7 +29,7 @@ cdef inline void cross(const double* a, const double* b, double* out) noexcept n
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-cdef inline void relative_velocity(const double* v, int32_t a, int32_t b, const double* arm_a,
+cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b, const double* arm_a,
                                    const double* arm_b, double* u, double* spin) noexcept nogil:
     """Compute the relative velocity u (1), and omega_b - omega_a in `spin`."""
     cdef const double* x
@@ -53,7 +53,7 @@ cdef inline void relative_velocity(const double* v, int32_t a, int32_t b, const 
             spin[k] -= x[3 + k]
 
 
-cdef inline void apply_impulse(double* v, double inv_mass, const double* inv_inertia, const double* arm,
+cdef inline void apply_impulse_to_body(double* v, double inv_mass, const double* inv_inertia, const double* arm,
                       const double* impulse, const double* twist, double sign) noexcept nogil:
     """Apply an impulse to one body by (3); twist = s n [N m s], or NULL. `sign` is -1 for body a, 1 for body b."""
     cdef double l[3]
@@ -74,12 +74,12 @@ cdef inline void apply_impulse_to_bodies(double* v, int32_t a, int32_t b, const 
                              const double* impulse, const double* twist) noexcept nogil:
     """Apply an impulse and a twist to both bodies by (3)."""
     if a >= 0:
-        apply_impulse(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
+        apply_impulse_to_body(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
     if b >= 0:
-        apply_impulse(v + 6 * b, inv_mass[b], inv_inertia + 9 * b, arm_b, impulse, twist, 1.0)
+        apply_impulse_to_body(v + 6 * b, inv_mass[b], inv_inertia + 9 * b, arm_b, impulse, twist, 1.0)
 
 
-cdef inline double joint_velocity(const double* jac, const double* v, int32_t a, int32_t b) noexcept nogil:
+cdef inline double joint_row_velocity(const double* jac, const double* v, int32_t a, int32_t b) noexcept nogil:
     """Return the product of one joint row (12) with the velocities of its bodies."""
     cdef double s = 0.0, t = 0.0
     cdef int32_t k
@@ -104,14 +104,14 @@ cdef inline void apply_joint_impulse(const double* minv_jac, double change, doub
             v[6 * b + k] += change * minv_jac[6 + k]
 
 
-cdef inline void contact_velocity(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* v,
+cdef inline void compute_contact_velocity(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* v,
                                double* w) noexcept nogil:
     """Compute the relative velocities w of the rows of one contact by (2), its rows of J v."""
     cdef double u[3]
     cdef double omega[3]
     cdef double t2[3]
     cdef const double* n = r.normal + 3 * c
-    relative_velocity(v, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.arm_a + 3 * c,
+    compute_relative_velocity(v, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.arm_a + 3 * c,
                       r.arm_b + 3 * c, u, omega)
     w[0] = dot3(n, u)
     if nt > 0:
@@ -126,18 +126,18 @@ cdef inline void contact_velocity(const rows_t* r, int32_t c, int32_t nt, int32_
         w[2 + nt + (n_angular & 1)] = dot3(t2, omega)
 
 
-cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
+cdef inline void multiply_jacobian(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
     """Compute out (m) = J v for v (n, 6)."""
     cdef int32_t i, j, c
     for i in range(r.n_joints):
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            out[j] = joint_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+            out[j] = joint_row_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
     for c in range(r.n_contacts):
         i = r.n_joints + c
-        contact_velocity(r, c, n_tangents(p, i), n_angular_rows(p, i), v, out + p.ptr[i])
+        compute_contact_velocity(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), v, out + p.ptr[i])
 
 
-cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular,
+cdef inline void form_contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular,
                                   double* jac) noexcept nogil:
     """Write the rows of one contact (1 + nt + n_angular, 12) in the layout of joint rows."""
     cdef double axis[3]
@@ -181,7 +181,7 @@ cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_
                 jac[12 * row + 6 + k] = 0.0
 
 
-cdef inline void minv_times(const double* jac, const double* inv_mass, const double* inv_inertia, int32_t a,
+cdef inline void multiply_inverse_mass(const double* jac, const double* inv_mass, const double* inv_inertia, int32_t a,
                             int32_t b, double* out) noexcept nogil:
     """Compute M^-1 J^T of one row in the layout of joint rows."""
     cdef int32_t k
@@ -197,7 +197,7 @@ cdef inline void minv_times(const double* jac, const double* inv_mass, const dou
             out[9 + k] = dot3(inv_inertia + 9 * b + 3 * k, jac + 9)
 
 
-cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a,
+cdef inline void compute_contact_delassus_block(const double* normal, const double* tangent, const double* arm_a,
                                   const double* arm_b,
                                   int32_t nt, int32_t n_angular, int32_t a, int32_t b, const double* inv_mass,
                                   const double* inv_inertia, double* d, double* off, double* coupling,
@@ -278,12 +278,12 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
         off[0] += m * dot3(axis + 3, axis + 6)
 
 
-cdef inline double reciprocal(double x) noexcept nogil:
+cdef inline double reciprocal_or_zero(double x) noexcept nogil:
     """Return 1 / x, or 0 if x is not positive (a row that no impulse moves)."""
     return 1.0 / x if x > 0.0 else 0.0
 
 
-cdef inline double largest_eigenvalue(double a, double b, double c) noexcept nogil:
+cdef inline double largest_eigenvalue_2x2(double a, double b, double c) noexcept nogil:
     """Return the largest eigenvalue of [[a, b], [b, c]]."""
     cdef double h = 0.5 * (a - c)
     return 0.5 * (a + c) + sqrt(h * h + b * b)

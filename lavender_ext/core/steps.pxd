@@ -7,11 +7,11 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t, get_row_groups, friction_components_t
-from lavender_ext.core.rows cimport largest_eigenvalue, reciprocal
+from lavender_ext.core.rows cimport largest_eigenvalue_2x2, reciprocal_or_zero
 from lavender_ext.core.view cimport csr_t
 
 
-cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
+cdef inline double get_csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
     """Return A_ij."""
     cdef int32_t q
     cdef double s = 0.0
@@ -21,27 +21,27 @@ cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogi
     return s
 
 
-cdef inline double csr_pair_eigenvalue(const csr_t* a, int32_t j, const double* d, const double* big) noexcept nogil:
+cdef inline double largest_eigenvalue_of_csr_pair(const csr_t* a, int32_t j, const double* d, const double* big) noexcept nogil:
     """Return lambda_max of (3) on rows j and j + 1, or d[j] if it is not clearly positive; big: largest entry of each row."""
     cdef double scale = big[j] if big[j] > big[j + 1] else big[j + 1], e
-    e = largest_eigenvalue(csr_entry(a, j, j), 0.5 * (csr_entry(a, j, j + 1) + csr_entry(a, j + 1, j)),
-                           csr_entry(a, j + 1, j + 1))
+    e = largest_eigenvalue_2x2(get_csr_entry(a, j, j), 0.5 * (get_csr_entry(a, j, j + 1) + get_csr_entry(a, j + 1, j)),
+                           get_csr_entry(a, j + 1, j + 1))
     return e if e > 1e-10 * scale else d[j]
 
 
-cdef inline void block_steps(const blocks_t* p, int32_t i, const friction_components_t* part, const double* eigenvalue,
+cdef inline void compute_block_steps(const blocks_t* p, int32_t i, const friction_components_t* part, const double* eigenvalue,
                              const double* d, double* step) noexcept nogil:
     """Compute the steps (3) of block i; eigenvalue[g] is lambda_max of component g if it has two rows."""
     cdef int32_t j = p.ptr[i], g, k
     for k in range(j, p.ptr[i + 1]):
-        step[k] = reciprocal(d[k])
+        step[k] = reciprocal_or_zero(d[k])
     for g in range(part.n):
         if part.size[g] == 2:                           # No sweep updates a round cone, so larger components need no step.
             k = j + part.first[g]
-            step[k] = step[k + 1] = reciprocal(eigenvalue[g] if eigenvalue[g] > 0.0 else d[k])
+            step[k] = step[k + 1] = reciprocal_or_zero(eigenvalue[g] if eigenvalue[g] > 0.0 else d[k])
 
 
-cdef inline void pair_means(const blocks_t* p, int32_t i, double* d) noexcept nogil:
+cdef inline void average_diagonal_of_pairs(const blocks_t* p, int32_t i, double* d) noexcept nogil:
     """Replace d of the two rows of each group of block i by their mean (1)."""
     cdef friction_components_t group
     cdef int32_t g, k

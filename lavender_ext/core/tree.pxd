@@ -3,7 +3,7 @@
     M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = n - 1 ... 0: each leaf of a
     kinematic tree is eliminated before its ancestors, and there is no fill-in (Featherstone 2008, section 6.5)     (1)
 
-The mass matrix of a problem and the normal matrix of Newton's method over its velocities are factored by `eliminate_rows`.
+The mass matrix of a problem and the normal matrix of Newton's method over its velocities are factored by `eliminate_tree_rows`.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
@@ -16,12 +16,12 @@ cdef enum:
     MIN_COLUMNS_FOR_FOUR = 16   # Four rows are subtracted at once if they have at least this many columns, otherwise two.
 
 
-cdef inline double min_pivot_of_mass() noexcept nogil:
+cdef inline double min_mass_pivot_ratio() noexcept nogil:
     """Return the fraction of M_kk that a pivot of a mass matrix must exceed: four roundings of M_kk."""
     return 8.8817841970012523e-16
 
 
-cdef inline void sort_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
+cdef inline void sort_row_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
     """Sort the columns of row k, the columns below k with the mark k, in ascending order.
 
     They are sorted by insertion, or collected by scanning the marks if that is cheaper.
@@ -51,7 +51,7 @@ cdef inline void sort_columns(int32_t k, const int32_t* mark, int32_t count, int
         i += 1
 
 
-cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace, int32_t* lptr,
+cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace, int32_t* lptr,
                                  int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
                                  int32_t* first_child) noexcept nogil:
     """Compute the pattern of L from the lower triangle of M; return the number of entries, -1 if `workspace` is too small.
@@ -86,7 +86,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
                     lidx[at] = j
             c = next_child[c]
         start = at
-        sort_columns(k, mark, end - start, lidx + start)
+        sort_row_columns(k, mark, end - start, lidx + start)
         lptr[k] = start
         parent[k] = end - start
         if end > start:
@@ -103,7 +103,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
     return lptr[n]
 
 
-cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
+cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
     """Compute L and 1 / D of (1) of a mass matrix; return -1, or the row with too small a pivot."""
@@ -128,10 +128,10 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
-    return eliminate_rows(n, lptr, lidx, lval, pivot, inv_pivot, min_pivot_of_mass())
+    return eliminate_tree_rows(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio())
 
 
-cdef inline int32_t eliminate_rows(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+cdef inline int32_t eliminate_tree_rows(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                    double* inv_pivot, double min_pivot) noexcept nogil:
     """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row with too small a pivot.
 
@@ -150,17 +150,17 @@ cdef inline int32_t eliminate_rows(int32_t n, const int32_t* lptr, const int32_t
             row[t] = lval + lptr[k - t]
         # rows of the chain among each other
         for t in range(s):
-            subtract_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
-            if not has_reciprocal(pivot, inv_pivot, k - t, min_pivot):
+            eliminate_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
+            if not invert_pivot(pivot, inv_pivot, k - t, min_pivot):
                 return k - t
         # the other rows
         for a in range(count - s, -1, -1):
-            subtract_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
+            eliminate_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
         k -= s
     return -1
 
 
-cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k, double min_pivot) noexcept nogil:
+cdef inline bint invert_pivot(const double* pivot, double* inv_pivot, int32_t k, double min_pivot) noexcept nogil:
     """Replace inv_pivot[k], which holds M_kk, by 1 / D_k; return False if the pivot is too small."""
     if not (pivot[k] > min_pivot * inv_pivot[k] and pivot[k] >= min_magnitude()):
         return False
@@ -168,7 +168,7 @@ cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t 
     return True
 
 
-cdef inline void subtract_chain_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+cdef inline void eliminate_chain_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                      const double* inv_pivot, int32_t k, int32_t j, int32_t count, double** row,
                                      int32_t s) noexcept nogil:
     """Eliminate the s rows k, k - 1 ... of a chain from row j, which is their column number `count`.
@@ -190,7 +190,7 @@ cdef inline void subtract_chain_rows(const int32_t* lptr, const int32_t* lidx, d
         while lidx[at] != lidx[first]:
             at += 1
     if lptr[j + 1] - at == count:                           # row j has exactly these columns
-        subtract_run(lval + at, row, z, s, count)
+        subtract_row_combination(lval + at, row, z, s, count)
     else:
         for b in range(count):
             while lidx[at] != lidx[first + b]:
@@ -203,7 +203,7 @@ cdef inline void subtract_chain_rows(const int32_t* lptr, const int32_t* lidx, d
         row[t][count] = z[t]
 
 
-cdef inline void subtract_run(double* x, double** row, const double* z, int32_t s, int32_t n) noexcept nogil:
+cdef inline void subtract_row_combination(double* x, double** row, const double* z, int32_t s, int32_t n) noexcept nogil:
     """Subtract z_0 row_0 + z_1 row_1 + ... (s rows) from x (n)."""
     cdef int32_t t = 0
     while t + 4 <= s and n >= MIN_COLUMNS_FOR_FOUR:
@@ -239,7 +239,7 @@ cdef inline void axpy_subtract_4(double* x, const double* l, double f, const dou
         x[i] = (((x[i] - f * l[i]) - g * u[i]) - h * v[i]) - k * w[i]
 
 
-cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
+cdef inline void solve_tree_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
                            const double* inv_pivot, double* x) noexcept nogil:
     """Overwrite x (n) with (L^T D L)^-1 x; lptr indexes both lidx and lval."""
     cdef int32_t k, q, first, end

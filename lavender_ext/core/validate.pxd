@@ -20,7 +20,7 @@ cdef inline double min_magnitude() noexcept nogil:
     return 1e-60
 
 
-cdef inline bint is_number(double x) noexcept nogil:
+cdef inline bint is_valid_number(double x) noexcept nogil:
     """Return whether x satisfies (1); False for NaN."""
     return fabs(x) <= max_magnitude()
 
@@ -30,16 +30,16 @@ cdef inline bint is_valid_magnitude(double x) noexcept nogil:
     return x == 0.0 or min_magnitude() <= x <= max_magnitude()
 
 
-cdef inline int64_t first_invalid(const double* x, int64_t n) noexcept nogil:
+cdef inline int64_t find_invalid_number(const double* x, int64_t n) noexcept nogil:
     """Return the index of the first number that violates (1), or -1."""
     cdef int64_t i
     for i in range(n):
-        if not is_number(x[i]):
+        if not is_valid_number(x[i]):
             return i
     return -1
 
 
-cdef inline int64_t first_invalid_magnitude(const double* x, int64_t n) noexcept nogil:
+cdef inline int64_t find_invalid_magnitude(const double* x, int64_t n) noexcept nogil:
     """Return the index of the first number that violates (1) or (2), or -1."""
     cdef int64_t i
     for i in range(n):
@@ -48,7 +48,7 @@ cdef inline int64_t first_invalid_magnitude(const double* x, int64_t n) noexcept
     return -1
 
 
-cdef inline bint is_beyond(const double* x, int64_t n, double bound) noexcept nogil:
+cdef inline bint any_magnitude_above(const double* x, int64_t n, double bound) noexcept nogil:
     """Return whether any |x_i| is above `bound`. The loop has no branch, so that compilers vectorise it."""
     cdef int64_t i
     cdef int exceeds = 0
@@ -57,7 +57,7 @@ cdef inline bint is_beyond(const double* x, int64_t n, double bound) noexcept no
     return exceeds
 
 
-cdef inline bint has_invalid(const double* x, int64_t n) noexcept nogil:
+cdef inline bint has_invalid_number(const double* x, int64_t n) noexcept nogil:
     """Return whether any number violates (1). The loop never ends early, because almost all arrays are valid."""
     cdef int64_t i
     cdef double limit = max_magnitude()
@@ -67,7 +67,7 @@ cdef inline bint has_invalid(const double* x, int64_t n) noexcept nogil:
     return invalid
 
 
-cdef inline double max_abs(double maximum, double x) noexcept nogil:
+cdef inline double update_max_abs(double maximum, double x) noexcept nogil:
     """Return the larger of `maximum` and |x|; NaN if either is NaN."""
     x = fabs(x)
     return maximum if x <= maximum or maximum != maximum else x
@@ -101,14 +101,14 @@ cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
     return (s + t) + (u + v) == 0.0
 
 
-cdef inline bint is_frame(const double* n, const double* t, double tolerance) noexcept nogil:
+cdef inline bint is_orthonormal_pair(const double* n, const double* t, double tolerance) noexcept nogil:
     """Return whether n.n and t.t are 1 and n.t is 0, all within `tolerance`."""
     cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
     return (fabs(nn - 1.0) <= tolerance and fabs(tt - 1.0) <= tolerance
             and fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) <= tolerance)
 
 
-cdef inline bint is_definite(const double* x, double skew, double shift, double pivot) noexcept nogil:
+cdef inline bint is_zero_or_definite_inertia(const double* x, double skew, double shift, double pivot) noexcept nogil:
     """Return whether x (3, 3) is zero or positive definite.
 
     With s = max |x_ij|, x / s must be symmetric within `skew`, and the pivots of x / s + shift I must be above `pivot`.

@@ -5,7 +5,7 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
+from lavender_ext.core.block_types cimport blocks_t, count_tangent_rows, count_angular_rows
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.core.view cimport rows_t
 
@@ -17,7 +17,7 @@ cdef inline void add6(double* total, const double* x) noexcept nogil:
         total[k] += x[k]
 
 
-cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
+cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
                               double* f) noexcept nogil:
     """Add J^T lam of joint i to f (n, 6)."""
     cdef double x[12]
@@ -35,7 +35,7 @@ cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, con
         add6(f + 6 * b, x + 6)
 
 
-cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
+cdef inline void add_contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                 double* f) noexcept nogil:
     """Add J^T lam of contact c to f (n, 6); lam points at its normal."""
     cdef double t2[3]
@@ -68,7 +68,7 @@ cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t 
             f[6 * b + 3 + k] += l[k] + twist[k] if n_angular else l[k]
 
 
-cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil:
+cdef inline void apply_body_inverse_mass(const rows_t* r, double* v) noexcept nogil:
     """Multiply wrenches v (n, 6) by M^-1 in place (1)."""
     cdef int32_t i, k
     cdef double l[3]
@@ -84,27 +84,27 @@ cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil
         inv += 9
 
 
-cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* lam, double* f) noexcept nogil:
+cdef inline void compute_body_wrenches(const blocks_t* p, const rows_t* r, const double* lam, double* f) noexcept nogil:
     """Compute f (n, 6) = J^T lam of all blocks."""
     cdef int32_t i, j, c, nt, n_angular
     for i in range(6 * r.n_bodies):
         f[i] = 0.0
     for i in range(r.n_joints):
-        joint_wrench(p, r, i, lam, f)
+        add_joint_wrench(p, r, i, lam, f)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_tangents(p, i)
-        n_angular = n_angular_rows(p, i)
+        nt = count_tangent_rows(p, i)
+        n_angular = count_angular_rows(p, i)
         if n_angular or nt == 1:                            # the two common kinds below have constant sizes
-            contact_wrench(r, c, nt, n_angular, lam + j, f)
+            add_contact_wrench(r, c, nt, n_angular, lam + j, f)
         elif nt == 2:
-            contact_wrench(r, c, 2, 0, lam + j, f)
+            add_contact_wrench(r, c, 2, 0, lam + j, f)
         else:
-            contact_wrench(r, c, 0, 0, lam + j, f)
+            add_contact_wrench(r, c, 0, 0, lam + j, f)
 
 
-cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
+cdef inline void compute_velocity_change(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
     """Compute v (n, 6) = M^-1 J^T lam of all blocks by (1)."""
-    rows_wrench(p, r, lam, v)
-    wrenches_to_velocity(r, v)
+    compute_body_wrenches(p, r, lam, v)
+    apply_body_inverse_mass(r, v)

@@ -65,6 +65,6 @@ cdef struct view_t:
     const generalized_t* g      # with panels
 
 
-cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
+cdef inline const int32_t* get_block_bodies(const rows_t* r, int32_t i) noexcept nogil:
     """Return the two bodies of block i."""
     return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)

@@ -6,23 +6,23 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport blocks_t, n_angular_rows
+from lavender_ext.core.block_types cimport blocks_t, count_angular_rows
 from lavender_ext.core.view cimport rows_t
 
 
-cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:
+cdef inline void compute_velocity_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:
     """Compute nu (m) if only a matrix is known: d (m), with (1) on angular rows."""
     cdef int32_t i, j, end
     for j in range(p.n_rows):
         nu[j] = d[j]
     for i in range(p.n_blocks):
         end = p.ptr[i + 1]
-        for j in range(end - n_angular_rows(p, i), end):
+        for j in range(end - count_angular_rows(p, i), end):
             nu[j] = d[p.ptr[i]]
 
 
-cdef inline void joint_weights(const blocks_t* p, const rows_t* r, double* nu) noexcept nogil:
-    """Apply (2) to the angular joint rows, after `block_weights`."""
+cdef inline void set_angular_joint_weights(const blocks_t* p, const rows_t* r, double* nu) noexcept nogil:
+    """Apply (2) to the angular joint rows, after `compute_velocity_weights`."""
     cdef int32_t i, q, t, a, b
     cdef double linear, inv
     for i in range(r.n_joints):

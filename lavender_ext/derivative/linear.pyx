@@ -17,20 +17,22 @@ from libc.string cimport memcpy, memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport ndarray as Array
-from lavender_ext.core.validate cimport all_finite, first_invalid
-from lavender_ext.core.generalized cimport jac_transpose_times, whitened_dot
-from lavender_ext.core.block_types cimport blocks_t, is_rows
+from lavender_ext.core.validate cimport all_finite, find_invalid_number
+from lavender_ext.core.generalized cimport multiply_jacobian_transpose, whitened_row_dot
+from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
-from lavender_ext.core.rows cimport rows_times
-from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
+from lavender_ext.core.rows cimport multiply_jacobian
+from lavender_ext.core.velocity cimport compute_body_wrenches, apply_body_inverse_mass
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, form_scaled_csr,
-                                              form_scaled_generalized, form_system_rows, linearised_t, linearise_blocks,
-                                              multiply_blocks, natural_t, number_system_rows)
+                                              form_scaled_generalized, form_reduced_system, linearised_t, linearise_all_projections,
+                                              multiply_block_derivatives, natural_t, number_system_rows)
 from lavender_ext.factor.linear cimport LU, analyse_dense, linear_factor, linear_solve, linear_solve_transposed
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
-from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.judge.measure cimport (
+    residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score, count_judge_scratch,
+)
+from lavender_ext.judge.score cimport make_empty_score, score_t
 
 cdef object empty = np.empty, ndarray = np.ndarray
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32), I1 = np.dtype(np.int8)
@@ -42,15 +44,15 @@ cdef double MIN_PIVOT_RATIO = 1e-12
 CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
 
 
-cdef void times_jac_transpose(const view_t* v, const double* lam, double* f) noexcept nogil:
+cdef void multiply_jacobian_transpose_of_view(const view_t* v, const double* lam, double* f) noexcept nogil:
     """Compute f (n) = J^T lam over J and M or bodies."""
     if v.g != NULL:
-        jac_transpose_times(v.g, lam, f)
+        multiply_jacobian_transpose(v.g, lam, f)
     elif v.r != NULL:
-        rows_wrench(&v.p, v.r, lam, f)
+        compute_body_wrenches(&v.p, v.r, lam, f)
 
 
-cdef void times_jac_minv(const linearised_t* a, double* f, double* out) noexcept nogil:
+cdef void multiply_jacobian_inverse_mass(const linearised_t* a, double* f, double* out) noexcept nogil:
     """Compute out = J M^-1 f on the rows of G (with bodies: on all rows); f (n) is overwritten.
 
     With M = L^T D L the result is Y D^-1/2 L^-T f.
@@ -59,8 +61,8 @@ cdef void times_jac_minv(const linearised_t* a, double* f, double* out) noexcept
     cdef int32_t k, q, i, b
     cdef double z
     if a.v.r != NULL:
-        wrenches_to_velocity(a.v.r, f)
-        rows_times(&a.v.p, a.v.r, f, out)
+        apply_body_inverse_mass(a.v.r, f)
+        multiply_jacobian(&a.v.p, a.v.r, f, out)
         return
     for k in range(g.n - 1, -1, -1):
         z = f[k]
@@ -71,10 +73,10 @@ cdef void times_jac_minv(const linearised_t* a, double* f, double* out) noexcept
     for b in range(g.n_panels):
         for i in range(g.prow[b], g.prow[b + 1]):
             if a.system_row[i] >= 0:
-                out[i] = whitened_dot(g, b, i, f)
+                out[i] = whitened_row_dot(g, b, i, f)
 
 
-cdef void add_matrix_transpose_times(const view_t* v, const double* x, double* out) noexcept nogil:
+cdef void add_matrix_transpose_product(const view_t* v, const double* x, double* out) noexcept nogil:
     """Add A^T x of a matrix to out (m)."""
     cdef int32_t i, k
     for i in range(v.p.n_rows):
@@ -92,15 +94,15 @@ cdef public void lav_adjoint(const linearised_t* a, const double* y, const doubl
         soft = v.g.compliance if v.g != NULL else v.r.compliance
     memset(q, 0, m * sizeof(double))
     if v.a != NULL and x != NULL:
-        add_matrix_transpose_times(v, x, q)
+        add_matrix_transpose_product(v, x, q)
     elif y != NULL or x != NULL:
         memset(f, 0, a.n * sizeof(double))
         if x != NULL:
-            times_jac_transpose(v, x, f)
+            multiply_jacobian_transpose_of_view(v, x, f)
         if y != NULL:
             for i in range(a.n):
                 f[i] += y[i]
-        times_jac_minv(a, f, q)
+        multiply_jacobian_inverse_mass(a, f, q)
         if x != NULL:
             for i in range(m):
                 q[i] += soft[i] * x[i]
@@ -110,10 +112,10 @@ cdef public void lav_adjoint(const linearised_t* a, const double* y, const doubl
     linear_solve_transposed(&a.g, s)
     for i in range(m):
         q[i] = s[a.system_row[i]] if a.system_row[i] >= 0 else 0.0
-    multiply_blocks(&a.x, &v.p, a.x.p, q, True, s)
+    multiply_block_derivatives(&a.x, &v.p, a.x.p, q, True, s)
     for i in range(m):
         s[i] = s[i] / a.x.root[i] - (x[i] if x != NULL else 0.0)
-    times_jac_transpose(v, s, f)
+    multiply_jacobian_transpose_of_view(v, s, f)
     for i in range(a.n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
 
@@ -136,7 +138,7 @@ cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to
     return True
 
 
-cdef void form_system(const linearised_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
+cdef void form_derivative_system(const linearised_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
     """Compute G of H + shift, for A of J and M or in compressed rows; h (rows, rows + n) is scratch."""
     cdef int32_t i, n = a.rows
     if v.g != NULL:
@@ -145,34 +147,35 @@ cdef void form_system(const linearised_t* a, const view_t* v, double shift, doub
         form_scaled_csr(v.a, a.v.p.n_rows, n, a.system_row, a.x.root, h)
     for i in range(n):
         h[<ssize_t>i * n + i] += shift
-    form_system_rows(&a.x, &a.v.p, n, a.system_row, h, g)
+    form_reduced_system(&a.x, &a.v.p, n, a.system_row, h, g)
 
 
-cdef ssize_t count_values(const blocks_t* b) noexcept nogil:
+cdef ssize_t count_projection_derivative_values(const blocks_t* b) noexcept nogil:
     """Return the number of values of P."""
     cdef int32_t i, n
     cdef ssize_t size = 0
     for i in range(b.n_blocks):
         n = b.ptr[i + 1] - b.ptr[i]
-        size += n if is_rows(b, i) else n * n
+        size += n if has_independent_rows(b, i) else n * n
     return size
 
 
-cdef ssize_t linear_workspace_size(const blocks_t* b, ssize_t values) noexcept nogil:
-    """Return the number of doubles that `linearise` stores."""
+cdef ssize_t linearisation_workspace_size(const blocks_t* b, ssize_t values) noexcept nogil:
+    """Return the number of doubles that `judge_and_linearise` stores."""
     return 5 * <ssize_t>b.n_rows + 2 * values + (5 * <ssize_t>b.n_rows + 4 * <ssize_t>b.n_blocks + 11) // 8
 
 
-cdef void linearise(linearised_t* a, const double* lam, double energy, double velocity, double* at, double* scratch) noexcept nogil:
+cdef void judge_and_linearise(linearised_t* a, const double* lam, double energy, double velocity, double* at,
+                           double* scratch) noexcept nogil:
     """Judge and linearise the impulse lam (m) of a.v; energy and velocity are the references of the zero impulse.
 
-    at (`linear_workspace_size`) is stored, scratch (m + `scratch_of`) is not.
+    at (`linearisation_workspace_size`) is stored, scratch (m + `count_judge_scratch`) is not.
     """
     cdef const blocks_t* b = &a.v.p
     cdef int32_t m = b.n_rows
-    cdef ssize_t values = count_values(b)
+    cdef ssize_t values = count_projection_derivative_values(b)
     cdef int32_t* ptr = <int32_t*>(at + 5 * m + 2 * values)
-    cdef score_t s = new_score()
+    cdef score_t s = make_empty_score()
     if m == 0:
         a.regular = True
         return
@@ -180,27 +183,27 @@ cdef void linearise(linearised_t* a, const double* lam, double energy, double ve
     a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.system_row + m), ptr, at + 5 * m, at + 5 * m + values)
     memcpy(a.lam, lam, m * sizeof(double))
     judge_view(&a.v, a.lam, a.w, scratch, scratch + m, True, &s)
-    linearise_blocks(b, a.lam, a.w, ptr, &a.x)
+    linearise_all_projections(b, a.lam, a.w, ptr, &a.x)
     a.rows = number_system_rows(b, &a.x, a.system_row)
-    a.relative = relative_of(&s, a.w, m, energy, velocity)
-    a.above_floor = above_floor_of(&s, a.relative, floor_of(&s, energy, velocity))
+    a.relative = relative_residual_of_score(&s, a.w, m, energy, velocity)
+    a.above_floor = residual_above_floor(&s, a.relative, relative_floor_of_score(&s, energy, velocity))
 
 
-cdef ssize_t factor_workspace_size(int32_t n) noexcept nogil:
-    """Return the number of doubles that `factorise` stores."""
+cdef ssize_t derivative_factor_workspace_size(int32_t n) noexcept nogil:
+    """Return the number of doubles that `factor_derivative_system` stores."""
     return <ssize_t>n * n + (n + 1) // 2
 
 
-cdef ssize_t scratch_of_factor(int32_t n, const view_t* v) noexcept nogil:
-    """Return the number of scratch doubles of `factorise`."""
+cdef ssize_t derivative_factor_scratch_size(int32_t n, const view_t* v) noexcept nogil:
+    """Return the number of scratch doubles of `factor_derivative_system`."""
     cdef ssize_t width = n + (v.g.n if v.g != NULL else 0)
     return n * width
 
 
-cdef bint factorise(linearised_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
+cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
     """Factor G of H + shift, with A of v; return whether it is regular.
 
-    at (`factor_workspace_size`) is stored, scratch (`scratch_of_factor`) is not.
+    at (`derivative_factor_workspace_size`) is stored, scratch (`derivative_factor_scratch_size`) is not.
     """
     cdef int32_t i, n = a.rows
     cdef double smallest = 1.0 / 0.0, norm_inf = 0.0, x
@@ -209,7 +212,7 @@ cdef bint factorise(linearised_t* a, const view_t* v, double shift, double* at, 
         return True
     analyse_dense(&a.g, n)
     a.g.by, a.g.wide, a.g.matrix, a.g.swap = LU, has_wide(), at, <int32_t*>(at + <ssize_t>n * n)
-    form_system(a, v, shift, at, scratch)
+    form_derivative_system(a, v, shift, at, scratch)
     if linear_factor(&a.g) == 0:
         for i in range(n):
             x = 1.0 / fabs(at[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
@@ -219,16 +222,16 @@ cdef bint factorise(linearised_t* a, const view_t* v, double shift, double* at, 
     return a.regular
 
 
-cdef bint is_prepared(Data p):
+cdef bint prepare_problem_data(Data p):
     """Prepare p; return False if it has too many entries or d outside the valid range."""
     try:
         p.prepare()
     except OverflowError:
         return False
-    return first_invalid(p.blocks.d, p.blocks.n_rows) < 0
+    return find_invalid_number(p.blocks.d, p.blocks.n_rows) < 0
 
 
-cdef bint adjoint_into(const linearised_t* a, velocity, impulse, slack, double* out):
+cdef bint write_adjoint(const linearised_t* a, velocity, impulse, slack, double* out):
     """Write `Linear.adjoint` to out (3 m + n); return False if an argument is invalid or all are None."""
     cdef int32_t m = a.v.p.n_rows, i
     cdef const double* y
@@ -299,10 +302,10 @@ cdef class Linear:
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, with A of `data` (compressed rows, or J and M); return whether it is regular."""
         cdef view_t v = data.view()
-        cdef Workspace spare = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
-        self.data, self.factor = data, allocate_workspace(factor_workspace_size(self.at.rows) * sizeof(double))
+        cdef Workspace spare = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
+        self.data, self.factor = data, allocate_workspace(derivative_factor_workspace_size(self.at.rows) * sizeof(double))
         with nogil:
-            factorise(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
+            factor_derivative_system(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
         return self.at.regular
 
     def adjoint(self, velocity, impulse, slack):
@@ -315,7 +318,7 @@ cdef class Linear:
         cdef bint is_valid
         out = empty(3 * self.at.v.p.n_rows + self.at.n)
         PyObject_GetBuffer(out, &view, PyBUF_WRITABLE)
-        is_valid = adjoint_into(&self.at, velocity, impulse, slack, <double*>view.buf)
+        is_valid = write_adjoint(&self.at, velocity, impulse, slack, <double*>view.buf)
         PyBuffer_Release(&view)
         return out if is_valid else None
 
@@ -336,8 +339,8 @@ cdef class Linear:
         cdef view_t v = self.data.view()
         cdef Workspace work
         if self.at.rows:
-            work = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
-            form_system(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
+            work = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
+            form_derivative_system(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
     def solve(self, r, bint transpose=False):
@@ -356,7 +359,7 @@ cdef class Linear:
         out_ = np.empty(self.at.v.p.n_rows)
         cdef double[::1] out = out_
         if self.at.v.p.n_rows:
-            multiply_blocks(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], transpose, &out[0])
+            multiply_block_derivatives(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], transpose, &out[0])
         return out_
 
     @property
@@ -433,12 +436,12 @@ cdef class Linears:
         for i in range(n):
             p = data[i]
             a = self.at + i
-            if p is None or not is_prepared(p):
+            if p is None or not prepare_problem_data(p):
                 continue
             a.valid, a.v = True, p.view()
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
-            size += linear_workspace_size(&a.v.p, count_values(&a.v.p))
-            scratch = max(scratch, a.v.p.n_rows + scratch_of(&a.v))
+            size += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
+            scratch = max(scratch, a.v.p.n_rows + count_judge_scratch(&a.v))
         self.workspace, spare = allocate_workspace(size * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to = <double*>self.workspace.at
         for i in range(n):
@@ -456,21 +459,21 @@ cdef class Linears:
                 if not a.valid:
                     continue
                 with nogil:
-                    linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
+                    judge_and_linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
             finally:
                 PyBuffer_Release(&view)
-            to += linear_workspace_size(&a.v.p, count_values(&a.v.p))
+            to += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
             if a.v.g != NULL and a.rows <= max_rows:
-                more += factor_workspace_size(a.rows)
-                scratch = max(scratch, scratch_of_factor(a.rows, &a.v))
+                more += derivative_factor_workspace_size(a.rows)
+                scratch = max(scratch, derivative_factor_scratch_size(a.rows, &a.v))
         self.factors, spare = allocate_workspace(more * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to, work = <double*>self.factors.at, <double*>spare.at
         with nogil:
             for i in range(n):
                 a = self.at + i
                 if a.valid and a.v.g != NULL and a.rows <= max_rows:
-                    factorise(a, &a.v, 0.0, to, work)
-                    to += factor_workspace_size(a.rows)
+                    factor_derivative_system(a, &a.v, 0.0, to, work)
+                    to += derivative_factor_workspace_size(a.rows)
 
     def item(self, Py_ssize_t i):
         """Return item i as a `Linear`, or None if it was skipped."""
@@ -506,7 +509,7 @@ cdef class Linears:
         numbers = empty(self.size)
         PyObject_GetBuffer(numbers, &view, PyBUF_WRITABLE)
         for i in range(self.n):
-            if self.at[i].valid and not adjoint_into(self.at + i, velocities[i], impulses[i], slacks[i],
+            if self.at[i].valid and not write_adjoint(self.at + i, velocities[i], impulses[i], slacks[i],
                                                      <double*>view.buf + self.at[i].first):
                 failed.append(i)
         PyBuffer_Release(&view)
@@ -532,9 +535,9 @@ cdef class Linears:
         return out_[:k]
 
 
-def wrench(Data p, const double[::1] lam, double[:, ::1] f):
+def write_body_wrenches(Data p, const double[::1] lam, double[:, ::1] f):
     """Write J^T lam (n, 6) of bodies to f."""
     if p.blocks.n_rows and p.rows.n_bodies:
-        rows_wrench(&p.blocks, &p.rows, &lam[0], &f[0, 0])
+        compute_body_wrenches(&p.blocks, &p.rows, &lam[0], &f[0, 0])
     else:
         f[:, :] = 0.0

@@ -13,10 +13,10 @@ the normal s_n of Pi(y) of a closed contact, and ||y_g| - a_g s_n| of each of it
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int8_t, int32_t
 
-from lavender_ext.core.block cimport length
-from lavender_ext.core.block_projection cimport active_bound, differentiate_by_coefficients, evaluate_natural_map
+from lavender_ext.core.block cimport euclidean_norm
+from lavender_ext.core.block_projection cimport classify_active_bound, differentiate_by_coefficients, evaluate_natural_map
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 from lavender_ext.factor.linear cimport linear_t
 
@@ -57,11 +57,11 @@ cdef struct linearised_t:           # a judged and linearised solution
     ssize_t first               # first index of the item in the results of `Linears.adjoint`
 
 
-cdef inline void linearise_row(double lam, double w, double low, double high, double root, double* f, double* margin,
+cdef inline void linearise_row_projection(double lam, double w, double low, double high, double root, double* f, double* margin,
                                int8_t* case_, double* p) noexcept nogil:
     """Compute (1), P, case and margin of one bounded row."""
     cdef double y = lam - w / (root * root)
-    cdef int32_t side = active_bound(y, low, high)
+    cdef int32_t side = classify_active_bound(y, low, high)
     p[0] = 1.0 if side == 0 else 0.0
     if side == 0:
         case_[0] = FREE
@@ -79,7 +79,7 @@ cdef inline void linearise_row(double lam, double w, double low, double high, do
         margin[0] = INFINITY
 
 
-cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
+cdef inline void linearise_contact_projection(const blocks_t* b, int32_t i, const double* lam, const double* w,
                                    const natural_t* out) noexcept nogil:
     """Compute (1), P, dPi/de, cases and margins of contact i."""
     cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
@@ -115,7 +115,7 @@ cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* l
     gap = -y[0]
     for g in range(q.n):
         first, size = q.first[g], q.size[g]
-        excess = length(y + first, size)
+        excess = euclidean_norm(y + first, size)
         gap -= q.friction_coefficient[g] * excess
         excess -= q.friction_coefficient[g] * normal
         for k in range(first, first + size):
@@ -127,7 +127,7 @@ cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* l
     margin[0] = (normal if normal > 0.0 else gap if b.law == CONE else -y[0]) / root[0]
 
 
-cdef inline void linearise_blocks(const blocks_t* b, const double* lam, const double* w, int32_t* value_ptr,
+cdef inline void linearise_all_projections(const blocks_t* b, const double* lam, const double* w, int32_t* value_ptr,
                              const natural_t* out) noexcept nogil:
     """Compute (1) and (2) of all blocks; `value_ptr` (k + 1) is the array of `out`."""
     cdef int32_t i, j, k, n
@@ -135,13 +135,13 @@ cdef inline void linearise_blocks(const blocks_t* b, const double* lam, const do
     for i in range(b.n_blocks):
         j = b.ptr[i]
         n = b.ptr[i + 1] - j
-        value_ptr[i + 1] = value_ptr[i] + (n if is_rows(b, i) else n * n)
-        if not is_rows(b, i):
-            linearise_contact(b, i, lam, w, out)
+        value_ptr[i + 1] = value_ptr[i] + (n if has_independent_rows(b, i) else n * n)
+        if not has_independent_rows(b, i):
+            linearise_contact_projection(b, i, lam, w, out)
             continue
         for k in range(n):
             out.root[j + k] = sqrt(b.d[j + k])
-            linearise_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
+            linearise_row_projection(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
                           out.margin + j + k, out.case_ + j + k, out.p + value_ptr[i] + k)
             out.edge[value_ptr[i] + k] = 0.0
 
@@ -158,7 +158,8 @@ cdef inline int32_t number_system_rows(const blocks_t* b, const natural_t* x, in
     return n
 
 
-cdef inline void multiply_blocks(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint transpose,
+cdef inline void multiply_block_derivatives(const natural_t* x, const blocks_t* b, const double* values, const double* v,
+                                            bint transpose,
                              double* out) noexcept nogil:
     """Compute out (m), the products of the blocks in `values`, or of their transposes, with v."""
     cdef int32_t i, j, k, l, n
@@ -169,7 +170,7 @@ cdef inline void multiply_blocks(const natural_t* x, const blocks_t* b, const do
         n = b.ptr[i + 1] - j
         a = values + x.value_ptr[i]
         for k in range(n):
-            if is_rows(b, i):
+            if has_independent_rows(b, i):
                 out[j + k] = a[k] * v[j + k]
                 continue
             s = 0.0
@@ -227,7 +228,7 @@ cdef inline void form_scaled_generalized(const generalized_t* g, int32_t count, 
             h[<ssize_t>system_row[i] * count + system_row[i]] += g.compliance[i] / (root[i] * root[i])
 
 
-cdef inline void form_system_rows(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* system_row,
+cdef inline void form_reduced_system(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* system_row,
                              const double* h, double* g) noexcept nogil:
     """Compute G (count, count) of (3) from H; system_row is row of G of each row, or -1."""
     cdef int32_t i, j, k, l, n, c
@@ -242,7 +243,7 @@ cdef inline void form_system_rows(const natural_t* x, const blocks_t* b, int32_t
             if system_row[j + k] < 0:
                 continue
             row = g + <ssize_t>system_row[j + k] * count
-            if is_rows(b, i):
+            if has_independent_rows(b, i):
                 from_ = h + <ssize_t>system_row[j + k] * count
                 for c in range(count):
                     row[c] = from_[c]

@@ -12,7 +12,7 @@ from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, rows
 from lavender_ext.velocity_newton.soft cimport is_soft
 
 
-cdef inline method_t row_of(const view_t* v) noexcept nogil:
+cdef inline method_t find_method_functions(const view_t* v) noexcept nogil:
     """Return the functions of the method for the form of the problem."""
     if v.g != NULL:
         return method_t(general_workspace_size, general_start, general_step)
@@ -26,18 +26,18 @@ cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, work
     r[0] = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     if o.method != NEWTON or v.p.n_rows == 0:
         return 0
-    return row_of(v).workspace(v, o, r)
+    return find_method_functions(v).workspace(v, o, r)
 
 
 cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     """Start from lam (m); return MORE, NEEDS_WORKSPACE with the required sizes in r, or another outcome."""
-    return row_of(v).start(v, o, r, lam)
+    return find_method_functions(v).start(v, o, r, lam)
 
 
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                              info_t* info) noexcept nogil:
     """Do at least `work` units of work; lam (m) receives the best impulse so far."""
-    return row_of(v).step(v, o, r, work, lam, info)
+    return find_method_functions(v).step(v, o, r, work, lam, info)
 
 
 cdef class Driver(Method):
@@ -63,7 +63,7 @@ cdef class Driver(Method):
         self.data, self.view = data, data.view()
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), max_values
         self.options.work = work
-        self.own = row_of(&self.view)
+        self.own = find_method_functions(&self.view)
         self.fits = lav_workspace_size(&self.view, &self.options, &self.space) and self.analyse() == NEEDS_WORKSPACE
 
     cdef int32_t analyse(self) except -1:
@@ -80,7 +80,7 @@ cdef class Driver(Method):
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
-        self.aim(tol, budget)
+        self.reset_target(tol, budget)
         if self.real is None:
             self.real = allocate_workspace(self.space.n_real * sizeof(double))
             self.space.real = <double*>self.real.at

@@ -1,7 +1,7 @@
 """The flat arrays of LavenderSim: three buffers, one layout.
 
 The complete engine state is stored in one buffer of doubles, one of int32 and one of uint64, allocated by
-the caller. `bind` places the arrays one after the other, so that a host (Python, WebAssembly) needs only the
+the caller. `bind_engine_arrays` places the arrays one after the other, so that a host (Python, WebAssembly) needs only the
 sizes and three pointers, and a snapshot is a copy of three buffers. An array that the scene does not
 need has length 0: no frames for spheres, no tangents without friction, no joint rows without joints.
 
@@ -11,7 +11,7 @@ only, by their index `dyn` (-1 = static), as core/rows.pxd requires.
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 
-# size[]: the array sizes that `bind` needs
+# size[]: the array sizes that `bind_engine_arrays` needs
 cpdef enum:
     N_BODY = 0
     N_DYNAMIC = 1
@@ -216,21 +216,21 @@ cdef struct engine_t:
     uint64_t* color_scratch  # (nd)
 
 
-cdef inline double* reals(double* base, int64_t* at, int64_t count) noexcept nogil:
+cdef inline double* take_next_doubles(double* base, int64_t* at, int64_t count) noexcept nogil:
     """Return the next `count` doubles of the buffer and advance the offset `at`."""
     cdef double* p = base + at[0]
     at[0] += count
     return p
 
 
-cdef inline int32_t* ints(int32_t* base, int64_t* at, int64_t count) noexcept nogil:
+cdef inline int32_t* take_next_integers(int32_t* base, int64_t* at, int64_t count) noexcept nogil:
     """Return the next `count` int32 of the buffer and advance the offset `at`."""
     cdef int32_t* p = base + at[0]
     at[0] += count
     return p
 
 
-cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
+cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
                       int64_t* used) noexcept nogil:
     """Point every array of `e` into the three buffers; `used` (3) receives the number of entries of each buffer."""
     cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
@@ -240,75 +240,75 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     cdef int64_t grid = n if size[N_BUCKET] > 0 else 0, n_excluded = size[N_EXCLUDED]
     cdef int64_t i = 0, j = 0
     e.size = size
-    e.setting = reals(real, &i, N_SETTINGS)
-    e.x = reals(real, &i, 3 * n)
-    e.q = reals(real, &i, 4 * n)
-    e.v = reals(real, &i, 6 * n)
-    e.inv_mass_body = reals(real, &i, n)
-    e.inertia = reals(real, &i, 9 * n)
-    e.inv_inertia_body = reals(real, &i, 9 * n)
-    e.shape = reals(real, &i, 4 * n)
-    e.friction = reals(real, &i, n)
-    e.restitution = reals(real, &i, n)
-    e.patch = reals(real, &i, n)
-    e.rot = reals(real, &i, 9 * frames)
-    e.fat = reals(real, &i, 6 * n)
-    e.joint = reals(real, &i, N_JOINT_REAL * kj)
-    e.joint_error = reals(real, &i, mj)
-    e.jac = reals(real, &i, 12 * mj)
-    e.minv_jac = reals(real, &i, 12 * mj)
-    e.joint_impulse = reals(real, &i, mj)
-    e.inv_mass = reals(real, &i, nd)
-    e.inv_inertia = reals(real, &i, 9 * nd)
-    e.v_free = reals(real, &i, 6 * nd)
-    e.dv = reals(real, &i, 6 * nd)
-    e.shift = reals(real, &i, 6 * nd)
-    e.point = reals(real, &i, 3 * c)
-    e.gap = reals(real, &i, c)
-    e.normal = reals(real, &i, 3 * c)
-    e.tangent = reals(real, &i, 3 * nt)
-    e.arm_a = reals(real, &i, 3 * c)
-    e.arm_b = reals(real, &i, 3 * c)
-    e.coupling = reals(real, &i, 5 * nt)
-    e.inv_inertia_arm = reals(real, &i, 6 * (m - mj))
-    e.local = reals(real, &i, 6 * c)
-    e.cache_impulse = reals(real, &i, N_CACHE_IMPULSE * c)
-    e.cache_local = reals(real, &i, 6 * c)
-    e.push = reals(real, &i, mj + c)
-    e.target = reals(real, &i, m)
-    e.lower = reals(real, &i, mj)
-    e.upper = reals(real, &i, mj)
-    e.b = reals(real, &i, m)
-    e.d = reals(real, &i, m)
-    e.step = reals(real, &i, m)
-    e.compliance = reals(real, &i, m)
-    e.impulse = reals(real, &i, m)
-    e.mu = reals(real, &i, k)
-    e.patch_radius = reals(real, &i, k)
-    e.rolling = reals(real, &i, k * rolls)
-    e.cache_roll = reals(real, &i, 3 * c * rolls)
-    e.head = ints(index, &j, N_HEAD)
-    e.kind_of_shape = ints(index, &j, n)
-    e.dyn = ints(index, &j, n)
-    e.uneven = ints(index, &j, n)
-    e.body_of = ints(index, &j, nd)
-    e.joint_kind = ints(index, &j, kj)
-    e.joint_motor = ints(index, &j, kj)
-    e.joint_bodies = ints(index, &j, 2 * kj)
-    e.excluded = ints(index, &j, 2 * n_excluded)
-    e.pair = ints(index, &j, 2 * p)
-    e.pair_scratch = ints(index, &j, 2 * p)
-    e.count = ints(index, &j, n + 1)
-    e.bucket = ints(index, &j, size[N_BUCKET])
-    e.chain = ints(index, &j, grid)
-    e.cell = ints(index, &j, 4 * grid)
-    e.contact_pair = ints(index, &j, 2 * c)
-    e.joint_body = ints(index, &j, 2 * k)
+    e.setting = take_next_doubles(real, &i, N_SETTINGS)
+    e.x = take_next_doubles(real, &i, 3 * n)
+    e.q = take_next_doubles(real, &i, 4 * n)
+    e.v = take_next_doubles(real, &i, 6 * n)
+    e.inv_mass_body = take_next_doubles(real, &i, n)
+    e.inertia = take_next_doubles(real, &i, 9 * n)
+    e.inv_inertia_body = take_next_doubles(real, &i, 9 * n)
+    e.shape = take_next_doubles(real, &i, 4 * n)
+    e.friction = take_next_doubles(real, &i, n)
+    e.restitution = take_next_doubles(real, &i, n)
+    e.patch = take_next_doubles(real, &i, n)
+    e.rot = take_next_doubles(real, &i, 9 * frames)
+    e.fat = take_next_doubles(real, &i, 6 * n)
+    e.joint = take_next_doubles(real, &i, N_JOINT_REAL * kj)
+    e.joint_error = take_next_doubles(real, &i, mj)
+    e.jac = take_next_doubles(real, &i, 12 * mj)
+    e.minv_jac = take_next_doubles(real, &i, 12 * mj)
+    e.joint_impulse = take_next_doubles(real, &i, mj)
+    e.inv_mass = take_next_doubles(real, &i, nd)
+    e.inv_inertia = take_next_doubles(real, &i, 9 * nd)
+    e.v_free = take_next_doubles(real, &i, 6 * nd)
+    e.dv = take_next_doubles(real, &i, 6 * nd)
+    e.shift = take_next_doubles(real, &i, 6 * nd)
+    e.point = take_next_doubles(real, &i, 3 * c)
+    e.gap = take_next_doubles(real, &i, c)
+    e.normal = take_next_doubles(real, &i, 3 * c)
+    e.tangent = take_next_doubles(real, &i, 3 * nt)
+    e.arm_a = take_next_doubles(real, &i, 3 * c)
+    e.arm_b = take_next_doubles(real, &i, 3 * c)
+    e.coupling = take_next_doubles(real, &i, 5 * nt)
+    e.inv_inertia_arm = take_next_doubles(real, &i, 6 * (m - mj))
+    e.local = take_next_doubles(real, &i, 6 * c)
+    e.cache_impulse = take_next_doubles(real, &i, N_CACHE_IMPULSE * c)
+    e.cache_local = take_next_doubles(real, &i, 6 * c)
+    e.push = take_next_doubles(real, &i, mj + c)
+    e.target = take_next_doubles(real, &i, m)
+    e.lower = take_next_doubles(real, &i, mj)
+    e.upper = take_next_doubles(real, &i, mj)
+    e.b = take_next_doubles(real, &i, m)
+    e.d = take_next_doubles(real, &i, m)
+    e.step = take_next_doubles(real, &i, m)
+    e.compliance = take_next_doubles(real, &i, m)
+    e.impulse = take_next_doubles(real, &i, m)
+    e.mu = take_next_doubles(real, &i, k)
+    e.patch_radius = take_next_doubles(real, &i, k)
+    e.rolling = take_next_doubles(real, &i, k * rolls)
+    e.cache_roll = take_next_doubles(real, &i, 3 * c * rolls)
+    e.head = take_next_integers(index, &j, N_HEAD)
+    e.kind_of_shape = take_next_integers(index, &j, n)
+    e.dyn = take_next_integers(index, &j, n)
+    e.uneven = take_next_integers(index, &j, n)
+    e.body_of = take_next_integers(index, &j, nd)
+    e.joint_kind = take_next_integers(index, &j, kj)
+    e.joint_motor = take_next_integers(index, &j, kj)
+    e.joint_bodies = take_next_integers(index, &j, 2 * kj)
+    e.excluded = take_next_integers(index, &j, 2 * n_excluded)
+    e.pair = take_next_integers(index, &j, 2 * p)
+    e.pair_scratch = take_next_integers(index, &j, 2 * p)
+    e.count = take_next_integers(index, &j, n + 1)
+    e.bucket = take_next_integers(index, &j, size[N_BUCKET])
+    e.chain = take_next_integers(index, &j, grid)
+    e.cell = take_next_integers(index, &j, 4 * grid)
+    e.contact_pair = take_next_integers(index, &j, 2 * c)
+    e.joint_body = take_next_integers(index, &j, 2 * k)
     e.contact_body = e.joint_body + 2 * kj
-    e.ptr = ints(index, &j, k + 1)
-    e.kind = ints(index, &j, k)
-    e.order = ints(index, &j, k)
-    e.order_scratch = ints(index, &j, 2 * (n + k) + 8)
+    e.ptr = take_next_integers(index, &j, k + 1)
+    e.kind = take_next_integers(index, &j, k)
+    e.order = take_next_integers(index, &j, k)
+    e.order_scratch = take_next_integers(index, &j, 2 * (n + k) + 8)
     e.key = keys
     e.cache_key = keys + c
     used[0] = i

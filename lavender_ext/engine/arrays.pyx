@@ -3,7 +3,8 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.engine.arrays cimport (N_CACHE_IMPULSE, N_INDEX_ARRAYS, N_JOINT_REAL, N_KEY_ARRAYS, N_REAL_ARRAYS, bind,
+from lavender_ext.engine.arrays cimport (N_CACHE_IMPULSE, N_INDEX_ARRAYS, N_JOINT_REAL, N_KEY_ARRAYS, N_REAL_ARRAYS,
+                                         bind_engine_arrays,
                                          engine_t)
 
 
@@ -14,7 +15,7 @@ cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept
     cdef double real = 0.0
     cdef int32_t index = 0, k
     cdef uint64_t key = 0
-    bind(size, &real, &index, &key, &e, n)
+    bind_engine_arrays(size, &real, &index, &key, &e, n)
     for k in range(3):
         used[k] = <int32_t>n[k] if n[k] < 2147483647 else -1
 
@@ -25,7 +26,7 @@ cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* 
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
-    bind(size, real, index, keys, &e, n)
+    bind_engine_arrays(size, real, index, keys, &e, n)
     cdef double** reals = &e.setting
     cdef int32_t** ints = &e.head
     cdef uint64_t** wide = &e.key
@@ -37,7 +38,7 @@ cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* 
         out[N_REAL_ARRAYS + N_INDEX_ARRAYS + k] = <int32_t>(wide[k] - keys)
 
 
-#: Arrays of each buffer, in the order of `bind`: the shape of one entry, or None for scratch arrays of a substep.
+#: Arrays of each buffer, in the order of `bind_engine_arrays`: the shape of one entry, or None for scratch arrays of a substep.
 SHAPES = {
     "real": {
         "setting": (), "x": (3,), "q": (4,), "v": (6,), "inv_mass_body": (), "inertia": (3, 3), "inv_inertia_body": (3, 3),
@@ -58,14 +59,14 @@ SHAPES = {
 }
 
 
-def lengths(const int32_t[::1] size):
+def compute_buffer_lengths(const int32_t[::1] size):
     """Return the lengths of the three buffers (doubles, int32, uint64) for these sizes (10,); -1 if a length exceeds int32."""
     cdef int32_t used[3]
     lav_engine_lengths(&size[0], used)
     return used[0], used[1], used[2]
 
 
-def offsets(const int32_t[::1] size):
+def compute_array_offsets(const int32_t[::1] size):
     """Return {array name: offset in its buffer} for these sizes (10,)."""
     cdef double real = 0.0
     cdef int32_t index = 0
@@ -75,11 +76,11 @@ def offsets(const int32_t[::1] size):
     return dict(zip((name for names in SHAPES.values() for name in names), np.asarray(out).tolist(), strict=True))
 
 
-def views(const int32_t[::1] size, real, index, keys):
+def make_array_views(const int32_t[::1] size, real, index, keys):
     """Return {array name: writable view into its buffer, in its shape}, without scratch arrays."""
-    first = offsets(size)
+    first = compute_array_offsets(size)
     out = {}
-    for buffer, end, shapes in zip((real, index, keys), lengths(size), SHAPES.values(), strict=True):
+    for buffer, end, shapes in zip((real, index, keys), compute_buffer_lengths(size), SHAPES.values(), strict=True):
         starts = [first[name] for name in shapes]
         for (name, shape), start, stop in zip(shapes.items(), starts, [*starts[1:], end], strict=True):
             if shape is not None:

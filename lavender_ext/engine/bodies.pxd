@@ -14,12 +14,12 @@ so the gyroscopic term conserves angular momentum to rounding and energy to O(h^
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.validate cimport first_invalid
+from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
 from lavender_ext.engine.vectors cimport copy3, add_scaled3, matvec3
 
 
-cdef inline void rotation_matrix(const double* q, double* r) noexcept nogil:
+cdef inline void compute_rotation_matrix(const double* q, double* r) noexcept nogil:
     """Compute the rotation matrix r (3, 3), body to world, of a unit quaternion w, x, y, z."""
     cdef double w = q[0], x = q[1], y = q[2], z = q[3]
     r[0] = 1.0 - 2.0 * (y * y + z * z)
@@ -33,12 +33,12 @@ cdef inline void rotation_matrix(const double* q, double* r) noexcept nogil:
     r[8] = 1.0 - 2.0 * (x * x + y * y)
 
 
-cdef inline void to_world(const double* r, const double* a, double* out) noexcept nogil:
+cdef inline void rotate_to_world(const double* r, const double* a, double* out) noexcept nogil:
     """Rotate a vector from the body's frame to the world: out = R a."""
     matvec3(r, a, out)
 
 
-cdef inline void to_body(const double* r, const double* a, double* out) noexcept nogil:
+cdef inline void rotate_to_body(const double* r, const double* a, double* out) noexcept nogil:
     """Rotate a vector from the world to the body's frame: out = R^T a."""
     cdef int32_t k
     for k in range(3):
@@ -61,7 +61,7 @@ cdef inline void rotate_quaternion(double* q, const double* omega, double h) noe
     q[3] *= s
 
 
-cdef inline void world_tensor(const double* r, const double* body, double* out) noexcept nogil:
+cdef inline void rotate_tensor_to_world(const double* r, const double* body, double* out) noexcept nogil:
     """Transform a symmetric tensor to the world, out = R T R^T; out is exactly symmetric."""
     cdef double t[9]
     cdef int32_t i, j
@@ -74,14 +74,14 @@ cdef inline void world_tensor(const double* r, const double* body, double* out) 
             out[3 * j + i] = out[3 * i + j]
 
 
-cdef inline void world_times(const double* r, const double* body, const double* a,
+cdef inline void multiply_by_world_tensor(const double* r, const double* body, const double* a,
                              double* out) noexcept nogil:
     """Compute out = R T R^T a: a tensor in the body's frame times a world vector."""
     cdef double s[3]
     cdef double t[3]
-    to_body(r, a, s)
+    rotate_to_body(r, a, s)
     matvec3(body, s, t)
-    to_world(r, t, out)
+    rotate_to_world(r, t, out)
 
 
 cdef inline void advance_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
@@ -92,36 +92,36 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
     cdef double momentum[3]
     cdef double middle[3]
     cdef int32_t k
-    rotation_matrix(q, r)
-    world_times(r, inertia, omega, momentum)
+    compute_rotation_matrix(q, r)
+    multiply_by_world_tensor(r, inertia, omega, momentum)
     for k in range(4):
         half[k] = q[k]
     rotate_quaternion(half, omega, 0.5 * h)
-    rotation_matrix(half, r)
-    world_times(r, inv_inertia, momentum, middle)
+    compute_rotation_matrix(half, r)
+    multiply_by_world_tensor(r, inv_inertia, momentum, middle)
     rotate_quaternion(q, middle, h)
-    rotation_matrix(q, r)
-    world_times(r, inv_inertia, momentum, omega)
+    compute_rotation_matrix(q, r)
+    multiply_by_world_tensor(r, inv_inertia, momentum, omega)
 
 
-cdef inline int32_t is_out_of_range(const engine_t* e, int32_t body) noexcept nogil:
+cdef inline int32_t is_body_out_of_range(const engine_t* e, int32_t body) noexcept nogil:
     """Return whether the body's state is outside the range that core/validate.pxd (1) allows."""
-    return (first_invalid(e.v + 6 * body, 6) >= 0 or first_invalid(e.x + 3 * body, 3) >= 0
-            or first_invalid(e.q + 4 * body, 4) >= 0)
+    return (find_invalid_number(e.v + 6 * body, 6) >= 0 or find_invalid_number(e.x + 3 * body, 3) >= 0
+            or find_invalid_number(e.q + 4 * body, 4) >= 0)
 
 
-cdef inline void start_bodies(engine_t* e) noexcept nogil:
+cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
     """Compute frames, world inverse inertia and v* = v + h g of the coming substep."""
     cdef int32_t i, b
     cdef double h = e.setting[S_H]
     cdef const double* g = e.setting + S_GRAVITY
     if e.size[N_FRAME] > 0:
         for i in range(e.size[N_BODY]):
-            rotation_matrix(e.q + 4 * i, e.rot + 9 * i)
+            compute_rotation_matrix(e.q + 4 * i, e.rot + 9 * i)
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
         if e.uneven[b]:
-            world_tensor(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
+            rotate_tensor_to_world(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
         add_scaled3(e.v + 6 * b, h, g, e.v_free + 6 * i)
         copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)
 
@@ -157,16 +157,16 @@ cdef inline int32_t advance_bodies(engine_t* e, const double* by, int32_t shifte
             if e.uneven[b] and by == e.dv:
                 advance_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
             elif e.uneven[b]:
-                rotation_matrix(q, r)
-                world_times(r, e.inertia + 9 * b, v + 3, momentum)
+                compute_rotation_matrix(q, r)
+                multiply_by_world_tensor(r, e.inertia + 9 * b, v + 3, momentum)
                 advance_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-                rotation_matrix(q, r)
-                world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
+                compute_rotation_matrix(q, r)
+                multiply_by_world_tensor(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
             elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
                 rotate_quaternion(q, moving + 3, h)
         if shifted:
             add_scaled3(x, 1.0, e.shift + 6 * i, x)
             rotate_quaternion(q, e.shift + 6 * i + 3, 1.0)
-        if lost < 0 and is_out_of_range(e, b):
+        if lost < 0 and is_body_out_of_range(e, b):
             lost = b
     return lost

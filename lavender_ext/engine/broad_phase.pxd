@@ -77,7 +77,7 @@ cdef inline int32_t boxes_overlap(const engine_t* e, int32_t i, int32_t j) noexc
     return (a[0] <= b[3] and b[0] <= a[3] and a[1] <= b[4] and b[1] <= a[4] and a[2] <= b[5] and b[2] <= a[5])
 
 
-cdef inline void add_pair(engine_t* e, int32_t i, int32_t j, int32_t* n) noexcept nogil:
+cdef inline void append_broad_phase_pair(engine_t* e, int32_t i, int32_t j, int32_t* n) noexcept nogil:
     """Append a pair. Pairs beyond the capacity are only counted, so that the caller gets the needed capacity."""
     if n[0] < e.size[CAP_PAIR]:
         e.pair[2 * n[0]] = i if i < j else j
@@ -85,7 +85,7 @@ cdef inline void add_pair(engine_t* e, int32_t i, int32_t j, int32_t* n) noexcep
     n[0] += 1
 
 
-cdef inline uint32_t cell_hash(const int32_t* c, int32_t mask) noexcept nogil:
+cdef inline uint32_t hash_grid_cell(const int32_t* c, int32_t mask) noexcept nogil:
     """Return the bucket of a cell (x, y, z, level)."""
     cdef uint32_t h = (<uint32_t>c[0]) * <uint32_t>0x9E3779B1U
     h = (h ^ (h >> 15)) + (<uint32_t>c[1]) * <uint32_t>0x85EBCA77U
@@ -94,13 +94,13 @@ cdef inline uint32_t cell_hash(const int32_t* c, int32_t mask) noexcept nogil:
     return (h ^ (h >> 15)) & <uint32_t>mask
 
 
-cdef inline int32_t cell_of(double x, double size) noexcept nogil:
+cdef inline int32_t cell_index_of_coordinate(double x, double size) noexcept nogil:
     """Return the cell index of a coordinate, clamped to 1e9 so that far cells merge and neighbours stay neighbours."""
     cdef double c = floor(x / size)
     return <int32_t>(-1e9 if not c > -1e9 else (1e9 if c > 1e9 else c))
 
 
-cdef inline double longest_side(const engine_t* e, int32_t i) noexcept nogil:
+cdef inline double longest_side_of_bounding_box(const engine_t* e, int32_t i) noexcept nogil:
     """Return the longest side [m] of a body's bounding box."""
     cdef const double* f = e.fat + 6 * i
     cdef double extent = 0.0
@@ -111,7 +111,7 @@ cdef inline double longest_side(const engine_t* e, int32_t i) noexcept nogil:
     return extent
 
 
-cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
+cdef inline void find_pairs_by_grid(engine_t* e, int32_t* n_pairs) noexcept nogil:
     """Find the overlapping boxes by the hash grid, then test planes against every body."""
     cdef int32_t n = e.size[N_BODY], mask = e.size[N_BUCKET] - 1, i, j, k, level, x, y, z
     cdef uint32_t used = 0, slot
@@ -125,7 +125,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
-        extent = longest_side(e, i)
+        extent = longest_side_of_bounding_box(e, i)
         if extent > max_extent:
             max_extent = extent
         if min_extent == 0.0 or extent < min_extent:
@@ -140,7 +140,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     while i >= 0:
         if e.kind_of_shape[i] >= SPHERE:
             f = e.fat + 6 * i
-            extent = longest_side(e, i)
+            extent = longest_side_of_bounding_box(e, i)
             size = base
             level = 0
             while size < extent and level < 31:
@@ -148,9 +148,9 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                 level += 1
             used |= (<uint32_t>1) << level
             for k in range(3):
-                e.cell[4 * i + k] = cell_of(0.5 * (f[k] + f[3 + k]), size)
+                e.cell[4 * i + k] = cell_index_of_coordinate(0.5 * (f[k] + f[3 + k]), size)
             e.cell[4 * i + 3] = level
-            slot = cell_hash(e.cell + 4 * i, mask)
+            slot = hash_grid_cell(e.cell + 4 * i, mask)
             e.chain[i] = e.bucket[slot]
             e.bucket[slot] = i
         i -= 1
@@ -164,8 +164,8 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
             if level >= e.cell[4 * i + 3] and (used >> level) & 1:
                 half = 0.5 * size
                 for k in range(3):
-                    low[k] = cell_of(f[k] - half, size)
-                    high[k] = cell_of(f[3 + k] + half, size)
+                    low[k] = cell_index_of_coordinate(f[k] - half, size)
+                    high[k] = cell_index_of_coordinate(f[3 + k] + half, size)
                 c[3] = level
                 # on its own level a body searches only the following cells: bodies of preceding cells search its cell
                 own = e.cell + 4 * i if level == e.cell[4 * i + 3] else NULL
@@ -179,14 +179,14 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                             if own != NULL and x == own[0] and y == own[1] and z < own[2]:
                                 continue
                             c[2] = z
-                            j = e.bucket[cell_hash(c, mask)]
+                            j = e.bucket[hash_grid_cell(c, mask)]
                             while j >= 0:
                                 if (e.cell[4 * j] == x and e.cell[4 * j + 1] == y and e.cell[4 * j + 2] == z
                                         and e.cell[4 * j + 3] == level
                                         and (j < i or own == NULL or x != own[0] or y != own[1]
                                              or z != own[2])
                                         and can_collide(e, i, j) and boxes_overlap(e, i, j)):
-                                    add_pair(e, i, j, n_pairs)
+                                    append_broad_phase_pair(e, i, j, n_pairs)
                                     if n_pairs[0] > MAX_PAIRS:
                                         return
                                 j = e.chain[j]
@@ -196,12 +196,12 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
         if e.kind_of_shape[i] == PLANE:
             for j in range(n):
                 if e.kind_of_shape[j] >= SPHERE and can_collide(e, i, j) and boxes_overlap(e, i, j):
-                    add_pair(e, i, j, n_pairs)
+                    append_broad_phase_pair(e, i, j, n_pairs)
                     if n_pairs[0] > MAX_PAIRS:
                         return
 
 
-cdef inline void sort_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
+cdef inline void sort_broad_phase_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
     """Sort the pairs by two stable counting sorts, by the second body, then by the first."""
     cdef int32_t n = e.size[N_BODY], i, t, s, word
     cdef int32_t* source = e.pair
@@ -225,7 +225,7 @@ cdef inline void sort_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
         goal = e.pair
 
 
-cdef inline int32_t drop_excluded(engine_t* e, int32_t n_pairs) noexcept nogil:
+cdef inline int32_t remove_excluded_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
     """Remove the excluded pairs by merging two sorted lists, and return the number of remaining pairs."""
     cdef int32_t i, j = 0, n_kept = 0, n = e.size[N_EXCLUDED], a, b
     for i in range(n_pairs):
@@ -241,7 +241,7 @@ cdef inline int32_t drop_excluded(engine_t* e, int32_t n_pairs) noexcept nogil:
     return n_kept
 
 
-cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
+cdef inline int32_t update_pair_list(engine_t* e) noexcept nogil:
     """Rebuild the pair list if a body has left its box, and return the needed capacity (see CAP_PAIR)."""
     cdef int32_t n = e.size[N_BODY], i, j, k, n_pairs = 0
     cdef double half[3]
@@ -257,21 +257,21 @@ cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
             e.fat[6 * i + k] = e.x[3 * i + k] - half[k] - enlargement
             e.fat[6 * i + 3 + k] = e.x[3 * i + k] + half[k] + enlargement
     if e.size[N_BUCKET] > 0:
-        grid_pairs(e, &n_pairs)
+        find_pairs_by_grid(e, &n_pairs)
         if n_pairs > MAX_PAIRS:
             return PAIR_COUNT_OVERFLOW
         if n_pairs > e.size[CAP_PAIR]:
             return n_pairs
-        sort_pairs(e, n_pairs)
+        sort_broad_phase_pairs(e, n_pairs)
     else:
         for i in range(n):
             for j in range(i + 1, n):
                 if can_collide(e, i, j) and boxes_overlap(e, i, j):
                     if e.kind_of_shape[i] != PLANE or e.kind_of_shape[j] != PLANE:
-                        add_pair(e, i, j, &n_pairs)
+                        append_broad_phase_pair(e, i, j, &n_pairs)
         if n_pairs > e.size[CAP_PAIR]:
             return n_pairs
-    e.head[H_PAIRS] = drop_excluded(e, n_pairs)
+    e.head[H_PAIRS] = remove_excluded_pairs(e, n_pairs)
     e.head[H_PAIRS_VALID] = 1
     e.head[H_REBUILDS] = 0 if e.head[H_REBUILDS] == 2147483647 else e.head[H_REBUILDS] + 1
     return e.head[H_PAIRS]

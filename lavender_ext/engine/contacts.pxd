@@ -28,20 +28,21 @@ no key has matched. A stale entry is not used; the sweeps correct a wrong match.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.block_types cimport contact_kind
-from lavender_ext.core.rows cimport (contact_diagonal, contact_velocity, cross, dot3, largest_eigenvalue, reciprocal,
-                                     relative_velocity)
+from lavender_ext.core.block_types cimport choose_contact_kind
+from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3, largest_eigenvalue_2x2,
+                                     reciprocal_or_zero,
+                                     compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
                                          H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
                                          N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
-from lavender_ext.engine.bodies cimport to_body
-from lavender_ext.engine.narrow_phase cimport collide, manifold_t
+from lavender_ext.engine.bodies cimport rotate_to_body
+from lavender_ext.engine.narrow_phase cimport collide_bodies, manifold_t
 from lavender_ext.engine.vectors cimport combine3, copy3, subtract3
 
 
-cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
+cdef inline uint64_t make_contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
     """Return a contact's cache key: 24 bits for each body and 16 for the feature, sorted like the pair list."""
     return ((<uint64_t>a) << 40) | ((<uint64_t>b) << 16) | (<uint64_t>feature)
 
@@ -66,20 +67,20 @@ cdef inline void compute_tangent(const double* n, double* t) noexcept nogil:
         t[2] = 0.0
 
 
-cdef inline double distance2(const double* a, const double* b) noexcept nogil:
+cdef inline double squared_distance(const double* a, const double* b) noexcept nogil:
     """Return the squared distance of two points."""
     cdef double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2]
     return x * x + y * y + z * z
 
 
-cdef inline double cached_distance2(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
+cdef inline double squared_distance_to_cached_contact(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
     """Return the squared distance [m^2] of a contact from a cached one, the smaller of the two body frames' values."""
-    cdef double x = distance2(e.cache_local + 6 * entry, e.local + 6 * c)
-    cdef double y = distance2(e.cache_local + 6 * entry + 3, e.local + 6 * c + 3)
+    cdef double x = squared_distance(e.cache_local + 6 * entry, e.local + 6 * c)
+    cdef double y = squared_distance(e.cache_local + 6 * entry + 3, e.local + 6 * c + 3)
     return x if x < y else y
 
 
-cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t first,
+cdef inline void match_contacts_of_pair_to_cache(const engine_t* e, int32_t c, int32_t n, int32_t first,
                             int32_t* entry) noexcept nogil:
     """Find the cache entries of contacts c .. c + n - 1 of one pair; the pair's entries begin at `first`.
 
@@ -96,7 +97,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
         entry[j] = -1
         for i in range(first, end):
             if (e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1
-                    and cached_distance2(e, c + j, i) <= max_distance2):
+                    and squared_distance_to_cached_contact(e, c + j, i) <= max_distance2):
                 entry[j] = i
                 used |= 1 << (i - first)
                 break
@@ -110,7 +111,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
         min_distance2 = max_distance2
         for i in range(first, end):
             if not (used >> (i - first)) & 1:
-                x = cached_distance2(e, c + j, i)
+                x = squared_distance_to_cached_contact(e, c + j, i)
                 if x <= min_distance2:
                     min_distance2 = x
                     entry[j] = i
@@ -137,7 +138,7 @@ cdef inline void warm_start_contact(engine_t* e, int32_t c, int32_t entry, int32
         e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
 
-cdef inline double restitution_of(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
+cdef inline double get_pair_restitution(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
     """Return the restitution of two bodies, the larger of their values."""
     return e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
 
@@ -146,15 +147,15 @@ cdef inline double initial_normal_velocity(const engine_t* e, int32_t a, int32_t
     """Return a contact's relative normal velocity [m/s] before the substep; static bodies are at rest."""
     cdef double u[3]
     cdef double s[3]
-    relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c,
+    compute_relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c,
                       e.arm_b + 3 * c, u, s)
     return dot3(e.normal + 3 * c, u)
 
 
-cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
+cdef inline void rotate_arm_to_body(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
     """Copy a contact's arm for the cache: in the body's frame for a box, in the world frame for other shapes."""
     if e.kind_of_shape[body] == BOX:
-        to_body(e.rot + 9 * body, arm, out)
+        rotate_to_body(e.rot + 9 * body, arm, out)
     else:
         copy3(arm, out)
 
@@ -172,44 +173,44 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
     e.contact_pair[2 * c + 1] = b
     e.contact_body[2 * c] = da
     e.contact_body[2 * c + 1] = db
-    e.key[c] = contact_key(a, b, m.feature[at])
+    e.key[c] = make_contact_key(a, b, m.feature[at])
     e.gap[c] = m.gap[at]
     copy3(m.point + 3 * at, e.point + 3 * c)
     copy3(m.normal, e.normal + 3 * c)
     subtract3(m.point + 3 * at, e.x + 3 * a, e.arm_a + 3 * c)
     subtract3(m.point + 3 * at, e.x + 3 * b, e.arm_b + 3 * c)
-    local_arm(e, a, e.arm_a + 3 * c, e.local + 6 * c)
-    local_arm(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
+    rotate_arm_to_body(e, a, e.arm_a + 3 * c, e.local + 6 * c)
+    rotate_arm_to_body(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
         copy3(tangent, e.tangent + 3 * c)
     # diagonal of A and w* = J v*; the common kind has constant sizes, so that the compiler unrolls its loops
     if nt == 2 and not n_angular:
-        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
+        compute_contact_delassus_block(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
                          e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_velocity(r, c, 2, 0, e.v_free, w)
+        compute_contact_velocity(r, c, 2, 0, e.v_free, w)
     else:
-        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, n_angular,
+        compute_contact_delassus_block(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, n_angular,
                          da, db, e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_velocity(r, c, nt, n_angular, e.v_free, w)
+        compute_contact_velocity(r, c, nt, n_angular, e.v_free, w)
     for k in range(1 + nt + n_angular):
         d[k] += e.compliance[row + k]
     # step sizes: separate tangents for box friction, else one step from the tangents' largest eigenvalue
-    e.step[row] = reciprocal(d[0])
+    e.step[row] = reciprocal_or_zero(d[0])
     if nt > 0 and e.head[H_FRICTION_SHAPE]:
         e.coupling[5 * c + 2] = off[0]
-        e.step[row + 1] = reciprocal(d[1])
-        e.step[row + 2] = reciprocal(d[2])
+        e.step[row + 1] = reciprocal_or_zero(d[1])
+        e.step[row + 2] = reciprocal_or_zero(d[2])
     elif nt > 0:
-        e.step[row + 1] = reciprocal(largest_eigenvalue(d[1], off[0], d[2]))
+        e.step[row + 1] = reciprocal_or_zero(largest_eigenvalue_2x2(d[1], off[0], d[2]))
         e.step[row + 2] = e.step[row + 1]
         d[1] = 0.5 * (d[1] + d[2])
         d[2] = d[1]
     if n_angular & 1:
-        e.step[row + 1 + nt] = reciprocal(d[1 + nt])
+        e.step[row + 1 + nt] = reciprocal_or_zero(d[1 + nt])
     if n_angular & 2:
-        e.step[roll] = e.step[roll + 1] = reciprocal(largest_eigenvalue(e.d[roll], off[1], e.d[roll + 1]))
+        e.step[roll] = e.step[roll + 1] = reciprocal_or_zero(largest_eigenvalue_2x2(e.d[roll], off[1], e.d[roll + 1]))
         e.d[roll] = e.d[roll + 1] = 0.5 * (e.d[roll] + e.d[roll + 1])
     # right-hand side with target 0
     for k in range(1 + nt + n_angular):
@@ -233,7 +234,7 @@ cdef inline void set_contact_target(engine_t* e, int32_t c, int32_t row, int32_t
     e.b[row] = target + e.b[row]                        # (4)
 
 
-cdef inline int32_t is_reversed(const engine_t* e) noexcept nogil:
+cdef inline int32_t is_contact_order_reversed(const engine_t* e) noexcept nogil:
     """Return whether this substep builds its contacts from the last pair to the first."""
     return e.head[H_ORDER] == ALTERNATING and e.head[H_STEP] & 1
 
@@ -244,7 +245,7 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     cdef double tangent[3]
     cdef int32_t entry[4]
     cdef int32_t i, j, k, a, b, nt, n_angular, box, start, c = 0, row = e.size[N_JOINT_ROW], block
-    cdef int32_t matches = 0, last_first = is_reversed(e), cached = e.head[H_CACHED]
+    cdef int32_t matches = 0, last_first = is_contact_order_reversed(e), cached = e.head[H_CACHED]
     cdef int32_t first = cached if last_first else 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
     cdef uint64_t pair
@@ -253,20 +254,20 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         k = e.head[H_PAIRS] - 1 - i if last_first else i
         a = e.pair[2 * k]
         b = e.pair[2 * k + 1]
-        collide(e, a, b, margin, &m)
+        collide_bodies(e, a, b, margin, &m)
         if m.n == 0:
             continue
         if c + m.n > e.size[CAP_CONTACT]:
             c += m.n                                    # beyond the capacity contacts are only counted
             continue
         mu = sqrt(e.friction[a] * e.friction[b])
-        bounce = restitution_of(e, a, b)
+        bounce = get_pair_restitution(e, a, b)
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
         n_angular = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
         if nt > 0:
             compute_tangent(m.normal, tangent)
-        pair = contact_key(a, b, 0)
+        pair = make_contact_key(a, b, 0)
         # first cache entry of this pair, or its insertion position
         while first < cached and e.cache_key[first] < pair:
             first += 1
@@ -277,7 +278,7 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             build_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, n_angular)
             block = e.size[N_JOINT] + c
             box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = contact_kind(box, n_angular & 1, n_angular & 2, nt)
+            e.kind[block] = choose_contact_kind(box, n_angular & 1, n_angular & 2, nt)
             e.mu[block] = mu
             e.patch_radius[block] = 1.0 if box else patch if n_angular & 1 else 0.0
             if e.size[ROWS_PER_CONTACT] > 4:
@@ -289,7 +290,7 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             c += 1
             e.ptr[block + 1] = row
         if e.head[H_WARM_START] and first < cached:
-            match_pair(e, start, m.n, first, entry)
+            match_contacts_of_pair_to_cache(e, start, m.n, first, entry)
             for j in range(m.n):
                 if entry[j] >= 0:
                     k = e.ptr[e.size[N_JOINT] + start + j]
@@ -304,9 +305,9 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     return c
 
 
-cdef inline void store_contacts(engine_t* e) noexcept nogil:
+cdef inline void store_contact_cache(engine_t* e) noexcept nogil:
     """Write the contact cache for the next substep, whether warm starting is on or not."""
-    cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = is_reversed(e)
+    cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = is_contact_order_reversed(e)
     cdef double t2[3]
     cdef double* p
     for c in range(n):

@@ -18,33 +18,33 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.block_types cimport ROW
-from lavender_ext.core.rows cimport cross, dot3, dot12, joint_velocity, minv_times, reciprocal
+from lavender_ext.core.rows cimport cross, dot3, dot12, joint_row_velocity, multiply_inverse_mass, reciprocal_or_zero
 from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
-from lavender_ext.engine.bodies cimport to_world
+from lavender_ext.engine.bodies cimport rotate_to_world
 from lavender_ext.engine.vectors cimport copy3, subtract3, add_scaled3, scale3
 
 
-cdef inline void world_direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
+cdef inline void rotate_direction_to_world(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
     """Rotate a direction from a body's frame to the world; body -1 is the world."""
     if body < 0:
         copy3(local, out)
     else:
-        to_world(e.rot + 9 * body, local, out)
+        rotate_to_world(e.rot + 9 * body, local, out)
 
 
-cdef inline void world_anchor(const engine_t* e, int32_t body, const double* local, double* arm,
+cdef inline void compute_world_anchor(const engine_t* e, int32_t body, const double* local, double* arm,
                         double* point) noexcept nogil:
     """Compute an anchor's arm from the body's centre and its point, both in the world frame."""
-    world_direction(e, body, local, arm)
+    rotate_direction_to_world(e, body, local, arm)
     if body < 0:
         copy3(arm, point)
     else:
         add_scaled3(e.x + 3 * body, 1.0, arm, point)
 
 
-cdef inline void linear_row(double* jac, const double* axis, const double* arm_a,
+cdef inline void fill_linear_jacobian_row(double* jac, const double* axis, const double* arm_a,
                            const double* arm_b) noexcept nogil:
     """Fill the Jacobian row (12) of axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)."""
     scale3(-1.0, axis, jac)
@@ -54,7 +54,7 @@ cdef inline void linear_row(double* jac, const double* axis, const double* arm_a
     cross(arm_b, axis, jac + 9)
 
 
-cdef inline void angular_row(double* jac, const double* axis) noexcept nogil:
+cdef inline void fill_angular_jacobian_row(double* jac, const double* axis) noexcept nogil:
     """Fill the Jacobian row (12) of axis.(omega_b - omega_a)."""
     cdef int32_t k
     for k in range(3):
@@ -76,8 +76,8 @@ cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     cdef double other[3]
     cdef double side[3]
     cdef double length
-    world_anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
-    world_anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
+    compute_world_anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
+    compute_world_anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
     # distance: one row along the line between the anchors
     if e.joint_kind[i] == DISTANCE:
         subtract3(pb, pa, axis)
@@ -89,7 +89,7 @@ cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
             axis[0] = 0.0
             axis[1] = 0.0
             axis[2] = 1.0
-        linear_row(e.jac + 12 * row, axis, arm_a, arm_b)
+        fill_linear_jacobian_row(e.jac + 12 * row, axis, arm_a, arm_b)
         e.joint_error[row] = length - p[J_LENGTH]
         return
     # ball: the three world axes
@@ -98,27 +98,27 @@ cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
         axis[1] = 0.0
         axis[2] = 0.0
         axis[k] = 1.0
-        linear_row(e.jac + 12 * (row + k), axis, arm_a, arm_b)
+        fill_linear_jacobian_row(e.jac + 12 * (row + k), axis, arm_a, arm_b)
         e.joint_error[row + k] = pb[k] - pa[k]
     if e.joint_kind[i] == BALL:
         return
     # hinge: two angular rows normal to the axis
-    world_direction(e, a, p + J_AXIS_A, axis)
-    world_direction(e, b, p + J_AXIS_B, other)
-    world_direction(e, a, p + J_SIDE_A, side)
-    angular_row(e.jac + 12 * (row + 3), side)
+    rotate_direction_to_world(e, a, p + J_AXIS_A, axis)
+    rotate_direction_to_world(e, b, p + J_AXIS_B, other)
+    rotate_direction_to_world(e, a, p + J_SIDE_A, side)
+    fill_angular_jacobian_row(e.jac + 12 * (row + 3), side)
     cross(axis, side, pa)
-    angular_row(e.jac + 12 * (row + 4), pa)
+    fill_angular_jacobian_row(e.jac + 12 * (row + 4), pa)
     cross(axis, other, pb)                              # rotation vector from axis_a to axis_b
     e.joint_error[row + 3] = dot3(pb, side)
     e.joint_error[row + 4] = dot3(pb, pa)
     # motor: relative angular velocity about the axis
     if e.joint_motor[i]:
-        angular_row(e.jac + 12 * (row + 5), axis)
+        fill_angular_jacobian_row(e.jac + 12 * (row + 5), axis)
         e.joint_error[row + 5] = 0.0
 
 
-cdef inline void build_joints(engine_t* e) noexcept nogil:
+cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
     """Build rows, diagonal, compliance, right-hand side and warm start of all joints."""
     cdef int32_t i, row, a, b
     cdef double h = e.setting[S_H], omega, k, c, d, inf = 1.0 / 0.0
@@ -134,7 +134,7 @@ cdef inline void build_joints(engine_t* e) noexcept nogil:
         if e.size[ROWS_PER_CONTACT] > 4:
             e.rolling[i] = 0.0
         for row in range(e.ptr[i], e.ptr[i + 1]):
-            minv_times(e.jac + 12 * row, e.inv_mass, e.inv_inertia, a, b, e.minv_jac + 12 * row)
+            multiply_inverse_mass(e.jac + 12 * row, e.inv_mass, e.inv_inertia, a, b, e.minv_jac + 12 * row)
             d = dot12(e.jac + 12 * row, e.minv_jac + 12 * row)
             e.lower[row] = -inf
             e.upper[row] = inf
@@ -151,6 +151,6 @@ cdef inline void build_joints(engine_t* e) noexcept nogil:
                 e.compliance[row] = 1.0 / (h * (c + h * k))
                 e.target[row] = -e.joint_error[row] * k / (c + h * k)
             e.d[row] = d + e.compliance[row]
-            e.step[row] = reciprocal(e.d[row])
-            e.b[row] = e.target[row] - joint_velocity(e.jac + 12 * row, e.v_free, a, b)
+            e.step[row] = reciprocal_or_zero(e.d[row])
+            e.b[row] = e.target[row] - joint_row_velocity(e.jac + 12 * row, e.v_free, a, b)
             e.impulse[row] = e.joint_impulse[row] if e.head[H_WARM_START] else 0.0

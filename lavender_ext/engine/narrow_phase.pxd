@@ -21,7 +21,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
-from lavender_ext.engine.bodies cimport to_body, to_world
+from lavender_ext.engine.bodies cimport rotate_to_body, rotate_to_world
 from lavender_ext.engine.vectors cimport column3, copy3, subtract3, add_scaled3, scale3
 
 
@@ -33,7 +33,7 @@ cdef struct manifold_t:
     double gap[4]
 
 
-cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
+cdef inline void collide_sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
                                manifold_t* m) noexcept nogil:
     """Collide two spheres."""
     cdef double d[3]
@@ -59,7 +59,7 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
     m.n = 1
 
 
-cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin,
+cdef inline void collide_plane_sphere(const double* plane, const double* x, double r, double margin,
                               manifold_t* m) noexcept nogil:
     """Collide a plane and a sphere."""
     cdef double gap = dot3(plane, x) - plane[3] - r
@@ -72,14 +72,14 @@ cdef inline void plane_sphere(const double* plane, const double* x, double r, do
     m.n = 1
 
 
-cdef inline void plane_box(const double* plane, const double* x, const double* rot, const double* half,
+cdef inline void collide_plane_box(const double* plane, const double* x, const double* rot, const double* half,
                            double margin, manifold_t* m) noexcept nogil:
     """Collide a plane and a box: the four corners with the smallest gaps g + sum +-p_k, ties to the lower corner number."""
     cdef double p[3]
     cdef double gap[8]
     cdef double low, g = dot3(plane, x) - plane[3]
     cdef int32_t i, _j, k, best, selected = 0
-    to_body(rot, plane, p)
+    rotate_to_body(rot, plane, p)
     # early out: the lowest corner is above the margin
     low = g
     for k in range(3):
@@ -113,7 +113,7 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
             m.n += 1
 
 
-cdef inline void box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
+cdef inline void collide_box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
                             double r, double margin, manifold_t* m) noexcept nogil:
     """Collide a box and a sphere."""
     cdef double d[3]
@@ -122,7 +122,7 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
     cdef double s, best
     cdef int32_t k, axis = -1
     subtract3(xb, xa, d)
-    to_body(rot, d, c)
+    rotate_to_body(rot, d, c)
     # closest point of the box to the sphere's centre, in the box's frame
     s = 0.0
     for k in range(3):
@@ -147,15 +147,15 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
         near[axis] = d[axis] * half[axis]
         s = best
     m.gap[0] = s - r
-    to_world(rot, d, m.normal)
+    rotate_to_world(rot, d, m.normal)
     add_scaled3(near, 0.5 * m.gap[0], d, c)
-    to_world(rot, c, m.point)
+    rotate_to_world(rot, c, m.point)
     add_scaled3(xa, 1.0, m.point, m.point)
     m.feature[0] = 0
     m.n = 1
 
 
-cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
+cdef inline int32_t clip_polygon_to_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
                               double bound, double tol, int32_t line, double* out,
                               int32_t* out_code) noexcept nogil:
     """Clip the polygon p (n, 3) against sign * p[axis] <= bound and return the number of points left.
@@ -185,7 +185,7 @@ cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, i
     return n_out
 
 
-cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t* pick) noexcept nogil:
+cdef inline void select_four_contact_points(const double* p, int32_t kept, double margin, int32_t* pick) noexcept nogil:
     """Select the outermost points along four directions, skewed so that the corners of a square do not tie.
 
     If the deepest point is not among them, it replaces the nearest selected point.
@@ -225,7 +225,7 @@ cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t
         pick[other] = at
 
 
-cdef inline void to_face(const double* along_x, const double* along_y, const double* along_z, const double* a,
+cdef inline void transform_to_face_frame(const double* along_x, const double* along_y, const double* along_z, const double* a,
                          double* out) noexcept nogil:
     """Transform a world vector to the frame of a face."""
     out[0] = dot3(a, along_x)
@@ -233,7 +233,7 @@ cdef inline void to_face(const double* along_x, const double* along_y, const dou
     out[2] = dot3(a, along_z)
 
 
-cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
+cdef inline void build_face_manifold(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
                              const double* xo, const double* ro, const double* ho, int32_t on_b,
                              double margin, manifold_t* m) noexcept nogil:
     """Build a face manifold: clip the other box's incident face by the reference face.
@@ -262,7 +262,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     column3(rr, axis, n)
     scale3(sign, n, n)
     # incident face: the other box's face most antiparallel to n
-    to_body(ro, n, u)
+    rotate_to_body(ro, n, u)
     best = -1.0
     for i in range(3):
         if fabs(u[i]) > best:
@@ -275,13 +275,13 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     subtract3(xo, xr, u)
     column3(ro, face, c)
     add_scaled3(u, s, c, c)
-    to_face(x, y, n, c, w)
+    transform_to_face_frame(x, y, n, c, w)
     w[2] -= hr[axis]
     for i in range(2):
         j = fx if i == 0 else fy
         column3(ro, j, c)
         scale3(ho[j], c, c)
-        to_face(x, y, n, c, more + 3 * i)
+        transform_to_face_frame(x, y, n, c, more + 3 * i)
     for k in range(3):
         poly[k] = w[k] - more[k] - more[3 + k]
         poly[3 + k] = w[k] + more[k] - more[3 + k]
@@ -302,7 +302,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
                 kept += 1
         if kept == 0:
             continue
-        kept = clip_side(count, poly, code, k, s, best, tol, 4 + i, more, more_code)
+        kept = clip_polygon_to_side(count, poly, code, k, s, best, tol, 4 + i, more, more_code)
         count = kept
         for j in range(count):
             code[j] = more_code[j]
@@ -317,7 +317,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             kept += 1
     # reduce to four points
     if kept > 4:
-        pick_four(more, kept, margin, pick)
+        select_four_contact_points(more, kept, margin, pick)
     else:
         for i in range(kept):
             pick[i] = i
@@ -349,13 +349,13 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     scale3(-1.0 if on_b else 1.0, n, m.normal)
 
 
-cdef inline int32_t edge_centre(const double* x, const double* rot, const double* half, int32_t axis, const double* n,
+cdef inline int32_t find_support_edge_centre(const double* x, const double* rot, const double* half, int32_t axis, const double* n,
                                 double sign, double* out) noexcept nogil:
     """Compute the centre of the edge along `axis` that is farthest along sign n; return two bits that identify it."""
     cdef double side[3]
     cdef double u[3]
     cdef int32_t r, bits = 0
-    to_body(rot, n, u)
+    rotate_to_body(rot, n, u)
     copy3(x, out)
     for r in range(3):
         if r != axis:
@@ -365,7 +365,7 @@ cdef inline int32_t edge_centre(const double* x, const double* rot, const double
     return bits
 
 
-cdef inline void edge_point(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
+cdef inline void build_edge_manifold(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
                             const double* rb, const double* hb, int32_t j, double* n, double gap,
                             manifold_t* m) noexcept nogil:
     """Build an edge manifold from the closest points of the edges along axis i of a and axis j of b."""
@@ -376,8 +376,8 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     cdef double along_b[3]
     cdef double u, v, w, s, t
     cdef int32_t bits
-    bits = 4 * edge_centre(xa, ra, ha, i, n, 1.0, p)
-    bits += edge_centre(xb, rb, hb, j, n, -1.0, q)
+    bits = 4 * find_support_edge_centre(xa, ra, ha, i, n, 1.0, p)
+    bits += find_support_edge_centre(xb, rb, hb, j, n, -1.0, q)
     subtract3(q, p, d)
     column3(ra, i, along_a)
     column3(rb, j, along_b)
@@ -398,7 +398,7 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     m.n = 1
 
 
-cdef inline void box_box(const double* xa, const double* ra, const double* ha, const double* xb,
+cdef inline void collide_box_box(const double* xa, const double* ra, const double* ha, const double* xb,
                          const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
     """Collide two boxes: separating axis test, then a face or edge manifold on the axis of least penetration."""
     cdef double c[9]            # R_a^T R_b
@@ -411,8 +411,8 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
     cdef double s, t, length, face_a = -1.0 / 0.0, face_b = -1.0 / 0.0, edge = -1.0 / 0.0, tol, best, small
     cdef int32_t i, j, k, i1, i2, j1, j2, axis_a = 0, axis_b = 0, edge_i = -1, edge_j = -1, parallel = 0
     subtract3(xb, xa, d)
-    to_body(ra, d, ta)
-    to_body(rb, d, tb)
+    rotate_to_body(ra, d, ta)
+    rotate_to_body(rb, d, tb)
     for i in range(3):
         for j in range(3):
             s = ra[i] * rb[j] + ra[3 + i] * rb[3 + j] + ra[6 + i] * rb[6 + j]
@@ -473,14 +473,14 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
         length = sqrt(dot3(m.normal, m.normal))
         s = 1.0 / length if dot3(m.normal, d) >= 0.0 else -1.0 / length
         scale3(s, m.normal, n)
-        edge_point(xa, ra, ha, edge_i, xb, rb, hb, edge_j, n, edge, m)
+        build_edge_manifold(xa, ra, ha, edge_i, xb, rb, hb, edge_j, n, edge, m)
     elif face_b > face_a + tol + 0.05 * fabs(face_a):
-        face_points(xb, rb, hb, axis_b, -1.0 if tb[axis_b] > 0.0 else 1.0, xa, ra, ha, 1, margin, m)
+        build_face_manifold(xb, rb, hb, axis_b, -1.0 if tb[axis_b] > 0.0 else 1.0, xa, ra, ha, 1, margin, m)
     else:
-        face_points(xa, ra, ha, axis_a, -1.0 if ta[axis_a] < 0.0 else 1.0, xb, rb, hb, 0, margin, m)
+        build_face_manifold(xa, ra, ha, axis_a, -1.0 if ta[axis_a] < 0.0 else 1.0, xb, rb, hb, 0, margin, m)
 
 
-cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
+cdef inline void collide_bodies(const engine_t* e, int32_t a, int32_t b, double margin,
                          manifold_t* m) noexcept nogil:
     """Compute the manifold of bodies a < b; m.n = 0 if their gap exceeds the margin."""
     cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], flip = 0
@@ -490,10 +490,10 @@ cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
     cdef const double* sb = e.shape + 4 * b
     m.n = 0
     if ka == SPHERE and kb == SPHERE:
-        sphere_sphere(xa, sa[0], xb, sb[0], margin, m)
+        collide_sphere_sphere(xa, sa[0], xb, sb[0], margin, m)
         return
     if ka == BOX and kb == BOX:
-        box_box(xa, e.rot + 9 * a, sa, xb, e.rot + 9 * b, sb, margin, m)
+        collide_box_box(xa, e.rot + 9 * a, sa, xb, e.rot + 9 * b, sb, margin, m)
         return
     if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # swap: planes first, then boxes
         flip = 1
@@ -502,10 +502,10 @@ cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
         xa, xb = xb, xa
         sa, sb = sb, sa
     if ka == PLANE and kb == SPHERE:
-        plane_sphere(sa, xb, sb[0], margin, m)
+        collide_plane_sphere(sa, xb, sb[0], margin, m)
     elif ka == PLANE and kb == BOX:
-        plane_box(sa, xb, e.rot + 9 * b, sb, margin, m)
+        collide_plane_box(sa, xb, e.rot + 9 * b, sb, margin, m)
     elif ka == BOX and kb == SPHERE:
-        box_sphere(xa, e.rot + 9 * a, sa, xb, sb[0], margin, m)
+        collide_box_sphere(xa, e.rot + 9 * a, sa, xb, sb[0], margin, m)
     if flip:
         scale3(-1.0, m.normal, m.normal)

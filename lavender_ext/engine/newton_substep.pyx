@@ -16,14 +16,14 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, info_t
-from lavender_ext.core.islands cimport find_islands, islands_index
-from lavender_ext.core.block_types cimport blocks_t, is_rows, islands_t
+from lavender_ext.core.islands cimport find_islands, island_workspace_integers
+from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.view cimport rows_t, view_t
-from lavender_ext.core.weights cimport block_weights, joint_weights
-from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
-from lavender_ext.engine.view cimport view
-from lavender_ext.judge.measure cimport find_reference, score_slack
-from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
+from lavender_ext.engine.arrays cimport S_OUT, bind_engine_arrays, engine_t
+from lavender_ext.engine.view cimport bind_substep_problem
+from lavender_ext.judge.measure cimport find_reference, score_given_slack
+from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.solve cimport bodies_start, bodies_workspace_size, system_step
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, band_width,
@@ -40,7 +40,7 @@ cdef enum:
 
 cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:
     """Return the number of scratch integers in addition to those of Newton's method."""
-    return SCRATCH_HEADER + v.r.n_bodies + 2 * <int64_t>v.r.n_joints + 1 + islands_index(v)
+    return SCRATCH_HEADER + v.r.n_bodies + 2 * <int64_t>v.r.n_joints + 1 + island_workspace_integers(v)
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -53,8 +53,8 @@ cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double*
     cdef rows_t r
     cdef view_t v
     cdef workspace_t n
-    bind(size, real, index, keys, &e, used)
-    view(&e, &p, &r)
+    bind_engine_arrays(size, real, index, keys, &e, used)
+    bind_substep_problem(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
     needed = own_index_size(&v)
     if all_stages and bodies_workspace_size(&v, NULL, &n):
@@ -76,8 +76,8 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     cdef rows_t r
     cdef view_t v
     cdef workspace_t n
-    bind(size, real, index, keys, &e, used)
-    view(&e, &p, &r)
+    bind_engine_arrays(size, real, index, keys, &e, used)
+    bind_substep_problem(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
     scratch[1] = 0
     needed = 0
@@ -111,7 +111,7 @@ cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o,
     return FACTORED if said.relative <= o.tol else UNDECIDED
 
 
-cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
+cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
                                    int32_t* scratch, double* workspace, double* lam, double* v) noexcept nogil:
     """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
     cdef int32_t j, result = warm_solve(p, r, s, tol, lam, v, 1)
@@ -139,14 +139,14 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     return run_newton_stages(&problem, &o, &n, s, lam, v)
 
 
-cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
+cdef inline void find_substep_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
                               islands_t* islands) noexcept nogil:
     """Find the islands of the substep and their reference errors, if there are several and all bounds contain 0.
 
     The arrays of s are scratch. Bounds of contact rows are not read.
     """
     cdef view_t v = view_t(p[0], NULL, r, NULL)
-    cdef score_t score = new_score()
+    cdef score_t score = make_empty_score()
     cdef double start[3]
     cdef int32_t i, j
     if p.n_rows == 0 or find_islands(&v, index, islands) == 1:
@@ -154,9 +154,9 @@ cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* 
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             s.start[j], s.slack[j] = 0.0, -p.b[j]
-            if is_rows(p, i) and not p.lower[j] <= 0.0 <= p.upper[j]:
+            if has_independent_rows(p, i) and not p.lower[j] <= 0.0 <= p.upper[j]:
                 return
-    score_slack(p, s.start, s.slack, s.error, &score)
+    score_given_slack(p, s.start, s.slack, s.error, &score)
     islands.reference = reference
     p.islands = islands
     find_reference(p, s.start, s.slack, s.error, start)
@@ -179,10 +179,10 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef islands_t islands
     cdef int64_t own
     cdef int32_t result, marks
-    bind(size, real, index, keys, &e, used)
-    view(&e, &p, &r)
-    block_weights(&p, p.d, workspace)
-    joint_weights(&p, &r, workspace)
+    bind_engine_arrays(size, real, index, keys, &e, used)
+    bind_substep_problem(&e, &p, &r)
+    compute_velocity_weights(&p, p.d, workspace)
+    set_angular_joint_weights(&p, &r, workspace)
     p.nu = workspace
     s.width = scratch[0]
     s.trace = trace
@@ -190,9 +190,9 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     own = warm_workspace_size(&p, s.width) + p.n_rows
     marks = SCRATCH_HEADER + scratch[1]
     bind_warm_workspace(&s, workspace + p.n_rows, scratch + marks, &p, &r)
-    bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
+    find_substep_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
     own += 2 * <int64_t>p.n_blocks
-    result = newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
+    result = solve_newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
     if p.n_rows > 0 and (all_stages or result != UNDECIDED):
         measure_as_engine(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps

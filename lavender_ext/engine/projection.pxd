@@ -12,15 +12,17 @@ the slop and no joint has an error.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport clip, relax_normal
-from lavender_ext.core.rows cimport cross, dot3, apply_joint_impulse, joint_velocity, apply_impulse_to_bodies, relative_velocity
+from lavender_ext.core.block cimport clip, project_normal_update
+from lavender_ext.core.rows cimport (
+    cross, dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies, compute_relative_velocity,
+)
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
 from lavender_ext.engine.vectors cimport scale3
 
 
-cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
+cdef inline int32_t is_rigid_joint_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
     """Return whether a joint row is projected: soft rows correct their own errors, a motor row has no position."""
     return e.joint[N_JOINT_REAL * i + J_HERTZ] == 0.0 and not (e.joint_motor[i] and row == e.ptr[i + 1] - 1)
 
@@ -29,12 +31,13 @@ cdef inline double contact_normal_velocity(const engine_t* e, const double* v, i
     """Return a contact's relative normal velocity (J v)_n for the body velocities v (nd, 6)."""
     cdef double u[3]
     cdef double s[3]
-    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
+    compute_relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
                       u, s)
     return dot3(e.normal + 3 * c, u)
 
 
-cdef inline double displacement(const engine_t* e, int32_t c, const double* z, const double* axis, double* turn) noexcept nogil:
+cdef inline double contact_displacement_along(const engine_t* e, int32_t c, const double* z, const double* axis,
+                                              double* turn) noexcept nogil:
     """Return J z of a contact along an axis, a velocity if z (nd, 6) holds velocities; turn (2, 3): arm x axis of a and b."""
     cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
     cdef double s = 0.0
@@ -79,7 +82,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             depth = -e.gap[c]
     for i in range(e.size[N_JOINT]):
         for j in range(e.ptr[i], e.ptr[i + 1]):
-            if rigid_row(e, i, j) and fabs(e.joint_error[j]) > joint_error:
+            if is_rigid_joint_row(e, i, j) and fabs(e.joint_error[j]) > joint_error:
                 joint_error = fabs(e.joint_error[j])
     e.setting[S_DEPTH] = depth
     e.setting[S_JOINT_ERROR] = joint_error
@@ -93,9 +96,9 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         b = e.joint_body[2 * i + 1]
         for j in range(e.ptr[i], e.ptr[i + 1]):
             e.push[j] = 0.0
-            x = e.joint_error[j] + h * joint_velocity(e.jac + 12 * j, e.shift, a, b)
+            x = e.joint_error[j] + h * joint_row_velocity(e.jac + 12 * j, e.shift, a, b)
             goal[j] = -clip(beta * x, -max_correction, max_correction)
-            if fabs(x) > 1e-3 * slop and rigid_row(e, i, j):
+            if fabs(x) > 1e-3 * slop and is_rigid_joint_row(e, i, j):
                 due = 1
     for c in range(n):
         e.push[mj + c] = 0.0
@@ -113,11 +116,11 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             a = e.joint_body[2 * i]
             b = e.joint_body[2 * i + 1]
             for j in range(e.ptr[i], e.ptr[i + 1]):
-                if rigid_row(e, i, j):
-                    change = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
+                if is_rigid_joint_row(e, i, j):
+                    change = (goal[j] - joint_row_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
                     apply_joint_impulse(e.minv_jac + 12 * j, change, e.shift, a, b)
         for c in range(n):
-            new_multiplier = relax_normal(e.push[mj + c], contact_normal_velocity(e, e.shift, c) - goal[mj + c],
+            new_multiplier = project_normal_update(e.push[mj + c], contact_normal_velocity(e, e.shift, c) - goal[mj + c],
                                           e.step[e.ptr[e.size[N_JOINT] + c]])                           # (1)
             change = new_multiplier - e.push[mj + c]
             if change == 0.0:

@@ -20,11 +20,11 @@ Stage 3 removes the velocity that pushed bodies apart, so that it adds no energy
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.rows cimport joint_velocity, reciprocal
+from lavender_ext.core.rows cimport joint_row_velocity, reciprocal_or_zero
 from lavender_ext.engine.arrays cimport (H_CONTACTS, N_DYNAMIC, N_JOINT, S_BOUNCE, S_H, S_HERTZ, S_PUSH, S_RATIO,
                                          engine_t)
-from lavender_ext.engine.contacts cimport initial_normal_velocity, restitution_of
-from lavender_ext.engine.projection cimport contact_normal_velocity, set_normal_impulse, rigid_row
+from lavender_ext.engine.contacts cimport initial_normal_velocity, get_pair_restitution
+from lavender_ext.engine.projection cimport contact_normal_velocity, set_normal_impulse, is_rigid_joint_row
 
 
 cdef inline void compute_soft_parameters(double hertz, double ratio, double h, double* rate, double* a2) noexcept nogil:
@@ -36,7 +36,7 @@ cdef inline void compute_soft_parameters(double hertz, double ratio, double h, d
     a2[0] = h * omega * a1
 
 
-cdef inline void soften_rows(engine_t* e) noexcept nogil:
+cdef inline void set_soft_constraint_rows(engine_t* e) noexcept nogil:
     """Apply (2) to the prepared rows: penetrating contacts and rigid joint rows."""
     cdef int32_t i, c, j, a, b
     cdef double h = e.setting[S_H], rate, a2, stiff, stiff_a2, push_velocity
@@ -49,12 +49,12 @@ cdef inline void soften_rows(engine_t* e) noexcept nogil:
         a = e.joint_body[2 * i]
         b = e.joint_body[2 * i + 1]
         for j in range(e.ptr[i], e.ptr[i + 1]):
-            if rigid_row(e, i, j):
+            if is_rigid_joint_row(e, i, j):
                 e.compliance[j] = e.d[j] / stiff_a2
                 e.target[j] = -stiff * e.joint_error[j]
                 e.d[j] += e.compliance[j]
-                e.step[j] = reciprocal(e.d[j])
-                e.b[j] = e.target[j] - joint_velocity(e.jac + 12 * j, e.v_free, a, b)
+                e.step[j] = reciprocal_or_zero(e.d[j])
+                e.b[j] = e.target[j] - joint_row_velocity(e.jac + 12 * j, e.v_free, a, b)
     compute_soft_parameters(hertz, e.setting[S_RATIO], h, &rate, &a2)
     compute_soft_parameters(2.0 * hertz, e.setting[S_RATIO], h, &stiff, &stiff_a2)
     for c in range(e.head[H_CONTACTS]):
@@ -70,11 +70,11 @@ cdef inline void soften_rows(engine_t* e) noexcept nogil:
             e.target[j] = push_velocity if push_velocity < e.setting[S_PUSH] else e.setting[S_PUSH]
             e.compliance[j] = e.d[j] / (stiff_a2 if i else a2)
             e.d[j] += e.compliance[j]
-            e.step[j] = reciprocal(e.d[j])
+            e.step[j] = reciprocal_or_zero(e.d[j])
         e.b[j] = e.target[j] - contact_normal_velocity(e, e.v_free, c)
 
 
-cdef inline void remove_bias(engine_t* e) noexcept nogil:
+cdef inline void set_rows_without_bias(engine_t* e) noexcept nogil:
     """Store dv, which moves the bodies, in `shift`, and set the rows of stage 3 with the gaps at the end of stage 2."""
     cdef int32_t i, c, j, a, b
     cdef double h = e.setting[S_H], gap
@@ -84,12 +84,12 @@ cdef inline void remove_bias(engine_t* e) noexcept nogil:
         a = e.joint_body[2 * i]
         b = e.joint_body[2 * i + 1]
         for j in range(e.ptr[i], e.ptr[i + 1]):
-            if rigid_row(e, i, j):
+            if is_rigid_joint_row(e, i, j):
                 e.d[j] -= e.compliance[j]
                 e.compliance[j] = 0.0
-                e.step[j] = reciprocal(e.d[j])
+                e.step[j] = reciprocal_or_zero(e.d[j])
                 e.target[j] = 0.0
-                e.b[j] = 0.0 - joint_velocity(e.jac + 12 * j, e.v_free, a, b)
+                e.b[j] = 0.0 - joint_row_velocity(e.jac + 12 * j, e.v_free, a, b)
     for c in range(e.head[H_CONTACTS]):
         j = e.ptr[e.size[N_JOINT] + c]
         gap = contact_normal_velocity(e, e.v_free, c)
@@ -97,7 +97,7 @@ cdef inline void remove_bias(engine_t* e) noexcept nogil:
         gap = e.gap[c] + h * (gap + contact_normal_velocity(e, e.dv, c))
         e.d[j] -= e.compliance[j]
         e.compliance[j] = 0.0
-        e.step[j] = reciprocal(e.d[j])
+        e.step[j] = reciprocal_or_zero(e.d[j])
         e.target[j] = -gap / h if gap > 0.0 else 0.0
         e.b[j] = e.target[j] + e.b[j]
 
@@ -109,7 +109,7 @@ cdef inline void apply_restitution(engine_t* e) noexcept nogil:
     for c in range(e.head[H_CONTACTS]):
         a = e.contact_pair[2 * c]
         b = e.contact_pair[2 * c + 1]
-        restitution = restitution_of(e, a, b)
+        restitution = get_pair_restitution(e, a, b)
         j = e.ptr[e.size[N_JOINT] + c]
         if restitution == 0.0 or e.impulse[j] <= 0.0:
             continue

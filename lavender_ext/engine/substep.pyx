@@ -6,66 +6,66 @@
     solve       dv = M^-1 J^T lam, then `iterations` sweeps: all joints, then all contacts
     finish      shift of the position projection, v = v* + dv, poses, cache
 
-`prepare` performs the first three stages and does not change the state; if a capacity is too small, it reports the
-needed capacity. Between `prepare` and `finish` any solver may replace `solve`: it reads the velocity problem from the
-arrays and writes the impulses back.
+`prepare_substep` performs the first three stages and does not change the state; if a capacity is too small, it reports the
+needed capacity. Between `prepare_substep` and `finish_substep` any solver may replace `run_stepper`: it reads the velocity
+problem from the arrays and writes the impulses back.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.engine.arrays import views
+from lavender_ext.engine.arrays import make_array_views
 
-from lavender_ext.core.block cimport row_error
+from lavender_ext.core.block cimport compute_row_error
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
-                                      color_by_bodies, reverse, sort_by_level)
+from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, find_block_levels, find_body_levels,
+                                      color_blocks_by_bodies, reverse_blocks, sort_blocks_by_level)
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
                                          H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
                                          H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
                                          N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SOFT_STEP, SYMMETRICALLY, S_OUT,
-                                         TOP_DOWN, XPBD, bind, engine_t)
-from lavender_ext.engine.avbd cimport descend_all
-from lavender_ext.engine.bodies cimport advance_bodies, start_bodies
-from lavender_ext.engine.broad_phase cimport update_pairs
-from lavender_ext.engine.contacts cimport build_contacts, store_contacts
-from lavender_ext.engine.joints cimport build_joints
+                                         TOP_DOWN, XPBD, bind_engine_arrays, engine_t)
+from lavender_ext.engine.avbd cimport run_avbd_substep
+from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
+from lavender_ext.engine.broad_phase cimport update_pair_list
+from lavender_ext.engine.contacts cimport build_contacts, store_contact_cache
+from lavender_ext.engine.joints cimport build_joint_rows
 from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
-from lavender_ext.engine.soft_step cimport remove_bias, apply_restitution, soften_rows
-from lavender_ext.engine.view cimport view
-from lavender_ext.engine.xpbd cimport correct_all
-from lavender_ext.judge.measure cimport score_slack
-from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.judge.slack cimport rows_slack
+from lavender_ext.engine.soft_step cimport set_rows_without_bias, apply_restitution, set_soft_constraint_rows
+from lavender_ext.engine.view cimport bind_substep_problem
+from lavender_ext.engine.xpbd cimport run_xpbd_substep
+from lavender_ext.judge.measure cimport score_given_slack
+from lavender_ext.judge.score cimport make_empty_score, score_t
+from lavender_ext.judge.slack cimport compute_body_slack
 from lavender_ext.sweep.packed cimport MAX_PACKED_BLOCKS, packed_workspace_size, sweep_packed
-from lavender_ext.sweep.pgs cimport relax_bodies
+from lavender_ext.sweep.pgs cimport sweep_bodies
 
 
 cdef enum:
     MIN_PACKED_SWEEPS = 4       # Pack the blocks from this many sweeps on: packing costs as much as a few sweeps.
 
 
-cdef int32_t prepare(engine_t* e) noexcept nogil:
+cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
     cdef blocks_t p
     cdef rows_t r
     cdef int32_t pairs, contacts, i
     e.head[H_SOLVED] = 0
     # bodies and pairs
-    start_bodies(e)
-    pairs = update_pairs(e)
+    begin_body_substep(e)
+    pairs = update_pair_list(e)
     e.head[H_NEED_PAIRS] = pairs
     if pairs > e.size[CAP_PAIR]:
         return NEED_CAPACITY
     # joint rows, contact rows
-    view(e, &p, &r)
+    bind_substep_problem(e, &p, &r)
     if e.size[N_JOINT] > 0:
-        build_joints(e)
+        build_joint_rows(e)
     if e.head[H_STEPPER] == SOFT_STEP:
         for i in range(e.size[CAP_CONTACT] * e.size[ROWS_PER_CONTACT]):
             e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # a previous substep may have stopped between prepare and solve
@@ -74,18 +74,18 @@ cdef int32_t prepare(engine_t* e) noexcept nogil:
     if contacts > e.size[CAP_CONTACT]:
         return NEED_CAPACITY
     if e.head[H_STEPPER] == SOFT_STEP:
-        soften_rows(e)
+        set_soft_constraint_rows(e)
     return OK
 
 
-cdef inline void measure_contacts(const engine_t* e, double* residual, double* violation) noexcept nogil:
+cdef inline void measure_contact_errors(const engine_t* e, double* residual, double* violation) noexcept nogil:
     """Compute max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b."""
     cdef int32_t c, row
     cdef double slack, error, inf = 1.0 / 0.0, max_error = 0.0, max_violation = 0.0
     for c in range(e.head[H_CONTACTS]):
         row = e.ptr[e.size[N_JOINT] + c]
         slack = contact_normal_velocity(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
-        error = row_error(e.impulse[row], slack, e.d[row], 0.0, inf)
+        error = compute_row_error(e.impulse[row], slack, e.d[row], 0.0, inf)
         error = -error if error < 0.0 else error
         if not error <= max_error:
             max_error = error
@@ -99,13 +99,13 @@ cdef inline void apply_warm_start(engine_t* e, const blocks_t* p, const rows_t* 
     """Set dv = M^-1 J^T lam, or 0 without warm starting."""
     cdef int32_t i
     if e.head[H_WARM_START]:
-        rows_velocity(p, r, e.impulse, e.dv)
+        compute_velocity_change(p, r, e.impulse, e.dv)
         return
     for i in range(6 * e.size[N_DYNAMIC]):
         e.dv[i] = 0.0
 
 
-cdef inline void order_blocks(engine_t* e) noexcept nogil:
+cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
     """Write the sweep order of all blocks to e.order, as computed by lavender.ordering: joints, then contacts."""
     cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC]
     cdef int32_t mode = e.head[H_ORDER]
@@ -115,19 +115,19 @@ cdef inline void order_blocks(engine_t* e) noexcept nogil:
     for i in range(n):
         e.order[i] = i
     if mode == REVERSED:
-        reverse(e.order, 0, kj)
-        reverse(e.order, kj, n)
+        reverse_blocks(e.order, 0, kj)
+        reverse_blocks(e.order, kj, n)
     elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
         if mode == COLORED:
-            levels = color_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
+            levels = color_blocks_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
         else:
-            levels = body_levels(n, e.joint_body, nd, level) + 2
-            block_levels(n, e.joint_body, level, block_level)
+            levels = find_body_levels(n, e.joint_body, nd, level) + 2
+            find_block_levels(n, e.joint_body, level, block_level)
         if mode == TOP_DOWN:
             for i in range(n):
                 block_level[i] = levels - 1 - block_level[i]
-        sort_by_level(kj, block_level, levels, block_level + n, e.order)
-        sort_by_level(n - kj, block_level + kj, levels, block_level + n, e.order + kj)
+        sort_blocks_by_level(kj, block_level, levels, block_level + n, e.order)
+        sort_blocks_by_level(n - kj, block_level + kj, levels, block_level + n, e.order + kj)
         for i in range(kj, n):
             e.order[i] += kj
 
@@ -136,14 +136,14 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
                             double* scratch) noexcept nogil:
     """Write max |e_n| [N s] over the contacts and E = sqrt(sum d e^2) [sqrt J] over all rows to out (2); scratch (2 m)."""
     cdef double violation
-    cdef score_t s = new_score()
-    measure_contacts(e, out, &violation)
-    rows_slack(p, r, e.impulse, e.dv, scratch)
-    score_slack(p, e.impulse, scratch, scratch + p.n_rows, &s)
+    cdef score_t s = make_empty_score()
+    measure_contact_errors(e, out, &violation)
+    compute_body_slack(p, r, e.impulse, e.dv, scratch)
+    score_given_slack(p, e.impulse, scratch, scratch + p.n_rows, &s)
     out[1] = s.energy
 
 
-cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
+cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
                     double* scratch) noexcept nogil:
     """Run the sweeps, joints, then contacts; curve (sweeps + 1, 2) or NULL receives the error after each."""
     cdef int32_t s, mode
@@ -152,9 +152,9 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t swe
     # every substep has its own random stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
     for s in range(sweeps):
-        advance_order(mode, s == 0, e.order, 0, r.n_joints, &rng)
-        advance_order(mode, s == 0, e.order, r.n_joints, p.n_blocks, &rng)
-        relax_bodies(p, r, e.order, p.n_blocks, e.impulse, e.dv)
+        update_sweep_order(mode, s == 0, e.order, 0, r.n_joints, &rng)
+        update_sweep_order(mode, s == 0, e.order, r.n_joints, p.n_blocks, &rng)
+        sweep_bodies(p, r, e.order, p.n_blocks, e.impulse, e.dv)
         if curve != NULL:
             record_sweep_error(e, p, r, curve + 2 * (s + 1), scratch)
 
@@ -167,53 +167,54 @@ cdef inline int32_t sweep_packed_blocks(engine_t* e, const blocks_t* p, const ro
     return sweep_packed(p, r, e.order, sweeps, workspace, e.impulse, e.dv)
 
 
-cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace, double* curve,
+cdef inline void run_velocity_sweeps(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace,
+                                     double* curve,
                        double* scratch) noexcept nogil:
     """Run the sweeps in the order of H_ORDER, over packed blocks if that pays."""
-    order_blocks(e)
+    set_sweep_order_of_blocks(e)
     if workspace == NULL or sweeps < MIN_PACKED_SWEEPS or not sweep_packed_blocks(e, p, r, sweeps, workspace):
-        sweep_all(e, p, r, sweeps, curve, scratch)
+        sweep_joints_then_contacts(e, p, r, sweeps, curve, scratch)
 
 
-cdef inline void solve_positions(engine_t* e) noexcept nogil:
+cdef inline void run_position_stepper(engine_t* e) noexcept nogil:
     """Run a stepper over positions (XPBD, AVBD); its velocity residuals are undefined and set to NaN."""
     cdef int32_t k
     cdef uint64_t nan = 0x7FF8000000000000              # as bits: the sign of 0/0 depends on the processor
     if e.head[H_STEPPER] == XPBD:
-        order_blocks(e)
-        correct_all(e)
+        set_sweep_order_of_blocks(e)
+        run_xpbd_substep(e)
     else:
-        descend_all(e)
+        run_avbd_substep(e)
     for k in range(4, 8):
         memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
 
 
-cdef inline void solve(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
+cdef inline void run_stepper(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
     """Run the stepper's solve, before the poses are updated; sweeps = 0: warm start and its error only."""
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
-    view(e, &p, &r)
+    bind_substep_problem(e, &p, &r)
     if sweeps and (e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD):
-        solve_positions(e)
+        run_position_stepper(e)
         return
     # warm start and error before the first sweep
     apply_warm_start(e, &p, &r)
-    measure_contacts(e, out + 4, out + 6)
+    measure_contact_errors(e, out + 4, out + 6)
     if curve != NULL:
         record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
         return
     # sweeps, and for SOFT_STEP the relaxing sweeps and restitution
-    sweep(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
+    run_velocity_sweeps(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
     if e.head[H_STEPPER] == SOFT_STEP:
-        remove_bias(e)
-        sweep(e, &p, &r, e.head[H_RELAXING], workspace, NULL, NULL)
+        set_rows_without_bias(e)
+        run_velocity_sweeps(e, &p, &r, e.head[H_RELAXING], workspace, NULL, NULL)
         apply_restitution(e)
-    measure_contacts(e, out + 5, out + 7)
+    measure_contact_errors(e, out + 5, out + 7)
 
 
-cdef inline int32_t moving_body(const engine_t* e, const int32_t* pair) noexcept nogil:
+cdef inline int32_t first_dynamic_body_of_pair(const engine_t* e, const int32_t* pair) noexcept nogil:
     """Return the first dynamic body of a pair."""
     return pair[0] if pair[0] >= 0 and e.dyn[pair[0]] >= 0 else pair[1]
 
@@ -227,15 +228,15 @@ cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
         return -1
     for i in range(kj):
         if not all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
-            return moving_body(e, e.joint_bodies + 2 * i)
+            return first_dynamic_body_of_pair(e, e.joint_bodies + 2 * i)
     for i in range(kj, kj + c):
         if not (all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]) and all_finite(e.b + e.ptr[i], 1)
                 and all_finite(e.gap + (i - kj), 1)):
-            return moving_body(e, e.contact_pair + 2 * (i - kj))
-    return moving_body(e, e.contact_pair) if c > 0 else e.body_of[0]
+            return first_dynamic_body_of_pair(e, e.contact_pair + 2 * (i - kj))
+    return first_dynamic_body_of_pair(e, e.contact_pair) if c > 0 else e.body_of[0]
 
 
-cdef int32_t finish(engine_t* e) noexcept nogil:
+cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     """Write the statistics, store the contact cache, project and advance the bodies; return OK or NOT_FINITE."""
     cdef int32_t i, shifted, nonfinite_body
     cdef const double* by = e.dv
@@ -253,7 +254,7 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
         by = NULL
     # cache, projection, integration
     nonfinite_body = find_nonfinite_body(e)
-    store_contacts(e)
+    store_contact_cache(e)
     shifted = project_positions(e)
     e.head[H_LOST] = advance_bodies(e, by, shifted)
     if e.head[H_LOST] < 0:
@@ -268,8 +269,8 @@ cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_
     """Build the coming substep's velocity problem without changing the state; return OK or NEED_CAPACITY."""
     cdef engine_t e
     cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    return prepare(&e)
+    bind_engine_arrays(size, real, index, keys, &e, n)
+    return prepare_substep(&e)
 
 
 cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -277,8 +278,8 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
     """Run the stepper on the prepared problem; sweeps = 0 only applies and measures the warm start."""
     cdef engine_t e
     cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    solve(&e, sweeps, NULL, NULL, NULL)
+    bind_engine_arrays(size, real, index, keys, &e, n)
+    run_stepper(&e, sweeps, NULL, NULL, NULL)
 
 
 cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -289,8 +290,8 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     """
     cdef engine_t e
     cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    solve(&e, 1, NULL, curve, scratch)
+    bind_engine_arrays(size, real, index, keys, &e, n)
+    run_stepper(&e, 1, NULL, curve, scratch)
 
 
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
@@ -298,11 +299,11 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
     """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
     cdef engine_t e
     cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    return finish(&e)
+    bind_engine_arrays(size, real, index, keys, &e, n)
+    return finish_substep(&e)
 
 
-cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
+cdef inline int32_t run_substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
     """Run up to n substeps; `done` receives the number completed.
 
     workspace: for packed blocks, of the size that `packed_workspace_size` returns for the capacities, or NULL: slower, same bits.
@@ -310,11 +311,11 @@ cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t*
     cdef int32_t status
     done[0] = 0
     while done[0] < n:
-        status = prepare(e)
+        status = prepare_substep(e)
         if status != OK:
             return status
-        solve(e, 1, workspace, NULL, NULL)
-        status = finish(e)
+        run_stepper(e, 1, workspace, NULL, NULL)
+        status = finish_substep(e)
         done[0] += 1
         if status != OK:
             return status
@@ -326,8 +327,8 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
     """Run complete substeps; `done` receives the number completed before the returned status."""
     cdef engine_t e
     cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    return substeps(&e, n_substeps, NULL, done)
+    bind_engine_arrays(size, real, index, keys, &e, n)
+    return run_substeps(&e, n_substeps, NULL, done)
 
 
 cdef class Buffers:
@@ -348,7 +349,7 @@ cdef class Buffers:
         self.index = index
         self.keys = keys
         cdef int64_t used[3]
-        bind(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
+        bind_engine_arrays(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
         cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MAX_PACKED_BLOCKS), joints = size[N_JOINT]
         self.workspace = np.empty(packed_workspace_size(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MAX_PACKED_BLOCKS else 1)
@@ -357,52 +358,52 @@ cdef class Buffers:
         """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""
         cdef int32_t n
         with nogil:
-            start_bodies(&self.e)
-            n = update_pairs(&self.e)
+            begin_body_substep(&self.e)
+            n = update_pair_list(&self.e)
         return n
 
     def prepare(self):
         """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
         cdef int32_t status
         with nogil:
-            status = prepare(&self.e)
+            status = prepare_substep(&self.e)
         return status
 
     def solve(self, bint sweeps=True):
         """Run the stepper on the prepared problem; without `sweeps` only apply and measure the warm start."""
         with nogil:
-            solve(&self.e, sweeps, NULL, NULL, NULL)
+            run_stepper(&self.e, sweeps, NULL, NULL, NULL)
 
     def solve_watched(self, double[:, ::1] curve):
         """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            solve(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
+            run_stepper(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
 
     def apply(self):
         """Compute dv and the final error of impulses that another solver has written."""
         cdef blocks_t p
         cdef rows_t r
         with nogil:
-            view(&self.e, &p, &r)
-            rows_velocity(&p, &r, self.e.impulse, self.e.dv)
-            measure_contacts(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
+            bind_substep_problem(&self.e, &p, &r)
+            compute_velocity_change(&p, &r, self.e.impulse, self.e.dv)
+            measure_contact_errors(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
 
     def finish(self):
         """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
         cdef int32_t status
         with nogil:
-            status = finish(&self.e)
+            status = finish_substep(&self.e)
         return status
 
     def substeps(self, int32_t n):
         """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = substeps(&self.e, n, &self.workspace[0], &done)
+            status = run_substeps(&self.e, n, &self.workspace[0], &done)
         return status, done
 
     def arrays(self):
         """Return {array name: writable view into its buffer}, with the shapes of engine/arrays.pyx."""
-        return views(self.size, np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys))
+        return make_array_views(self.size, np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys))

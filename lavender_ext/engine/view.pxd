@@ -4,7 +4,7 @@ from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
 
 
-cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
+cdef inline void bind_substep_problem(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     """Fill p and r with pointers to the arrays of the prepared substep.
 
     nu = d is correct for contacts without spin and for linear joint rows; a caller that judges other rows must set nu.

@@ -23,27 +23,30 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.rows cimport cross, dot3, apply_joint_impulse, joint_velocity
+from lavender_ext.core.rows cimport cross, dot3, apply_joint_impulse, joint_row_velocity
 from lavender_ext.engine.arrays cimport (BOX, DISTANCE, HINGE, H_CONTACTS, H_ITERATIONS, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, N_DYNAMIC, N_JOINT,
                                          N_JOINT_REAL, S_BOUNCE, S_H, engine_t)
-from lavender_ext.engine.bodies cimport advance_rotation, rotation_matrix, to_world, rotate_quaternion
-from lavender_ext.engine.contacts cimport initial_normal_velocity, restitution_of
-from lavender_ext.engine.projection cimport displacement, contact_normal_velocity, apply_contact_impulse, set_normal_impulse
+from lavender_ext.engine.bodies cimport advance_rotation, compute_rotation_matrix, rotate_to_world, rotate_quaternion
+from lavender_ext.engine.contacts cimport initial_normal_velocity, get_pair_restitution
+from lavender_ext.engine.projection cimport (
+    contact_displacement_along, contact_normal_velocity, apply_contact_impulse, set_normal_impulse,
+)
 from lavender_ext.engine.vectors cimport copy3, subtract3, normalise3, add_scaled3, scale3, matvec3
 
 
-cdef inline void turned(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
+cdef inline void rotate_vector_to_world(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
     """Rotate a vector from a body's frame at its current pose to the world; body -1 is the world."""
     cdef double r[9]
     if body < 0:
         copy3(local, out)
     else:
-        rotation_matrix(e.q + 4 * body, r)
-        to_world(r, local, out)
+        compute_rotation_matrix(e.q + 4 * body, r)
+        rotate_to_world(r, local, out)
 
 
-cdef inline double inverse_mass(const engine_t* e, int32_t dyn, const double* arm, const double* n) noexcept nogil:
+cdef inline double generalised_inverse_mass_of_body(const engine_t* e, int32_t dyn, const double* arm,
+                                                    const double* n) noexcept nogil:
     """Return one body's contribution to (1); arm NULL: of a rotation about n."""
     cdef double l[3]
     cdef double k[3]
@@ -74,11 +77,12 @@ cdef inline void displace_body(engine_t* e, int32_t body, int32_t dyn, const dou
     rotate_quaternion(e.q + 4 * body, k, 1.0)
 
 
-cdef inline double correct_row(engine_t* e, int32_t i, const double* arm_a, const double* arm_b, const double* n,
+cdef inline double apply_positional_correction(engine_t* e, int32_t i, const double* arm_a, const double* arm_b, const double* n,
                            double error, double before, double lam) noexcept nogil:
     """Apply (2) to joint i along n, b relative to a, and return lambda; `before` is the error at the start of the substep."""
     cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1]
-    cdef double w = inverse_mass(e, e.joint_body[2 * i], arm_a, n) + inverse_mass(e, e.joint_body[2 * i + 1], arm_b, n)
+    cdef double w = (generalised_inverse_mass_of_body(e, e.joint_body[2 * i], arm_a, n)
+                     + generalised_inverse_mass_of_body(e, e.joint_body[2 * i + 1], arm_b, n))
     cdef double h = e.setting[S_H], alpha = 0.0, g = 0.0, omega, x
     cdef double p[3]
     if w <= 0.0:
@@ -95,7 +99,7 @@ cdef inline double correct_row(engine_t* e, int32_t i, const double* arm_a, cons
     return lam + x
 
 
-cdef inline void correct_joint(engine_t* e, int32_t i) noexcept nogil:
+cdef inline void correct_joint_positions(engine_t* e, int32_t i) noexcept nogil:
     """Correct a joint's errors: its length, the separation of its anchors, or for a hinge also the angle of its axes."""
     cdef const double* p = e.joint + N_JOINT_REAL * i
     cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1], row = e.ptr[i], k
@@ -103,34 +107,36 @@ cdef inline void correct_joint(engine_t* e, int32_t i) noexcept nogil:
     cdef double arm_b[3]
     cdef double n[3]
     cdef double size, initial_error = 0.0
-    turned(e, a, p + J_ANCHOR_A, arm_a)
-    turned(e, b, p + J_ANCHOR_B, arm_b)
+    rotate_vector_to_world(e, a, p + J_ANCHOR_A, arm_a)
+    rotate_vector_to_world(e, b, p + J_ANCHOR_B, arm_b)
     for k in range(3):
         n[k] = (e.x[3 * b + k] if b >= 0 else 0.0) + arm_b[k] - (e.x[3 * a + k] if a >= 0 else 0.0) - arm_a[k]
     size = normalise3(n)
     # distance: the length error
     if e.joint_kind[i] == DISTANCE:
         if size > 0.0:
-            e.impulse[row] = correct_row(e, i, arm_a, arm_b, n, size - p[J_LENGTH], e.joint_error[row], e.impulse[row])
+            e.impulse[row] = apply_positional_correction(e, i, arm_a, arm_b, n, size - p[J_LENGTH], e.joint_error[row],
+                                                         e.impulse[row])
         return
     # ball: the separation of the anchors; multipliers of the changing direction n are accumulated by world axis
     if size > 0.0:
         for k in range(3):
             initial_error += n[k] * e.joint_error[row + k]
-        size = correct_row(e, i, arm_a, arm_b, n, size, initial_error, dot3(e.impulse + row, n)) - dot3(e.impulse + row, n)
+        size = apply_positional_correction(e, i, arm_a, arm_b, n, size, initial_error,
+                                           dot3(e.impulse + row, n)) - dot3(e.impulse + row, n)
         add_scaled3(e.impulse + row, size, n, e.impulse + row)
     if e.joint_kind[i] != HINGE:
         return
     # hinge: the rotation between the axes
-    turned(e, a, p + J_AXIS_A, arm_a)
-    turned(e, b, p + J_AXIS_B, arm_b)
+    rotate_vector_to_world(e, a, p + J_AXIS_A, arm_a)
+    rotate_vector_to_world(e, b, p + J_AXIS_B, arm_b)
     cross(arm_a, arm_b, n)                              # rotation vector from axis_a to axis_b: the rotation of b to remove
     size = normalise3(n)
     if size > 0.0:
-        correct_row(e, i, NULL, NULL, n, size, 0.0, 0.0)
+        apply_positional_correction(e, i, NULL, NULL, n, size, 0.0, 0.0)
 
 
-cdef inline void rotation_between(const double* q, const double* p, double* out) noexcept nogil:
+cdef inline void compute_rotation_between(const double* q, const double* p, double* out) noexcept nogil:
     """Compute the rotation from p to q as a vector [rad], 2 (q p^-1)_xyz / (q p^-1)_w, the inverse of `rotate_quaternion`."""
     cdef double s = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + q[3] * p[3]
     s = 2.0 / s if s != 0.0 else 2.0                    # rotation by pi: the vector is infinite
@@ -139,7 +145,8 @@ cdef inline void rotation_between(const double* q, const double* p, double* out)
     out[2] = s * (q[3] * p[0] - q[0] * p[3] - q[1] * p[2] + q[2] * p[1])
 
 
-cdef inline void contact_point_motion(const engine_t* e, int32_t body, int32_t dyn, const double* local, const double* arm0,
+cdef inline void compute_contact_point_displacement(const engine_t* e, int32_t body, int32_t dyn, const double* local,
+                                                    const double* arm0,
                        int32_t material, double* arm, double* by) noexcept nogil:
     """Compute the current arm of a contact point and the point's displacement during the substep.
 
@@ -155,21 +162,23 @@ cdef inline void contact_point_motion(const engine_t* e, int32_t body, int32_t d
     if dyn < 0:
         return
     if e.kind_of_shape[body] == BOX:
-        turned(e, body, local, arm)
+        rotate_vector_to_world(e, body, local, arm)
     for k in range(3):
         by[k] = (e.x[3 * body + k] - e.shift[6 * dyn + k]) + (arm[k] - arm0[k])
     if material and e.kind_of_shape[body] != BOX:
-        rotation_between(e.q + 4 * body, e.dv + 6 * dyn, rotation_vector)
+        compute_rotation_between(e.q + 4 * body, e.dv + 6 * dyn, rotation_vector)
         cross(rotation_vector, arm, l)
         add_scaled3(by, 1.0, l, by)
 
 
-cdef inline void relative_motion(const engine_t* e, int32_t c, int32_t material, double* arm_a, double* arm_b,
+cdef inline void compute_relative_contact_displacement(const engine_t* e, int32_t c, int32_t material, double* arm_a, double* arm_b,
                                double* by) noexcept nogil:
     """Compute a contact's current arms and the displacement of b's point relative to a's."""
     cdef double by_a[3]
-    contact_point_motion(e, e.contact_pair[2 * c], e.contact_body[2 * c], e.local + 6 * c, e.arm_a + 3 * c, material, arm_a, by_a)
-    contact_point_motion(e, e.contact_pair[2 * c + 1], e.contact_body[2 * c + 1], e.local + 6 * c + 3, e.arm_b + 3 * c, material,
+    compute_contact_point_displacement(e, e.contact_pair[2 * c], e.contact_body[2 * c], e.local + 6 * c, e.arm_a + 3 * c, material,
+                                       arm_a, by_a)
+    compute_contact_point_displacement(e, e.contact_pair[2 * c + 1], e.contact_body[2 * c + 1], e.local + 6 * c + 3,
+                                       e.arm_b + 3 * c, material,
           arm_b, by)
     subtract3(by, by_a, by)
 
@@ -186,10 +195,11 @@ cdef inline void displace_contact(engine_t* e, int32_t c, const double* arm_a, c
 cdef inline double contact_inverse_mass(const engine_t* e, int32_t c, const double* arm_a, const double* arm_b,
                              const double* n) noexcept nogil:
     """Return the generalised inverse mass (1) of a contact along n."""
-    return inverse_mass(e, e.contact_body[2 * c], arm_a, n) + inverse_mass(e, e.contact_body[2 * c + 1], arm_b, n)
+    return (generalised_inverse_mass_of_body(e, e.contact_body[2 * c], arm_a, n)
+            + generalised_inverse_mass_of_body(e, e.contact_body[2 * c + 1], arm_b, n))
 
 
-cdef inline void correct_normal(engine_t* e, int32_t c) noexcept nogil:
+cdef inline void correct_penetration(engine_t* e, int32_t c) noexcept nogil:
     """Correct the penetration of a contact by (2), with its multiplier clamped at 0."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
     cdef const double* n = e.normal + 3 * c
@@ -197,7 +207,7 @@ cdef inline void correct_normal(engine_t* e, int32_t c) noexcept nogil:
     cdef double arm_b[3]
     cdef double by[3]
     cdef double new_multiplier, multiplier
-    relative_motion(e, c, 0, arm_a, arm_b, by)
+    compute_relative_contact_displacement(e, c, 0, arm_a, arm_b, by)
     multiplier = e.impulse[row]
     new_multiplier = multiplier - (e.gap[c] + dot3(n, by)) / contact_inverse_mass(e, c, arm_a, arm_b, n)
     new_multiplier = new_multiplier if new_multiplier > 0.0 else 0.0
@@ -206,7 +216,7 @@ cdef inline void correct_normal(engine_t* e, int32_t c) noexcept nogil:
         displace_contact(e, c, arm_a, arm_b, n, new_multiplier - multiplier)
 
 
-cdef inline void correct_tangents(engine_t* e, int32_t c) noexcept nogil:
+cdef inline void correct_tangential_displacement(engine_t* e, int32_t c) noexcept nogil:
     """Undo the tangential displacement of a contact if the friction for it stays inside the disk."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
     cdef const double* t1 = e.tangent + 3 * c
@@ -218,7 +228,7 @@ cdef inline void correct_tangents(engine_t* e, int32_t c) noexcept nogil:
     if friction_bound == 0.0:
         return
     # tangential displacement and its direction
-    relative_motion(e, c, 1, arm_a, arm_b, by)
+    compute_relative_contact_displacement(e, c, 1, arm_a, arm_b, by)
     cross(e.normal + 3 * c, t1, t2)
     s = dot3(by, t1)
     t = dot3(by, t2)
@@ -255,7 +265,7 @@ cdef inline void advance_free_flight(engine_t* e) noexcept nogil:
             rotate_quaternion(e.q + 4 * b, e.v_free + 6 * i + 3, h)
 
 
-cdef inline void compute_velocities(engine_t* e) noexcept nogil:
+cdef inline void compute_velocities_from_poses(engine_t* e) noexcept nogil:
     """Compute dv = v - v* from the poses (stage 3); for anisotropic inertia relative to the rotation of free flight."""
     cdef int32_t i, k, b
     cdef double h = e.setting[S_H]
@@ -269,7 +279,7 @@ cdef inline void compute_velocities(engine_t* e) noexcept nogil:
         if e.uneven[b]:
             copy3(e.v + 6 * b + 3, spin)
             advance_rotation(p, spin, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-        rotation_between(e.q + 4 * b, p, by)
+        compute_rotation_between(e.q + 4 * b, p, by)
         for k in range(3):
             e.dv[6 * i + k] = (e.x[3 * b + k] - e.shift[6 * i + k]) / h - e.v_free[6 * i + k]
             e.dv[6 * i + 3 + k] = by[k] / h - (0.0 if e.uneven[b] else e.v_free[6 * i + 3 + k])
@@ -285,7 +295,7 @@ cdef inline void apply_contact_restitution(engine_t* e, int32_t c) noexcept nogi
         return
     # required change of the relative normal velocity
     initial_velocity = initial_normal_velocity(e, a, b, c)
-    velocity_change = -restitution_of(e, a, b) * initial_velocity if initial_velocity < -e.setting[S_BOUNCE] else 0.0
+    velocity_change = -get_pair_restitution(e, a, b) * initial_velocity if initial_velocity < -e.setting[S_BOUNCE] else 0.0
     velocity_change = velocity_change - contact_normal_velocity(e, e.v_free, c) - contact_normal_velocity(e, e.dv, c)
     set_normal_impulse(e, c, e.impulse[row] + velocity_change / e.d[row])
 
@@ -307,8 +317,8 @@ cdef inline void apply_sliding_friction(engine_t* e, int32_t c) noexcept nogil:
         return
     # relative tangential velocity and its direction
     cross(e.normal + 3 * c, t1, t2)
-    s = displacement(e, c, e.v_free, t1, angular) + displacement(e, c, e.dv, t1, angular)
-    t = displacement(e, c, e.v_free, t2, angular) + displacement(e, c, e.dv, t2, angular)
+    s = contact_displacement_along(e, c, e.v_free, t1, angular) + contact_displacement_along(e, c, e.dv, t1, angular)
+    t = contact_displacement_along(e, c, e.v_free, t2, angular) + contact_displacement_along(e, c, e.dv, t2, angular)
     x = sqrt(s * s + t * t)
     if x == 0.0:
         return
@@ -323,7 +333,7 @@ cdef inline void apply_sliding_friction(engine_t* e, int32_t c) noexcept nogil:
     apply_contact_impulse(e, e.dv, c, p)
 
 
-cdef inline void correct_all(engine_t* e) noexcept nogil:
+cdef inline void run_xpbd_substep(engine_t* e) noexcept nogil:
     """Run stages 1 to 4 on the prepared rows in the order of e.order; motors act on velocities, after stage 3."""
     cdef int32_t i, _sweep, row, kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS]
     cdef double x, h = e.setting[S_H]
@@ -333,19 +343,19 @@ cdef inline void correct_all(engine_t* e) noexcept nogil:
     advance_free_flight(e)
     for _sweep in range(e.head[H_ITERATIONS]):
         for i in range(kj):
-            correct_joint(e, e.order[i])
+            correct_joint_positions(e, e.order[i])
         for i in range(kj, n):
-            correct_normal(e, e.order[i] - kj)
+            correct_penetration(e, e.order[i] - kj)
         for i in range(kj, n):
-            correct_tangents(e, e.order[i] - kj)
+            correct_tangential_displacement(e, e.order[i] - kj)
     # stage 3: velocities, joint impulses, motors
-    compute_velocities(e)
+    compute_velocities_from_poses(e)
     for i in range(kj):
         for row in range(e.ptr[i], e.ptr[i + 1]):
             e.impulse[row] = e.impulse[row] / h
         if e.joint_motor[i]:
             row = e.ptr[i + 1] - 1
-            x = e.b[row] - joint_velocity(e.jac + 12 * row, e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
+            x = e.b[row] - joint_row_velocity(e.jac + 12 * row, e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
             e.impulse[row] = clip(x / e.d[row], e.lower[row], e.upper[row])
             apply_joint_impulse(e.minv_jac + 12 * row, e.impulse[row], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
     # stage 4: restitution, then friction

@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.islands cimport join, number_components
+from lavender_ext.core.islands cimport merge_components, number_components
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
@@ -34,7 +34,7 @@ def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const in
             for i in range(k):
                 for j in range(ptr[i], ptr[i + 1]):
                     for q in range(indptr[j], indptr[j + 1]):
-                        join(&parent[0], i, block[indices[q]])
+                        merge_components(&parent[0], i, block[indices[q]])
             count = number_components(k, &parent[0], &label[0])
     return count, label_array
 

@@ -7,8 +7,8 @@ import numpy as np
 from lavender_ext.factor.symbolic import analyse as analyse_pattern
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport eliminate_rows
-from lavender_ext.core.tree cimport ldl_solve as tree_solve
+from lavender_ext.core.tree cimport eliminate_tree_rows
+from lavender_ext.core.tree cimport solve_tree_factor as solve_mass_matrix
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve, no_pivots
 from lavender_ext.factor.blocks cimport factor_blocks
@@ -122,7 +122,7 @@ cdef int32_t linear_factor(linear_t* f) noexcept nogil:
         f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
     else:
         f.factored = CHOLESKY
-        lost = eliminate_rows(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
+        lost = eliminate_tree_rows(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
         f.pivots.small, f.pivots.first_small = lost >= 0, lost
     return f.pivots.small
 
@@ -148,7 +148,7 @@ cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
     elif f.kind == BLOCKS:
         solve_supernodes(&f.blocks.factor, x, f.factored == LU)
     elif f.kind == TREE:
-        tree_solve(f.n, f.lptr, f.lidx, f.matrix, f.scale, x)
+        solve_mass_matrix(f.n, f.lptr, f.lidx, f.matrix, f.scale, x)
     elif f.factored == CHOLESKY:
         dense_cholesky_solve(f.n, f.lower, x)
     elif f.d == NULL:

@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.csr cimport scan_entries
+from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.view cimport csr_t
 
 
@@ -32,7 +32,7 @@ def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
     a.data = &data[0]
     cursor = np.empty(n, np.int32)
     with nogil:
-        asymmetry = scan_entries(&a, &d[0], n, &cursor[0], band)
+        asymmetry = measure_asymmetry_and_bandwidth(&a, &d[0], n, &cursor[0], band)
     return band[0], band[1], asymmetry
 
 

@@ -1,16 +1,17 @@
 """Functions for engine hosts without Python: solver values, and growth of the buffers.
 
 Such a host (WebAssembly, C) allocates every buffer itself. engine/arrays.pyx returns the offsets of the arrays in the order of
-`bind`: the length of an array is the distance to the next array of the same buffer.
+`bind_engine_arrays`: the length of an array is the distance to the next array of the same buffer.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID,
-                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, N_SIZES, ROWS_PER_CONTACT, S_OUT, bind,
-                                         engine_t)
+from lavender_ext.engine.arrays cimport (
+    CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+    N_SIZES, ROWS_PER_CONTACT, S_OUT, bind_engine_arrays, engine_t,
+)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -19,12 +20,12 @@ cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* i
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
-    bind(size, real, index, keys, &e, n)
+    bind_engine_arrays(size, real, index, keys, &e, n)
     for k in range(8):
         out[k] = e.setting[S_OUT + k]
 
 
-cdef inline int32_t quarter_more(int32_t need) noexcept nogil:
+cdef inline int32_t add_quarter_capacity(int32_t need) noexcept nogil:
     """Return need * 1.25 + 16, at most 2^31 - 1."""
     cdef double workspace = need * 1.25
     return 2147483647 if workspace > 2147483000.0 else <int32_t>workspace + 16
@@ -36,13 +37,13 @@ cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, in
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
-    bind(size, real, index, keys, &e, n)
+    bind_engine_arrays(size, real, index, keys, &e, n)
     for k in range(N_SIZES):
         out[k] = size[k]
     if e.head[H_NEED_PAIRS] > size[CAP_PAIR]:
-        out[CAP_PAIR] = quarter_more(e.head[H_NEED_PAIRS])
+        out[CAP_PAIR] = add_quarter_capacity(e.head[H_NEED_PAIRS])
     if e.head[H_NEED_CONTACTS] > size[CAP_CONTACT]:
-        out[CAP_CONTACT] = quarter_more(e.head[H_NEED_CONTACTS])
+        out[CAP_CONTACT] = add_quarter_capacity(e.head[H_NEED_CONTACTS])
 
 
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -52,8 +53,8 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     cdef engine_t a, b
     cdef int64_t used[3]
     cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
-    bind(size, real, index, keys, &a, used)
-    bind(to_size, to_real, to_index, to_keys, &b, used)
+    bind_engine_arrays(size, real, index, keys, &a, used)
+    bind_engine_arrays(to_size, to_real, to_index, to_keys, &b, used)
     # Consecutive arrays of sizes that do not depend on the capacities are copied together.
     memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
     memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
@@ -76,7 +77,7 @@ def grow_workspace(const int32_t[::1] size, double[::1] real, int32_t[::1] index
     return np.asarray(out)
 
 
-def move(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys,
+def move_engine_state(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys,
          const int32_t[::1] to_size, double[::1] to_real, int32_t[::1] to_index, uint64_t[::1] to_keys):
     """Copy the state that is carried between substeps to zero-initialised buffers of at least the same sizes."""
     lav_engine_move(&size[0], &real[0], &index[0], &keys[0], &to_size[0], &to_real[0], &to_index[0], &to_keys[0])

@@ -11,10 +11,12 @@ from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, freeze, ints, ndarray, array_data
+from lavender_ext.core.arrays cimport (
+    DOUBLE, INT, as_double_pointer, make_read_only, as_int_pointer, ndarray, get_checked_data_pointer,
+)
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
-from lavender_ext.core.validate cimport is_number, is_valid_magnitude, max_abs
-from lavender_ext.core.block_types cimport ROW, blocks_t, contact_kind, write_contact_bounds
+from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
+from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
 from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
@@ -86,7 +88,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                       | (<uint64_t>((geom[2 * of + 1] + 1) & 0xFFFFF) << 20) | (<uint64_t>(nth & 0xFFFF) << 4))
             lower[i] = 0.0
             if code == 5:
-                kind[k] = contact_kind(False, False, False, 0)
+                kind[k] = choose_contact_kind(False, False, False, 0)
             elif not 1 < dim[of] <= MAX_EQUALITY_ROWS:
                 return -1 - i
             elif code == 6:
@@ -104,7 +106,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                 size = dim[of]
                 if i + size > m:
                     return -1 - i
-                kind[k] = contact_kind(False, False, False, size - 1)
+                kind[k] = choose_contact_kind(False, False, False, size - 1)
                 mu[k] = friction[5 * of]
                 for j in range(1, size):
                     lower[i + j] = -inf
@@ -117,7 +119,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def blocks(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double dt):
+def make_blocks_of_rows(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double dt):
     """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
 
     blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
@@ -125,12 +127,12 @@ def blocks(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double
     cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
     cdef int32_t limits[CODES]
     cdef Py_ssize_t step[3]
-    cdef const int32_t* of = ints(type_, m)
-    cdef const int32_t* which = ints(id_, m)
-    cdef const double* losses = doubles(loss, m)
-    cdef const char* dims = array_data(dim, c, 1, INT, &step[0])
-    cdef const char* pair = array_data(geom, c, 2, INT, &step[1])
-    cdef const char* rub = array_data(friction, c, 5, DOUBLE, &step[2])
+    cdef const int32_t* of = as_int_pointer(type_, m)
+    cdef const int32_t* which = as_int_pointer(id_, m)
+    cdef const double* losses = as_double_pointer(loss, m)
+    cdef const char* dims = get_checked_data_pointer(dim, c, 1, INT, &step[0])
+    cdef const char* pair = get_checked_data_pointer(geom, c, 2, INT, &step[1])
+    cdef const char* rub = get_checked_data_pointer(friction, c, 5, DOUBLE, &step[2])
     cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
     cdef blocks_t* p = &made.at
     cdef int32_t* held = <int32_t*>p.kind + m
@@ -146,23 +148,23 @@ def blocks(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double
         memcpy(&held[2 * m + i], dims + i * step[0], sizeof(int32_t))
         memcpy(&held[2 * m + c + 2 * i], pair + i * step[1], 2 * sizeof(int32_t))
         memcpy(&x[5 * i], rub + i * step[2], 5 * sizeof(double))
-    k = lav_export_blocks(m, held, held + m, ints(codes, CODES), limits, held + 2 * m, x, held + 2 * m + c, losses, dt,
+    k = lav_export_blocks(m, held, held + m, as_int_pointer(codes, CODES), limits, held + 2 * m, x, held + 2 * m + c, losses, dt,
                           <int32_t*>p.ptr, <int32_t*>p.kind, <double*>p.lower, <double*>p.upper, <double*>p.mu, scale,
                           <uint64_t*>(<ndarray>keys).data)
     if k < 0:
         return -1 - k
     p.n_blocks = k
-    fits = made.check()
+    fits = made.validate()
     write_contact_bounds(&made.at)
-    return made if fits else None, made.numbers[5 * m:6 * m], freeze(keys if k == m else keys[:k])
+    return made if fits else None, made.numbers[5 * m:6 * m], make_read_only(keys if k == m else keys[:k])
 
 
-def rows_of_dense(values, int32_t m, int32_t n, scale):
+def scale_dense_rows(values, int32_t m, int32_t n, scale):
     """Return (indptr, indices, data) of J with scaled rows, from at least m n values, row by row."""
     cdef int32_t i, j, at = 0
     cdef double x
-    cdef const double* value = doubles(values, values.size)
-    cdef const double* factor = doubles(scale, m)
+    cdef const double* value = as_double_pointer(values, values.size)
+    cdef const double* factor = as_double_pointer(scale, m)
     cdef int32_t* indptr
     cdef int32_t* indices
     cdef double* data
@@ -170,7 +172,7 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
         for j in range(n):
             at += value[i * n + j] * factor[i] != 0.0
     indptr_, indices_, data_ = new(m + 1, I4), new(at, I4), new(at)
-    indptr, indices, data = ints(indptr_, m + 1), ints(indices_, at), doubles(data_, at)
+    indptr, indices, data = as_int_pointer(indptr_, m + 1), as_int_pointer(indices_, at), as_double_pointer(data_, at)
     at = indptr[0] = 0
     for i in range(m):
         for j in range(n):
@@ -183,7 +185,7 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
     return indptr_, indices_, data_
 
 
-def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
+def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
     """Return (indptr, indices, data) of J with scaled rows, from compressed rows of n columns that may have gaps between them.
 
     The result is None if columns do not ascend, and the number of the first row with invalid indices if there is one.
@@ -192,19 +194,19 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
     cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)
     cdef double x, factor
     cdef bint ascend = True
-    cdef const int32_t* count = ints(count_, m)
-    cdef const int32_t* first = ints(first_, m)
-    cdef const double* scales = doubles(scale, m)
-    cdef const int32_t* column = ints(columns, columns.size)
-    cdef const double* value = doubles(values, values.size)
+    cdef const int32_t* count = as_int_pointer(count_, m)
+    cdef const int32_t* first = as_int_pointer(first_, m)
+    cdef const double* scales = as_double_pointer(scale, m)
+    cdef const int32_t* column = as_int_pointer(columns, columns.size)
+    cdef const double* value = as_double_pointer(values, values.size)
     for i in range(m):
         if not 0 <= count[i] <= workspace or not 0 <= first[i] <= workspace - count[i]:
             return i
         total += count[i]
     indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
-    cdef int32_t* indptr = ints(indptr_, m + 1)
-    cdef int32_t* indices = ints(indices_, total)
-    cdef double* data = doubles(data_, total)
+    cdef int32_t* indptr = as_int_pointer(indptr_, m + 1)
+    cdef int32_t* indices = as_int_pointer(indices_, total)
+    cdef double* data = as_double_pointer(data_, total)
     indptr[0] = 0
     for i in range(m):
         factor = scales[i]
@@ -230,7 +232,7 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
     return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
 
 
-def lower(first_, count_, columns, values, x, y, double bound, tuple like):
+def lower_triangle_of_mass(first_, count_, columns, values, x, y, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     The denominator is max |y| if the ratio is then at most `bound`. Rows are given by first index and length and must be
@@ -240,8 +242,8 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
     cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
     cdef double gap = 0.0, big = 0.0
     cdef Workspace scratch
-    cdef const int32_t* first = ints(first_, n)
-    cdef const int32_t* source = ints(columns, nnz)
+    cdef const int32_t* first = as_int_pointer(first_, n)
+    cdef const int32_t* source = as_int_pointer(columns, nnz)
     cdef const int32_t* count
     cdef const int32_t* at
     cdef const int32_t* column
@@ -252,10 +254,10 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
     cdef const double* right
     if not n == len(count_) == len(x) == len(y) or nnz != len(values) or n == 0:
         return None if n or nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
-    count, v, right = ints(count_, n), doubles(x, n), doubles(y, n)
-    if not has_pattern(like, n, nnz, first, count, source):
+    count, v, right = as_int_pointer(count_, n), as_double_pointer(x, n), as_double_pointer(y, n)
+    if not has_row_pattern(like, n, nnz, first, count, source):
         like = new(n + 1, I4), np.array(columns, I4)
-        whole = ints(like[0], n + 1)
+        whole = as_int_pointer(like[0], n + 1)
         whole[0] = 0
         for i in range(n):
             if first[i] != whole[i] or not 0 < count[i] <= nnz - whole[i]:
@@ -271,24 +273,24 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
         if whole[n] != nnz:
             return None
         for made_ in like:
-            freeze(made_)
-    at, column = ints(like[0], n + 1), ints(like[1], nnz)
+            make_read_only(made_)
+    at, column = as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz)
     copy, scratch = new(nnz), allocate_workspace(n * sizeof(double))
-    out, made = doubles(copy, nnz), <double*>scratch.at
-    memcpy(out, doubles(values, nnz), nnz * sizeof(double))
-    multiply(n, at, column, out, v, False, made)
+    out, made = as_double_pointer(copy, nnz), <double*>scratch.at
+    memcpy(out, as_double_pointer(values, nnz), nnz * sizeof(double))
+    multiply_mass(n, at, column, out, v, False, made)
     for i in range(n):
-        gap = max_abs(gap, made[i] - right[i])
-        big = max_abs(big, right[i])
+        gap = update_max_abs(gap, made[i] - right[i])
+        big = update_max_abs(big, right[i])
     if not gap <= bound * big:
         big = 0.0
-        multiply(n, at, column, out, v, True, made)
+        multiply_mass(n, at, column, out, v, True, made)
         for i in range(n):
-            big = max_abs(big, made[i] + fabs(right[i]))
+            big = update_max_abs(big, made[i] + fabs(right[i]))
     return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
-cdef inline void multiply(int32_t n, const int32_t* at, const int32_t* column, const double* data, const double* x,
+cdef inline void multiply_mass(int32_t n, const int32_t* at, const int32_t* column, const double* data, const double* x,
                           bint sizes, double* y) noexcept nogil:
     """Compute y = M x from the lower triangle of M, or |M| |x| with `sizes`."""
     cdef int32_t i, q, j, end
@@ -305,14 +307,15 @@ cdef inline void multiply(int32_t n, const int32_t* at, const int32_t* column, c
         y[i] = own + (fabs(data[end]) if sizes else data[end]) * z
 
 
-cdef bint has_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
+cdef bint has_row_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
     """Return whether (indptr, indices) is the pattern given by first index, length and columns of each row."""
     cdef const int32_t* at
     cdef int32_t i
     if len(like[0]) != n + 1 or len(like[1]) != nnz:
         return False
-    at = ints(like[0], n + 1)
-    if at[n] != nnz or memcmp(at, first, n * sizeof(int32_t)) or memcmp(ints(like[1], nnz), columns, nnz * sizeof(int32_t)):
+    at = as_int_pointer(like[0], n + 1)
+    if (at[n] != nnz or memcmp(at, first, n * sizeof(int32_t))
+            or memcmp(as_int_pointer(like[1], nnz), columns, nnz * sizeof(int32_t))):
         return False
     for i in range(n):
         if at[i + 1] - at[i] != count[i]:
@@ -320,7 +323,7 @@ cdef bint has_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, 
     return True
 
 
-def motion_gap(parent, body, axis, spatial, v_):
+def compare_spatial_velocities(parent, body, axis, spatial, v_):
     """Return the largest difference of the spatial velocities c (n, 6) from the ones that v (nv) gives, and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
@@ -334,11 +337,11 @@ def motion_gap(parent, body, axis, spatial, v_):
         return -1.0, 0.0
     cdef Workspace scratch = allocate_workspace(6 * bodies * sizeof(double))
     cdef double* made = <double*>scratch.at
-    cdef const double* c = doubles(spatial, 6 * bodies)
-    cdef const double* s = doubles(axis, 6 * n)
-    cdef const double* v = doubles(v_, n)
-    cdef const int32_t* of = ints(body, n)
-    cdef const int32_t* up = ints(parent, bodies)
+    cdef const double* c = as_double_pointer(spatial, 6 * bodies)
+    cdef const double* s = as_double_pointer(axis, 6 * n)
+    cdef const double* v = as_double_pointer(v_, n)
+    cdef const int32_t* of = as_int_pointer(body, n)
+    cdef const int32_t* up = as_int_pointer(parent, bodies)
     cdef double* row
     cdef const double* before
     for i in range(bodies):
@@ -357,18 +360,18 @@ def motion_gap(parent, body, axis, spatial, v_):
         for k in range(6):
             term = s[6 * j + k] * z
             row[k] += term
-            big[k] = larger(big[k], term)
+            big[k] = max_ignoring_nan(big[k], term)
     for i in range(1, bodies):
         row = made + 6 * i
         before = c + 6 * up[i]
         for k in range(6):
             term = row[k] + before[k]
-            gap[k] = larger(gap[k], term)
-            big[k] = larger(big[k], c[6 * i + k])
+            gap[k] = max_ignoring_nan(gap[k], term)
+            big[k] = max_ignoring_nan(big[k], c[6 * i + k])
             lost[k] += 0.0 * term
     for k in range(6):
-        gap[0] = larger(gap[0], gap[k])
-        big[0] = larger(big[0], big[k])
+        gap[0] = max_ignoring_nan(gap[0], gap[k])
+        big[0] = max_ignoring_nan(big[0], big[k])
         lost[0] += lost[k] + 0.0 * made[k]
     i = 0
     while i < 6 * n and not fabs(s[i]) > 0.0:
@@ -376,9 +379,9 @@ def motion_gap(parent, body, axis, spatial, v_):
     return (gap[0] + lost[0] if i < 6 * n else 0.0), big[0] + lost[0]
 
 
-def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
+def recover_joint_velocity(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
                   const double[:, ::1] spatial, double alike):
-    """Recover v (nv) from the spatial velocities c, with the arrays of `motion_gap`; None if s does not determine it.
+    """Recover v (nv) from the spatial velocities c of `compare_spatial_velocities`; None if s does not determine it.
 
     Least squares are solved body by body with modified Gram-Schmidt. `alike` is the minimum fraction of an axis s_j that must
     be independent of the other axes of its body.
@@ -432,7 +435,8 @@ def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const doub
     return velocities
 
 
-def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_, double usual):
+def compute_problem_numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_,
+                            double usual):
     """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
@@ -447,28 +451,28 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     """
     cdef int32_t i, j, m = <int32_t>len(aref_), n = <int32_t>len(v_)
     cdef Py_ssize_t q
-    cdef const int32_t* jptr = ints(jptr_, m + 1)
-    cdef const int32_t* jidx = ints(jidx_, jptr[m])
-    cdef const double* jval = doubles(jval_, jptr[m])
-    cdef const double* scale = doubles(scale_, m)
-    cdef const double* v = doubles(v_, n)
-    cdef const double* smooth = doubles(smooth_, n)
-    cdef const double* aref = doubles(aref_, m)
-    cdef const double* r = doubles(r_, m)
-    cdef const double* inverse = doubles(inverse_, m)
-    cdef const double* force = doubles(force_, m)
-    cdef const double* vel = doubles(vel_, m)
-    cdef const double* b = doubles(b_, m)
-    cdef const double* push = doubles(push_, n)
-    cdef const double* a = doubles(a_, n)
+    cdef const int32_t* jptr = as_int_pointer(jptr_, m + 1)
+    cdef const int32_t* jidx = as_int_pointer(jidx_, jptr[m])
+    cdef const double* jval = as_double_pointer(jval_, jptr[m])
+    cdef const double* scale = as_double_pointer(scale_, m)
+    cdef const double* v = as_double_pointer(v_, n)
+    cdef const double* smooth = as_double_pointer(smooth_, n)
+    cdef const double* aref = as_double_pointer(aref_, m)
+    cdef const double* r = as_double_pointer(r_, m)
+    cdef const double* inverse = as_double_pointer(inverse_, m)
+    cdef const double* force = as_double_pointer(force_, m)
+    cdef const double* vel = as_double_pointer(vel_, m)
+    cdef const double* b = as_double_pointer(b_, m)
+    cdef const double* push = as_double_pointer(push_, n)
+    cdef const double* a = as_double_pointer(a_, n)
     cdef double c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
     rhs_, compliance_, free_ = new(m), new(m), new(n)
-    cdef double* rhs = doubles(rhs_, m)
-    cdef double* compliance = doubles(compliance_, m)
-    cdef double* free = doubles(free_, n)
+    cdef double* rhs = as_double_pointer(rhs_, m)
+    cdef double* compliance = as_double_pointer(compliance_, m)
+    cdef double* free = as_double_pointer(free_, n)
     cdef Workspace scratch = allocate_workspace(3 * n * sizeof(double))
     cdef double* force_sum = <double*>scratch.at           # J^T f, then |J|^T |f|
     cdef double* change = force_sum + 2 * n                # dt a0
@@ -476,10 +480,10 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
         change[j] = dt * smooth[j]
         force_sum[j] = force_sum[n + j] = 0.0
         free[j] = v[j] + change[j]
-        sound &= is_number(free[j])
-        top_v = max_abs(top_v, v[j])
-        top_free = max_abs(top_free, change[j])
-        stored_3 = max_abs(stored_3, push[j])
+        sound &= is_valid_number(free[j])
+        top_v = update_max_abs(top_v, v[j])
+        top_free = update_max_abs(top_free, change[j])
+        stored_3 = update_max_abs(stored_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
         size = s_v = s_free = 0.0
@@ -495,27 +499,27 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
             force_sum[n + j] += fabs(c)
         rhs[i] = dt * scale[i] * aref[i] - s_free
         compliance[i] = r[i] * scale[i] * scale[i]
-        top_b = max_abs(top_b, rhs[i])
+        top_b = update_max_abs(top_b, rhs[i])
         sound &= is_valid_magnitude(compliance[i]) and compliance[i] <= usual
-        gap_0 = max_abs(gap_0, r[i] * inverse[i] - 1.0)
+        gap_0 = update_max_abs(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
-        gap_1 = max_abs(gap_1, s_v - c)
-        big_1 = max_abs(big_1, size * top_v + fabs(c))
-        stored_1 = max_abs(stored_1, vel[i])
+        gap_1 = update_max_abs(gap_1, s_v - c)
+        big_1 = update_max_abs(big_1, size * top_v + fabs(c))
+        stored_1 = update_max_abs(stored_1, vel[i])
         c = scale[i] * dt * b[i]
-        gap_2 = max_abs(gap_2, rhs[i] + c)
-        big_2 = max_abs(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
-        stored_2 = max_abs(stored_2, b[i])
+        gap_2 = update_max_abs(gap_2, rhs[i] + c)
+        big_2 = update_max_abs(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
+        stored_2 = update_max_abs(stored_2, b[i])
     for j in range(n):
-        gap_3 = max_abs(gap_3, force_sum[j] - push[j])
-        big_3 = max_abs(big_3, force_sum[n + j] + fabs(push[j]))
-    return freeze(rhs_), freeze(compliance_), freeze(free_), sound and is_valid_magnitude(top_b), gap_0, (
+        gap_3 = update_max_abs(gap_3, force_sum[j] - push[j])
+        big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(push[j]))
+    return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_), sound and is_valid_magnitude(top_b), gap_0, (
         gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
 
 
-cdef inline double larger(double maximum, double x) noexcept nogil:
+cdef inline double max_ignoring_nan(double maximum, double x) noexcept nogil:
     """Return the larger of `maximum` and |x|, ignoring a NaN x."""
     x = fabs(x)
     return x if x > maximum else maximum

@@ -44,13 +44,13 @@ cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noex
     s.energy, s.start, s.now = s.relative + n, s.relative + 2 * n, s.relative + 3 * n
 
 
-cdef inline void note_score(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
+cdef inline void copy_score_without_islands(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
     """Write the score of a pass to `now` if the problem has no islands; otherwise the pass has already written it."""
     if p.islands == NULL:
         s.now[0], s.now[1] = relative, x.energy if x.finite else INFINITY
 
 
-cdef inline void copy_island(const blocks_t* p, int32_t island, const double* lam, double* out) noexcept nogil:
+cdef inline void copy_island_impulse(const blocks_t* p, int32_t island, const double* lam, double* out) noexcept nogil:
     """Copy the rows of an island from lam to out (m each)."""
     cdef int32_t a, i
     if p.islands == NULL:
@@ -61,7 +61,7 @@ cdef inline void copy_island(const blocks_t* p, int32_t island, const double* la
         memcpy(out + p.ptr[i], lam + p.ptr[i], (p.ptr[i + 1] - p.ptr[i]) * sizeof(double))
 
 
-cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept nogil:
+cdef inline bint is_better_in_island(const best_t* s, int32_t island, double tol) noexcept nogil:
     """Return whether (1) or (2) holds for `now`."""
     cdef double relative = s.now[2 * island]
     if s.relative[island] <= tol:
@@ -69,14 +69,14 @@ cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept
     return relative <= tol or (relative <= s.start[island] and s.now[2 * island + 1] < s.energy[island])
 
 
-cdef inline void store_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+cdef inline void store_better_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
     """Store the start lam (m), scored in `now`, in the islands in which no earlier start has a lower relative residual."""
     cdef int32_t i
     for i in range(s.n):
         if s.seen == 0 or s.now[2 * i] < s.start[i]:
             s.relative[i] = s.start[i] = s.now[2 * i]
             s.energy[i] = s.now[2 * i + 1]
-            copy_island(p, i, lam, s.impulse)
+            copy_island_impulse(p, i, lam, s.impulse)
     s.seen += 1
 
 
@@ -88,19 +88,19 @@ cdef inline bint store_better_islands(best_t* s, const blocks_t* p, const double
     cdef int32_t i
     cdef bint changed = False
     if s.seen == 0:
-        store_start(s, p, lam)
+        store_better_start(s, p, lam)
         return True
     for i in range(s.n):
-        if not is_better(s, i, tol):
+        if not is_better_in_island(s, i, tol):
             continue
         s.relative[i], s.energy[i] = s.now[2 * i], s.now[2 * i + 1]
-        copy_island(p, i, lam, s.impulse)
+        copy_island_impulse(p, i, lam, s.impulse)
         changed = True
     s.seen += 1
     return changed
 
 
-cdef inline double relative_of_best(const best_t* s) noexcept nogil:
+cdef inline double relative_residual_of_best(const best_t* s) noexcept nogil:
     """Return the relative residual of the best impulse: the largest over its islands."""
     cdef double worst = 0.0
     cdef int32_t i

@@ -11,24 +11,26 @@ v = M^-1 J^T lam, and a second loop computes J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport block_error
-from lavender_ext.core.csr cimport csr_dot, csr_dot_long
-from lavender_ext.core.generalized cimport panel_transpose_add_abs, panel_times_abs
-from lavender_ext.core.block_types cimport blocks_t, is_rows, n_tangents, n_angular_rows
+from lavender_ext.core.block cimport compute_block_error
+from lavender_ext.core.csr cimport csr_row_dot, csr_row_dot_with_abs_sum
+from lavender_ext.core.generalized cimport add_abs_panel_transpose_product, multiply_abs_whitened_panel
+from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, count_tangent_rows, count_angular_rows
 from lavender_ext.core.rows cimport cross
-from lavender_ext.core.velocity cimport add6, rows_velocity
+from lavender_ext.core.velocity cimport add6, compute_velocity_change
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 from lavender_ext.judge.score cimport score_t
-from lavender_ext.judge.slack cimport general_slack, rows_slack
-from lavender_ext.judge.tally cimport (add_block_floor, add_row_floor, begin_islands, block_at, close_island,
-                                       floor_from, floor_t, island_begin, island_end, no_floor, empty_tally, score_from,
-                                       score_rows, tally_block, tally_t)
+from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
+from lavender_ext.judge.tally cimport (
+    add_block_floor, add_row_floor, begin_island_scores, get_block_in_order, add_island_to_score, write_score_floor,
+    floor_t, index_of_island_begin, index_of_island_end, make_empty_floor, make_empty_tally, write_score_norms,
+    score_all_blocks, add_block_error, tally_t,
+)
 
 
 # -- islands --------------------------------------------------------------------------------------------
 
 
-cdef inline void join_floor(const floor_t* island, floor_t* total) noexcept nogil:
+cdef inline void raise_total_floor(const floor_t* island, floor_t* total) noexcept nogil:
     """Add the floor of an island to the floor of all rows."""
     total.energy += island.energy
     if island.fast > total.fast:
@@ -39,85 +41,85 @@ cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const doub
                                   const double* sizes, score_t* out) noexcept nogil:
     """Compute errors e, norms and floors from the slack w, island by island.
 
-    With bodies r, sizes is the result of `velocity_size`. If r is NULL, sizes (m) is an upper bound of |A| |lam|.
+    With bodies r, sizes is the result of `compute_abs_velocity`. If r is NULL, sizes (m) is an upper bound of |A| |lam|.
     """
-    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = empty_tally()
-    cdef floor_t floor, f = no_floor()
+    cdef tally_t own, s = make_empty_tally()
+    cdef floor_t floor, f = make_empty_floor()
     for island in range(n):
-        own = empty_tally()
-        floor = no_floor()
-        end = island_end(p, island)
-        for a in range(island_begin(p, island), end):
-            i = block_at(order, a)
-            block_error(p, i, lam, w, e)
-            tally_block(p, i, e, &own)
+        own = make_empty_tally()
+        floor = make_empty_floor()
+        end = index_of_island_end(p, island)
+        for a in range(index_of_island_begin(p, island), end):
+            i = get_block_in_order(order, a)
+            compute_block_error(p, i, lam, w, e)
+            add_block_error(p, i, e, &own)
             if r == NULL:
                 add_block_floor(p, i, lam, w, e, sizes + p.ptr[i], &floor)
             elif i < r.n_joints:
-                joint_floor(p, r, i, lam, w, sizes, &floor)
+                add_joint_floor(p, r, i, lam, w, sizes, &floor)
             else:
-                contact_floor(p, r, i - r.n_joints, lam, w, e, sizes, &floor)
-        close_island(p, island, w, e, &own, &floor, &s, out)
-        join_floor(&floor, &f)
-    score_from(p, e, &s, out)
-    floor_from(&f, out)
+                add_contact_floor(p, r, i - r.n_joints, lam, w, e, sizes, &floor)
+        add_island_to_score(p, island, w, e, &own, &floor, &s, out)
+        raise_total_floor(&floor, &f)
+    write_score_norms(p, e, &s, out)
+    write_score_floor(&f, out)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
 
 
-cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
+cdef inline void compute_csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
     """Compute w = A lam - b."""
     cdef int32_t i
     for i in range(p.n_rows):
-        w[i] = csr_dot(a, i, lam) - p.b[i]
+        w[i] = csr_row_dot(a, i, lam) - p.b[i]
 
 
-cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
+cdef inline void judge_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
                            floor_t* f) noexcept nogil:
     """Compute slack and error of block i; add the error to s and its rounding to f."""
     cdef int32_t j = p.ptr[i], k
     cdef double size[6]
     for k in range(j, p.ptr[i + 1]):
-        w[k] = csr_dot_long(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
-        if is_rows(p, i):                               # The block may have any number of rows.
+        w[k] = csr_row_dot_with_abs_sum(a, k, lam, size + (0 if has_independent_rows(p, i) else k - j)) - p.b[k]
+        if has_independent_rows(p, i):                               # The block may have any number of rows.
             add_row_floor(p, k, lam[k], w[k], size[0], f)
-    block_error(p, i, lam, w, e)
-    tally_block(p, i, e, s)
-    if not is_rows(p, i):
+    compute_block_error(p, i, lam, w, e)
+    add_block_error(p, i, e, s)
+    if not has_independent_rows(p, i):
         add_block_floor(p, i, lam, w, e, size, f)
 
 
-cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
+cdef inline void judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
     """Judge lam over A in compressed rows."""
     cdef int32_t island, k, end, n
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = empty_tally()
-    cdef floor_t island_floor_, f = no_floor()
+    cdef tally_t own, s = make_empty_tally()
+    cdef floor_t island_floor_, f = make_empty_floor()
     if not floor:
-        csr_slack(p, a, lam, w)
-        score_rows(p, lam, w, e, out)
+        compute_csr_slack(p, a, lam, w)
+        score_all_blocks(p, lam, w, e, out)
         return
-    n = begin_islands(p, out)
+    n = begin_island_scores(p, out)
     for island in range(n):
-        own = empty_tally()
-        island_floor_ = no_floor()
-        end = island_end(p, island)
-        for k in range(island_begin(p, island), end):
-            csr_block(p, a, block_at(order, k), lam, w, e, &own, &island_floor_)
-        close_island(p, island, w, e, &own, &island_floor_, &s, out)
-        join_floor(&island_floor_, &f)
-    score_from(p, e, &s, out)
-    floor_from(&f, out)
+        own = make_empty_tally()
+        island_floor_ = make_empty_floor()
+        end = index_of_island_end(p, island)
+        for k in range(index_of_island_begin(p, island), end):
+            judge_csr_block(p, a, get_block_in_order(order, k), lam, w, e, &own, &island_floor_)
+        add_island_to_score(p, island, w, e, &own, &island_floor_, &s, out)
+        raise_total_floor(&island_floor_, &f)
+    write_score_norms(p, e, &s, out)
+    write_score_floor(&f, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
 
 
-cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
+cdef inline void add_joint_abs_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
                                    double* size) noexcept nogil:
     """Add |J|^T |lam| of joint i to size (n, 6)."""
     cdef double x[12]
@@ -135,7 +137,7 @@ cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i
         add6(size + 6 * b, x + 6)
 
 
-cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexcept nogil:
+cdef inline double abs_cross_component(const double* x, const double* y, int32_t k) noexcept nogil:
     """Return |(x x y)_k|."""
     if k == 0:
         return fabs(x[1] * y[2] - x[2] * y[1])
@@ -144,7 +146,7 @@ cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexce
     return fabs(x[0] * y[1] - x[1] * y[0])
 
 
-cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
+cdef inline void add_one_body_abs_wrench(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
                                   int32_t n_angular, double x, double y, double z, const double* angular,
                                   double* out) noexcept nogil:
     """Add |J|^T |lam| of one contact on one body to out (6).
@@ -155,13 +157,13 @@ cdef inline void side_wrench_size(const double* n, const double* t1, const doubl
     cdef double s, l
     for k in range(3):
         s = fabs(n[k]) * x
-        l = abs_cross(arm, n, k) * x
+        l = abs_cross_component(arm, n, k) * x
         if nt > 0:
             s += fabs(t1[k]) * y
-            l += abs_cross(arm, t1, k) * y
+            l += abs_cross_component(arm, t1, k) * y
         if nt > 1:
             s += fabs(t2[k]) * z
-            l += abs_cross(arm, t2, k) * z
+            l += abs_cross_component(arm, t2, k) * z
         if n_angular & 1:
             l += fabs(n[k]) * fabs(angular[0])
         if n_angular & 2:
@@ -170,7 +172,7 @@ cdef inline void side_wrench_size(const double* n, const double* t1, const doubl
         out[3 + k] += l
 
 
-cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
+cdef inline void add_contact_abs_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                      double* size) noexcept nogil:
     """Add |J|^T |lam| of contact c to size (n, 6)."""
     cdef double t2[3]
@@ -184,12 +186,12 @@ cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int
         z = fabs(lam[2])
         cross(n, t1, t2)
     if a >= 0:
-        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
+        add_one_body_abs_wrench(n, t1, t2, r.arm_a + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
     if b >= 0:
-        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
+        add_one_body_abs_wrench(n, t1, t2, r.arm_b + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
 
 
-cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
+cdef inline void compute_abs_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
     """Compute size (n, 6) = |M^-1| |J|^T |lam|."""
     cdef int32_t i, j, c, k, nt, n_angular
     cdef double* x
@@ -198,18 +200,18 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for i in range(6 * r.n_bodies):
         size[i] = 0.0
     for i in range(r.n_joints):
-        joint_wrench_size(p, r, i, lam, size)
+        add_joint_abs_wrench(p, r, i, lam, size)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_tangents(p, i)
-        n_angular = n_angular_rows(p, i)
+        nt = count_tangent_rows(p, i)
+        n_angular = count_angular_rows(p, i)
         if n_angular or nt == 1:                            # the two common kinds below have constant sizes
-            contact_wrench_size(r, c, nt, n_angular, lam + j, size)
+            add_contact_abs_wrench(r, c, nt, n_angular, lam + j, size)
         elif nt == 2:
-            contact_wrench_size(r, c, 2, 0, lam + j, size)
+            add_contact_abs_wrench(r, c, 2, 0, lam + j, size)
         else:
-            contact_wrench_size(r, c, 0, 0, lam + j, size)
+            add_contact_abs_wrench(r, c, 0, 0, lam + j, size)
     for i in range(r.n_bodies):
         x = size + 6 * <ssize_t>i
         inv = r.inv_inertia + 9 * <ssize_t>i
@@ -220,7 +222,7 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
             x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
 
 
-cdef inline double joint_size(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
+cdef inline double joint_row_abs_velocity(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
     """Return |J| size of one joint row; two sums, for two vector lanes."""
     cdef double s = 0.0, t = 0.0
     cdef const double* x
@@ -238,17 +240,17 @@ cdef inline double joint_size(const double* jac, const double* size, int32_t a, 
     return s + t
 
 
-cdef inline double side_size(const double* axis, const double* arm, const double* size) noexcept nogil:
+cdef inline double one_body_abs_velocity(const double* axis, const double* arm, const double* size) noexcept nogil:
     """Return |axis| . linear + |arm x axis| . angular of size (6)."""
     cdef double s = 0.0, t = 0.0
     cdef int32_t k
     for k in range(3):
         s += fabs(axis[k]) * size[k]
-        t += abs_cross(arm, axis, k) * size[3 + k]
+        t += abs_cross_component(arm, axis, k) * size[3 + k]
     return s + t
 
 
-cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* size,
+cdef inline void compute_contact_abs_velocity(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* size,
                                double* out) noexcept nogil:
     """Compute |J| size of the rows of contact c."""
     cdef double t2[3]
@@ -267,11 +269,11 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t n
             continue
         arm = r.arm_b + 3 * c if side else r.arm_a + 3 * c
         x = size + 6 * body
-        out[0] += side_size(n, arm, x)
+        out[0] += one_body_abs_velocity(n, arm, x)
         if nt > 0:
-            out[1] += side_size(t1, arm, x)
+            out[1] += one_body_abs_velocity(t1, arm, x)
         if nt > 1:
-            out[2] += side_size(t2, arm, x)
+            out[2] += one_body_abs_velocity(t2, arm, x)
         if n_angular & 1:
             for k in range(3):
                 out[1 + nt] += fabs(n[k]) * x[3 + k]
@@ -281,47 +283,48 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t n
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
 
 
-cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
+cdef inline void add_joint_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
                              const double* sizes, floor_t* f) noexcept nogil:
-    """Add the rounding of the rows of joint i to f; sizes is the result of `velocity_size`."""
+    """Add the rounding of the rows of joint i to f; sizes is the result of `compute_abs_velocity`."""
     cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
     for j in range(p.ptr[i], p.ptr[i + 1]):
-        add_row_floor(p, j, lam[j], w[j], r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
+        add_row_floor(p, j, lam[j], w[j], r.compliance[j] * fabs(lam[j]) + joint_row_abs_velocity(r.jac + 12 * j, sizes, a, b), f)
 
 
-cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
+cdef inline void add_contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
                                const double* e, const double* sizes, floor_t* f) noexcept nogil:
-    """Add the rounding of the rows of contact c to f; sizes is the result of `velocity_size`."""
-    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p, i), n_angular = n_angular_rows(p, i)
+    """Add the rounding of the rows of contact c to f; sizes is the result of `compute_abs_velocity`."""
+    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef int32_t nt = count_tangent_rows(p, i), n_angular = count_angular_rows(p, i)
     cdef double size[6]
     if n_angular or nt == 1:                                # the two common kinds below have constant sizes
-        contact_sizes(r, c, nt, n_angular, sizes, size)
+        compute_contact_abs_velocity(r, c, nt, n_angular, sizes, size)
     elif nt == 2:
-        contact_sizes(r, c, 2, 0, sizes, size)
+        compute_contact_abs_velocity(r, c, 2, 0, sizes, size)
     else:
-        contact_sizes(r, c, 0, 0, sizes, size)
+        compute_contact_abs_velocity(r, c, 0, 0, sizes, size)
     for k in range(n):
         size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
     add_block_floor(p, i, lam, w, e, size, f)
 
 
-cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+cdef inline void judge_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
     """Judge lam over bodies; v (12 n) is scratch, (6 n) without a floor."""
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
-    rows_velocity(p, r, lam, v)
-    rows_slack(p, r, lam, v, w)
+    compute_velocity_change(p, r, lam, v)
+    compute_body_slack(p, r, lam, v, w)
     if not floor:
-        score_rows(p, lam, w, e, out)
+        score_all_blocks(p, lam, w, e, out)
         return
-    velocity_size(p, r, lam, sizes)
+    compute_abs_velocity(p, r, lam, sizes)
     score_with_floor(p, r, lam, w, e, sizes, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
 
 
-cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, const double* extra,
+cdef inline const double* bound_generalized_terms(const blocks_t* p, const generalized_t* g, const double* lam, const double* extra,
                                         double* x) noexcept nogil:
     """Return |Y| |Y|^T |lam| + c |lam| + extra (m), an upper bound of |A| |lam|, inside x (n + m); extra is (m) or NULL."""
     cdef int32_t i
@@ -329,9 +332,9 @@ cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* 
     for i in range(g.n):
         x[i] = 0.0
     for i in range(g.n_panels):
-        panel_transpose_add_abs(g, i, lam, x)
+        add_abs_panel_transpose_product(g, i, lam, x)
     for i in range(g.n_panels):
-        panel_times_abs(g, i, x, size)
+        multiply_abs_whitened_panel(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
     if extra != NULL:
@@ -340,17 +343,17 @@ cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* 
     return size
 
 
-cdef inline void general_errors(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
+cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
                                double* x, const double* extra, score_t* out) noexcept nogil:
-    """Compute errors e from the slack w, their norms and floors; extra as in `general_sizes`, x (n + m) is scratch."""
-    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, extra, x), out)
+    """Compute errors e from the slack w, their norms and floors; extra as in `bound_generalized_terms`, x (n + m) is scratch."""
+    score_with_floor(p, NULL, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
 
 
-cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+cdef inline void judge_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                double* x, bint floor, score_t* out) noexcept nogil:
     """Judge lam over J and M; x (n + m) is scratch, (n) without a floor."""
-    general_slack(p, g, lam, x, w)
+    compute_generalized_slack(p, g, lam, x, w)
     if floor:
-        general_errors(p, g, lam, w, e, x, NULL, out)
+        score_generalized_slack(p, g, lam, w, e, x, NULL, out)
     else:
-        score_rows(p, lam, w, e, out)
+        score_all_blocks(p, lam, w, e, out)

@@ -4,10 +4,10 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.score cimport above_floor, are_numbers, hides_residual, relative, score_t
+from lavender_ext.judge.score cimport zero_if_at_floor, all_finite_numbers, floor_hides_residual, relative_residual, score_t
 
 
-cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
+cdef inline int64_t count_judge_scratch(const view_t* v) noexcept nogil:
     """Return the number of scratch doubles of `judge_view`, and over J and M of its refinement (judge/refine.pxd)."""
     return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
 
@@ -16,9 +16,10 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
                      score_t* out) noexcept nogil
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
                       double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
-cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
+cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
+                                        double* x,
                         score_t* out) noexcept nogil
-cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
+cdef void score_given_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil
 cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
                         double* scratch, double* out) noexcept nogil
@@ -42,7 +43,7 @@ cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexc
     return moves
 
 
-cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double reference_energy,
+cdef inline double relative_residual_of_score(const score_t* s, const double* w, int32_t m, double reference_energy,
                                double reference_velocity) noexcept nogil:
     """Return the relative residual of a pass with slack w (m); inf if a number is not finite.
 
@@ -52,26 +53,27 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
     cdef double now, floor
     if s.relative >= 0.0:
         return s.relative
-    if m > 0 and not are_numbers(w, m):
+    if m > 0 and not all_finite_numbers(w, m):
         return 1.0 / 0.0
     if not s.finite:
-        return relative(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)
-    now = relative(s.energy, s.velocity, reference_energy, reference_velocity)
-    floor = relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
-    return floor if hides_residual(floor) and floor < 1.0 / 0.0 and floor > now else now
+        return relative_residual(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)
+    now = relative_residual(s.energy, s.velocity, reference_energy, reference_velocity)
+    floor = relative_residual(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
+    return floor if floor_hides_residual(floor) and floor < 1.0 / 0.0 and floor > now else now
 
 
-cdef inline double floor_of(const score_t* s, double reference_energy, double reference_velocity) noexcept nogil:
+cdef inline double relative_floor_of_score(const score_t* s, double reference_energy, double reference_velocity) noexcept nogil:
     """Return the floor of a pass as a relative residual; with islands, the floor of the island with the largest residual."""
-    return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
+    return s.floor if s.relative >= 0.0 else relative_residual(s.floor_energy, s.floor_velocity, reference_energy,
+                                                               reference_velocity)
 
 
-cdef inline double above_floor_of(const score_t* s, double now, double floor) noexcept nogil:
+cdef inline double residual_above_floor(const score_t* s, double now, double floor) noexcept nogil:
     """Return the relative residual that rounding does not explain, 0 if it explains all.
 
-    now and floor are the results of `relative_of` and `floor_of`.
+    now and floor are the results of `relative_residual_of_score` and `relative_floor_of_score`.
     """
-    return s.above_floor if s.relative >= 0.0 else above_floor(now, floor)
+    return s.above_floor if s.relative >= 0.0 else zero_if_at_floor(now, floor)
 
 
 cdef class Judged:
@@ -88,5 +90,5 @@ cdef class Judged:
     cdef readonly int island                            # island with the largest relative residual, or -1
 
 
-cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor,
+cdef Judged make_judged(Data p, object impulse, object both, const score_t* s, double relative_, double floor,
                         double float64_relative=*)

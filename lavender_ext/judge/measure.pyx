@@ -6,34 +6,36 @@ from libc.string cimport memcmp, memcpy
 import numpy as np
 
 from lavender_ext.core cimport validate
-from lavender_ext.core.arrays cimport doubles, ints
-from lavender_ext.core.generalized cimport whitened_transpose_times
-from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
+from lavender_ext.core.generalized cimport multiply_whitened_transpose
+from lavender_ext.core.islands cimport find_islands, has_no_moving_body, island_workspace_integers, list_one_island
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
-                                      count_islands, note_score, store_better_islands, store_start)
-from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
-from lavender_ext.judge.measure cimport above_floor_of, set_zero_impulse, floor_of, relative_of, scratch_of
-from lavender_ext.judge.reference cimport needs_rows, reference_of
-from lavender_ext.judge.refine cimport loss_by_factor, refine_general
-from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
-from lavender_ext.judge.score cimport are_numbers, is_at_floor, new_score, relative, score_t
-from lavender_ext.judge.slack cimport general_slack, rows_slack
-from lavender_ext.judge.tally cimport norms_of_rhs, empty_tally, score_rows, tally_block, tally_t
+                                      count_islands, copy_score_without_islands, store_better_islands, store_better_start)
+from lavender_ext.judge.forms cimport judge_csr, compute_csr_slack, score_generalized_slack, judge_generalized, judge_bodies
+from lavender_ext.judge.measure cimport (
+    residual_above_floor, set_zero_impulse, relative_floor_of_score, relative_residual_of_score, count_judge_scratch,
+)
+from lavender_ext.judge.reference cimport reference_needs_islands, compute_reference
+from lavender_ext.judge.refine cimport estimate_factor_loss, refine_generalized_slack
+from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
+from lavender_ext.judge.score cimport all_finite_numbers, is_at_floor, make_empty_score, relative_residual, score_t
+from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
+from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms, make_empty_tally, score_all_blocks, add_block_error, tally_t
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                      score_t* out) noexcept nogil:
-    """Compute slack w (m), error e (m) and their norms; scratch (`scratch_of`; half of it over bodies without a floor)."""
+    """Compute slack w (m), error e (m) and their norms; scratch (`count_judge_scratch`; half of it over bodies without a floor)."""
     if v.g != NULL:
-        general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
+        judge_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
-        rows_judge(&v.p, v.r, lam, w, e, scratch, floor, out)
+        judge_bodies(&v.p, v.r, lam, w, e, scratch, floor, out)
     else:
-        csr_judge(&v.p, v.a, lam, w, e, floor, out)
+        judge_csr(&v.p, v.a, lam, w, e, floor, out)
 
 
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
@@ -41,62 +43,63 @@ cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, 
     """Repeat the pass of `judge_view` with refinement if judge/refine.pxd (2) requires it; return whether it was repeated.
 
     w, e and out are the results of `judge_view`, relative_ is its relative residual. They are unchanged if the pass is not
-    repeated. Problems given by A or by bodies need no refinement. scratch (`scratch_of`).
+    repeated. Problems given by A or by bodies need no refinement. scratch (`count_judge_scratch`).
     """
     if v.g == NULL or v.p.n_rows == 0 or not relative_ < 1.0 / 0.0:
         return False
-    if loss_by_factor(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity,
+    if estimate_factor_loss(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity,
                       0.1 * (tol if tol > relative_ else relative_)) == 0.0:
         return False
-    refine_general(&v.p, v.g, lam, w, e, scratch, out)
+    refine_generalized_slack(&v.p, v.g, lam, w, e, scratch, out)
     return True
 
 
-cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
+cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
+                                        double* x,
                         score_t* out) noexcept nogil:
     """Compute errors e (m) from the slack w over J and M, their norms and floors; x (n + m) is scratch."""
-    general_errors(p, g, lam, w, e, x, NULL, out)
+    score_generalized_slack(p, g, lam, w, e, x, NULL, out)
 
 
-cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+cdef void score_given_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
     """Compute errors e (m) from the slack w and their norms, without floors."""
-    score_rows(p, lam, w, e, out)
+    score_all_blocks(p, lam, w, e, out)
 
 
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
-    """Compute `reference_of` of judge/reference.pxd."""
-    reference_of(p, x, w, e, out)
+    """Compute `compute_reference` of judge/reference.pxd."""
+    compute_reference(p, x, w, e, out)
 
 
 cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
                         double* scratch, double* out) noexcept nogil:
-    """Judge the zero impulse, written to x (m), and write the results of `reference_of` to out (3).
+    """Judge the zero impulse, written to x (m), and write the results of `compute_reference` to out (3).
 
-    If there are several islands, v.p receives them with their references. index (`islands_index`), islands and reference
-    (2 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
+    If there are several islands, v.p receives them with their references. index (`island_workspace_integers`), islands
+    and reference (2 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
     """
-    cdef score_t s = new_score()
+    cdef score_t s = make_empty_score()
     cdef int32_t i
     v.p.islands = NULL
     if set_zero_impulse(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
     else:
-        score_rows(&v.p, x, w, e, &s)
+        score_all_blocks(&v.p, x, w, e, &s)
     islands.reference = reference
     if find_islands(v, index, islands) > 1:
         v.p.islands = islands
-    reference_of(&v.p, x, w, e, out)
-    if needs_rows(&v.p, out):
+    compute_reference(&v.p, x, w, e, out)
+    if reference_needs_islands(&v.p, out):
         list_one_island(v.p.n_blocks, index, islands)
         v.p.islands = islands
-        reference_of(&v.p, x, w, e, out)
+        compute_reference(&v.p, x, w, e, out)
     if v.p.islands != NULL:
         for i in range(islands.n):
-            if is_immovable(v, islands.order[islands.ptr[i]]):
+            if has_no_moving_body(v, islands.order[islands.ptr[i]]):
                 reference[2 * i], reference[2 * i + 1] = out[0], out[1]
 
 
-def slack(Data p, const double[::1] lam, double[::1] w):
+def compute_slack(Data p, const double[::1] lam, double[::1] w):
     """Compute w (m,) = A lam - b [m/s]."""
     cdef double[::1] v
     if p.blocks.n_rows == 0:
@@ -104,55 +107,56 @@ def slack(Data p, const double[::1] lam, double[::1] w):
     if p.is_general:
         v = np.empty(p.general.n + 1)
         with nogil:
-            general_slack(&p.blocks, &p.general, &lam[0], &v[0], &w[0])
+            compute_generalized_slack(&p.blocks, &p.general, &lam[0], &v[0], &w[0])
     elif p.factored:
         v = np.empty(6 * p.rows.n_bodies + 1)
         with nogil:
-            rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0])
-            rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
+            compute_velocity_change(&p.blocks, &p.rows, &lam[0], &v[0])
+            compute_body_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
     else:
         with nogil:
-            csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
+            compute_csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
 
 
-def at_floor(double relative_, double floor):
+def is_residual_at_floor(double relative_, double floor):
     """Return `is_at_floor` of judge/score.pxd."""
     return is_at_floor(relative_, floor)
 
 
-def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Compute slack w and error e; return (energy [sqrt J], velocity [m/s], relative residual, `above_floor_of`).
+def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
+    """Compute slack w and error e; return (energy [sqrt J], velocity [m/s], relative residual, `residual_above_floor`).
 
     All four are inf if a slack or an error is not finite. Without a floor the last is the relative residual.
     """
-    cdef score_t s = new_score()
+    cdef score_t s = make_empty_score()
     cdef double now, above
     cdef view_t v = p.view()
     cdef double[::1] scratch
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, 0.0, 0.0
-    scratch = np.empty(scratch_of(&v) + 1)
+    scratch = np.empty(count_judge_scratch(&v) + 1)
     with nogil:
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
-    if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
+    if not s.finite or not all_finite_numbers(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, np.inf
-    now = relative_of(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
-    above = above_floor_of(&s, now, floor_of(&s, p.reference_energy, p.reference_velocity)) if floor else now
+    now = relative_residual_of_score(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
+    above = residual_above_floor(&s, now, relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)) if floor else now
     return s.energy, s.velocity, now, above
 
 
-cdef double loss_of(Data p, impulse, both) except -1.0:
+cdef double factor_loss(Data p, impulse, both) except -1.0:
     """Return the possible error of the slack in `both` due to the factor of M, as a relative residual."""
     cdef const double[::1] lam = impulse, w = both
     cdef Workspace workspace
     if p.blocks.n_rows == 0:
         return 0.0
     workspace = allocate_workspace(2 * <Py_ssize_t>p.general.n * sizeof(double))
-    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at, p.reference_energy, p.reference_velocity,
+    return estimate_factor_loss(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at, p.reference_energy,
+                                p.reference_velocity,
                           0.0)
 
 
-cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
+cdef Judged make_judged(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
     """Create the result of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
     cdef Judged judged = Judged.__new__(Judged)
     judged.data, judged.impulse, judged.both = p, impulse, both
@@ -160,7 +164,7 @@ cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative
     judged.velocity = s.velocity if s.finite else 1.0 / 0.0
     judged.floor_energy = s.floor_energy
     judged.worst, judged.island = s.worst, s.island
-    judged.relative, judged.roundoff_floor, judged.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
+    judged.relative, judged.roundoff_floor, judged.above_floor = relative_, floor, residual_above_floor(s, relative_, floor)
     judged.float64_relative = float64_relative
     judged.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
     return judged
@@ -181,33 +185,33 @@ cdef class Judged:
         cdef double* e
         cdef Workspace workspace
         cdef view_t v = p.view()
-        cdef score_t s = new_score()
+        cdef score_t s = make_empty_score()
         self.data = p
         self.impulse = impulse
         self.both = both = np.empty(2 * m + 1)
         w = &both[0]
         e = w + m
         if m > 0:
-            workspace = allocate_workspace(scratch_of(&v) * sizeof(double))
+            workspace = allocate_workspace(count_judge_scratch(&v) * sizeof(double))
             with nogil:
                 judge_view(&v, &lam[0], w, e, <double*>workspace.at, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.floor_energy = s.floor_energy
         self.worst, self.island = s.worst, s.island
-        self.roundoff_floor = floor_of(&s, p.reference_energy, p.reference_velocity)
-        self.relative = relative_of(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity)
-        self.above_floor = above_floor_of(&s, self.relative, self.roundoff_floor)
+        self.roundoff_floor = relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)
+        self.relative = relative_residual_of_score(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity)
+        self.above_floor = residual_above_floor(&s, self.relative, self.roundoff_floor)
         self.float64_relative, self.known_loss = NAN, 0.0
         if p.is_general and m > 0:
-            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>workspace.at, p.reference_energy,
+            self.known_loss = estimate_factor_loss(&p.blocks, &p.general, &lam[0], w, <double*>workspace.at, p.reference_energy,
                                              p.reference_velocity, 0.0)
 
     @property
     def loss(self):
         """Possible error due to the factor of M, as a relative residual (judge/refine.pxd (2)); 0 after refinement."""
         if self.known_loss < 0.0:
-            self.known_loss = loss_of(self.data, self.impulse, self.both)
+            self.known_loss = factor_loss(self.data, self.impulse, self.both)
         return self.known_loss
 
     def refine(self, double tol):
@@ -215,7 +219,7 @@ cdef class Judged:
         cdef Data p = self.data
         cdef int32_t m = p.blocks.n_rows
         cdef view_t v = p.view()
-        cdef score_t s = new_score()
+        cdef score_t s = make_empty_score()
         cdef const double[::1] lam
         cdef const double[::1] first
         cdef double[::1] both
@@ -223,16 +227,16 @@ cdef class Judged:
         if not (self.relative < 1.0 / 0.0 and self.loss > 0.1 * max(tol, self.relative)):
             return self
         lam, first = self.impulse, self.both
-        workspace = allocate_workspace((2 * m + scratch_of(&v)) * sizeof(double))
+        workspace = allocate_workspace((2 * m + count_judge_scratch(&v)) * sizeof(double))
         memcpy(workspace.at, &first[0], m * sizeof(double))
         with nogil:
-            refine_general(&p.blocks, &p.general, &lam[0], <double*>workspace.at, <double*>workspace.at + m,
+            refine_generalized_slack(&p.blocks, &p.general, &lam[0], <double*>workspace.at, <double*>workspace.at + m,
                            <double*>workspace.at + 2 * m, &s)
         results = both = np.empty(2 * m + 1)
         memcpy(&both[0], workspace.at, 2 * m * sizeof(double))
-        return judged_from(p, self.impulse, results, &s,
-                           relative_of(&s, &both[0], m, p.reference_energy, p.reference_velocity),
-                           floor_of(&s, p.reference_energy, p.reference_velocity), self.relative)
+        return make_judged(p, self.impulse, results, &s,
+                           relative_residual_of_score(&s, &both[0], m, p.reference_energy, p.reference_velocity),
+                           relative_floor_of_score(&s, p.reference_energy, p.reference_velocity), self.relative)
 
     @property
     def slack(self):
@@ -245,9 +249,9 @@ cdef class Judged:
         return self.both[self.data.blocks.n_rows:2 * self.data.blocks.n_rows]
 
 
-def compare(double energy, double velocity, double reference_energy, double reference_velocity):
+def make_relative_score(double energy, double velocity, double reference_energy, double reference_velocity):
     """Return the relative residual: the larger ratio of an error to its reference; inf if a number is not finite."""
-    return relative(energy, velocity, reference_energy, reference_velocity)
+    return relative_residual(energy, velocity, reference_energy, reference_velocity)
 
 
 def all_finite(const double[::1] x):
@@ -255,49 +259,49 @@ def all_finite(const double[::1] x):
     return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
 
 
-def rhs_norms(Data p):
+def compute_rhs_norms(Data p):
     """Return b in the judge's two norms [sqrt J, m/s]."""
     cdef double energy, velocity
     with nogil:
-        norms_of_rhs(&p.blocks, &energy, &velocity)
+        rhs_energy_and_velocity_norms(&p.blocks, &energy, &velocity)
     return energy, velocity
 
 
-def same_bits(const double[::1] x, const double[::1] y):
+def are_bit_identical(const double[::1] x, const double[::1] y):
     """Return whether two arrays are bit-identical."""
     cdef Py_ssize_t n = x.shape[0]
     return y.shape[0] == n and (n == 0 or memcmp(&x[0], &y[0], n * sizeof(double)) == 0)
 
 
-def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
+def score_slack_array(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     """Compute the error e of lam with the given slack w; return (energy, velocity, worst row, whether all are finite)."""
-    cdef score_t s = new_score()
+    cdef score_t s = make_empty_score()
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, True
     with nogil:
-        score_rows(&p.blocks, &lam[0], &w[0], &e[0], &s)
+        score_all_blocks(&p.blocks, &lam[0], &w[0], &e[0], &s)
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
-def begin(Data p):
+def store_zero_impulse_residual(Data p):
     """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only."""
     cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks
     cdef view_t v = p.view()
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
-    cdef Workspace workspace = allocate_workspace((2 * m + 2 * k + scratch_of(&v)) * sizeof(double))
-    cdef Workspace marks = allocate_workspace(islands_index(&v) * sizeof(int32_t))
+    cdef Workspace workspace = allocate_workspace((2 * m + 2 * k + count_judge_scratch(&v)) * sizeof(double))
+    cdef Workspace marks = allocate_workspace(island_workspace_integers(&v) * sizeof(int32_t))
     cdef double* w = <double*>workspace.at
     start = np.zeros(m)
     x = start
     judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
     start.setflags(write=False)
-    p.keep_reference(v.p.islands, out)
+    p.store_reference(v.p.islands, out)
     return start
 
 
-def by_island(Data p, const double[::1] lam):
+def residuals_by_island(Data p, const double[::1] lam):
     """Return the islands of the blocks (k,) and a table (n, 5) of an impulse (m,) [N s], with one row per island.
 
     Columns: relative residual, E [sqrt J], V [m/s] (worst row), E0 [sqrt J], V0 [m/s]; the last two -1 if no row acts.
@@ -306,9 +310,9 @@ def by_island(Data p, const double[::1] lam):
     cdef view_t v = p.view()
     cdef const islands_t* s = p.blocks.islands
     cdef int32_t i, a, n = s.n if s != NULL else 1
-    cdef score_t score = new_score()
+    cdef score_t score = make_empty_score()
     cdef tally_t t
-    cdef double[::1] w = np.empty(2 * m + 2 * n + scratch_of(&v) + 1)
+    cdef double[::1] w = np.empty(2 * m + 2 * n + count_judge_scratch(&v) + 1)
     label_, table_ = np.zeros(p.blocks.n_blocks, np.int32), np.zeros((n, 5))
     cdef int32_t[::1] label = label_
     cdef double[:, ::1] table = table_
@@ -317,52 +321,52 @@ def by_island(Data p, const double[::1] lam):
     score.by_island = &w[2 * m]
     judge_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], False, &score)
     if s == NULL:
-        table[0, 0] = relative_of(&score, &w[0], m, p.reference_energy, p.reference_velocity)
+        table[0, 0] = relative_residual_of_score(&score, &w[0], m, p.reference_energy, p.reference_velocity)
         table[0, 1], table[0, 2] = score.energy, score.velocity
         table[0, 3], table[0, 4] = p.reference_energy, p.reference_velocity
         return label_, table_
     for i in range(p.blocks.n_blocks):
         label[i] = s.label[i]
     for i in range(n):
-        t = empty_tally()
+        t = make_empty_tally()
         for a in range(s.ptr[i], s.ptr[i + 1]):
-            tally_block(&p.blocks, s.order[a], &w[m], &t)
+            add_block_error(&p.blocks, s.order[a], &w[m], &t)
         table[i, 0], table[i, 1] = score.by_island[2 * i], score.by_island[2 * i + 1]
         table[i, 2] = sqrt(t.fast) if t.fast > 0.0 else 0.0
         table[i, 3], table[i, 4] = s.reference[2 * i], s.reference[2 * i + 1]
     return label_, table_
 
 
-def best_of_islands(Data p, list starts, list impulses, double tol):
+def combine_best_islands(Data p, list starts, list impulses, double tol):
     """Combine the best island impulses of starts and impulses (m,), compared by judge/best.pxd, in a new array."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.view()
     cdef best_t best
     cdef score_t s
     cdef int64_t workspace = best_workspace_size(m, count_islands(&p.blocks))
-    cdef double[::1] x = np.empty(workspace + 2 * m + scratch_of(&v) + 1)
+    cdef double[::1] x = np.empty(workspace + 2 * m + count_judge_scratch(&v) + 1)
     cdef double* w = &x[workspace]
     cdef double now
     cdef const double* lam
     bind_best(&best, &p.blocks, &x[0])
     for impulse in [*starts, *impulses] if m else []:
-        lam = doubles(impulse, m)
-        s = new_score()
+        lam = as_double_pointer(impulse, m)
+        s = make_empty_score()
         s.by_island = best.now
         judge_view(&v, lam, w, w + m, w + 2 * m, False, &s)
-        now = relative_of(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
-        note_score(&best, &p.blocks, &s, now)
+        now = relative_residual_of_score(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
+        copy_score_without_islands(&best, &p.blocks, &s, now)
         if best.seen < len(starts):
-            store_start(&best, &p.blocks, lam)
+            store_better_start(&best, &p.blocks, lam)
         else:
             store_better_islands(&best, &p.blocks, lam, tol)
     return np.array(x[:m])
 
 
-def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
+def write_velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
     """Write M^-1 J^T lam (n, 6) of a factored problem, or Y^T lam (nv) over J and M, to v."""
     if p.is_general and p.blocks.n_rows > 0:
-        whitened_transpose_times(&p.general, &lam[0], &v[0, 0])
+        multiply_whitened_transpose(&p.general, &lam[0], &v[0, 0])
         return
     if not p.factored or p.rows.n_bodies == 0:
         return
@@ -370,10 +374,10 @@ def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
         v[:, :] = 0.0
         return
     with nogil:
-        rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0, 0])
+        compute_velocity_change(&p.blocks, &p.rows, &lam[0], &v[0, 0])
 
 
-def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] lam):
+def squared_float32_rounding(Data p, mass, const double[::1] free, const double[::1] lam):
     """Return the squared changes of w (3, m) [m2/s2] by rounding to float32: (1), (4), (5) of judge/rounding.pxd.
 
     mass is (indptr, indices, data) of the lower triangle of M, free (n,) is v*, both in the order of the factor.
@@ -391,26 +395,26 @@ def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] l
         at.idx, at.val, v = &idx[0], &val[0], &free[0]
     if m:
         with nogil:
-            squares32(&p.blocks, &p.general, &at, v, &lam[0], &x[0, 0], &x[1, 0], &x[2, 0], &work[0])
+            compute_squared_float32_rounding(&p.blocks, &p.general, &at, v, &lam[0], &x[0, 0], &x[1, 0], &x[2, 0], &work[0])
     return out
 
 
-def size_of_square(Data p, const double[::1] square):
+def relative_size_by_island(Data p, const double[::1] square):
     """Return the size of a change of w relative to the zero impulse in each island, from its squares (m) [m2/s2]."""
     cdef const double* x = &square[0] if square.shape[0] else NULL
     cdef const islands_t* s = p.blocks.islands
     cdef int32_t i
     if s == NULL:
-        return [relative_size(&p.blocks, -1, x, p.reference_energy, p.reference_velocity)]
-    return [relative_size(&p.blocks, i, x, s.reference[2 * i], s.reference[2 * i + 1]) for i in range(s.n)]
+        return [relative_size_of_change(&p.blocks, -1, x, p.reference_energy, p.reference_velocity)]
+    return [relative_size_of_change(&p.blocks, i, x, s.reference[2 * i], s.reference[2 * i + 1]) for i in range(s.n)]
 
 
-cdef inline double max_nan(double s, double x) noexcept nogil:
+cdef inline double max_or_nan(double s, double x) noexcept nogil:
     """Return the larger of s and x; NaN if either is NaN."""
     return s if x <= s or s != s else x
 
 
-cdef inline double ratio(double x, double scale) noexcept nogil:
+cdef inline double ratio_or_inf(double x, double scale) noexcept nogil:
     """Return x / scale; if scale is 0, inf for positive x, otherwise x."""
     return x / scale if scale > 0.0 else 1.0 / 0.0 if x > 0.0 else x
 
@@ -426,7 +430,7 @@ cdef double TARGET_ROUNDING = 1e-12
 cdef double MIN_TERMS_FRACTION = 1e-3
 
 
-def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
+def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
                       sizes_without_rows, double least_force):
     """Compute the residuals of a quadratic program, and each relative to its own terms.
 
@@ -455,18 +459,18 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     r_p, r_d, gap, the three relative ones, and the largest of these
     """
     cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
-    cdef const double* x = doubles(x_, n)
-    cdef const double* q = doubles(q_, n)
-    cdef const double* px = doubles(px_, n)
-    cdef const double* force = doubles(force_, n)
-    cdef const double* jx = doubles(jx_, m)
-    cdef const double* target = doubles(target_, m)
-    cdef const double* lam = doubles(lam_, m)
-    cdef const double* ordered = doubles(ordered_, n)
+    cdef const double* x = as_double_pointer(x_, n)
+    cdef const double* q = as_double_pointer(q_, n)
+    cdef const double* px = as_double_pointer(px_, n)
+    cdef const double* force = as_double_pointer(force_, n)
+    cdef const double* jx = as_double_pointer(jx_, m)
+    cdef const double* target = as_double_pointer(target_, m)
+    cdef const double* lam = as_double_pointer(lam_, m)
+    cdef const double* ordered = as_double_pointer(ordered_, n)
     cdef const double* unbounded = NULL
-    cdef const int32_t* ptr = ints(jac[0], m + 1)
-    cdef const int32_t* column = ints(jac[1], len(jac[1]))
-    cdef const double* value = doubles(jac[2], len(jac[2]))
+    cdef const int32_t* ptr = as_int_pointer(jac[0], m + 1)
+    cdef const int32_t* column = as_int_pointer(jac[1], len(jac[1]))
+    cdef const double* value = as_double_pointer(jac[2], len(jac[2]))
     cdef Workspace workspace = allocate_workspace((n + 2 * m) * sizeof(double))
     cdef double* size = <double*>workspace.at
     cdef double* terms = size + n
@@ -476,22 +480,22 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     cdef double uncancelled = 0.0, rows = 0.0, violation, own, scale, largest, floor
     cdef bint homogeneous = True
     for j in range(n):
-        force_error = max_nan(force_error, fabs(px[j] + q[j] - force[j]))
+        force_error = max_or_nan(force_error, fabs(px[j] + q[j] - force[j]))
         curvature += x[j] * px[j]
         linear += q[j] * x[j]
         uncancelled += x[j] * (px[j] + q[j] - force[j])
-        own = max_nan(max_nan(fabs(px[j]), fabs(q[j])), fabs(force[j]))
-        own = max_nan(own, least_force)
-        forces = max_nan(forces, own)
+        own = max_or_nan(max_or_nan(fabs(px[j]), fabs(q[j])), fabs(force[j]))
+        own = max_or_nan(own, least_force)
+        forces = max_or_nan(forces, own)
         sums += fabs(x[j]) * own
         size[j] = 0.0
-        far = max_nan(far, fabs(x[j]))
+        far = max_or_nan(far, fabs(x[j]))
     gap = curvature + linear
     uncancelled, rows = fabs(uncancelled), far
     for i in range(m):
         own = fabs(target[i])
         for k in range(ptr[i], ptr[i + 1]):
-            own = max_nan(own, fabs(value[k] * ordered[column[k]]))
+            own = max_or_nan(own, fabs(value[k] * ordered[column[k]]))
         terms[i] = own
         violation = target[i] - jx[i]
         acts[i] = i < free or violation > 0.0 or (lam[i] > 0.0 and -violation <= 0.5 * own)
@@ -500,40 +504,40 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         if acts[i] == 0.0:
             continue
         homogeneous = homogeneous and target[i] == 0.0
-        rows = max_nan(rows, max_nan(fabs(jx[i]), fabs(target[i])))
+        rows = max_or_nan(rows, max_or_nan(fabs(jx[i]), fabs(target[i])))
         for k in range(ptr[i], ptr[i + 1]):
             if value[k] != 0.0:
-                size[column[k]] = max_nan(size[column[k]], own / fabs(value[k]))
+                size[column[k]] = max_or_nan(size[column[k]], own / fabs(value[k]))
     floor = MIN_VARIABLE_FRACTION * far
     if homogeneous:
         sizes_array = sizes_without_rows()
-        unbounded = doubles(sizes_array, n)
+        unbounded = as_double_pointer(sizes_array, n)
     for j in range(n):
         if homogeneous:
-            size[j] = max_nan(size[j], unbounded[j])
-        size[j] = max_nan(size[j], floor)
+            size[j] = max_or_nan(size[j], unbounded[j])
+        size[j] = max_or_nan(size[j], floor)
     for i in range(m):
         violation = target[i] - jx[i]
         violation = fabs(violation) if i < free else violation
         largest = scale = 0.0
         for k in range(ptr[i], ptr[i + 1]):
-            largest = max_nan(largest, fabs(value[k]))
-            scale = max_nan(scale, fabs(value[k]) * size[column[k]])
+            largest = max_or_nan(largest, fabs(value[k]))
+            scale = max_or_nan(scale, fabs(value[k]) * size[column[k]])
         if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
             scale *= EQUATION_SCALE_FACTOR
-        scale = max_nan(terms[i], scale)
+        scale = max_or_nan(terms[i], scale)
         if not homogeneous:
             scale = min(scale, rows)
-        primal = max_nan(primal, violation)
-        row_error = max_nan(row_error, ratio(violation, scale))
+        primal = max_or_nan(primal, violation)
+        row_error = max_or_nan(row_error, ratio_or_inf(violation, scale))
         if acts[i] != 0.0:
             sums += fabs(lam[i]) * scale
         if i >= free:
-            dual = max_nan(dual, -lam[i])
-            negative = max_nan(negative, -lam[i] * largest)
-    dual = max_nan(dual, force_error)
-    scale = max_nan(fabs(0.5 * curvature + linear), MIN_TERMS_FRACTION * sums)
+            dual = max_or_nan(dual, -lam[i])
+            negative = max_or_nan(negative, -lam[i] * largest)
+    dual = max_or_nan(dual, force_error)
+    scale = max_or_nan(fabs(0.5 * curvature + linear), MIN_TERMS_FRACTION * sums)
     gap = fabs(gap)
-    force_error = ratio(max_nan(force_error, negative), forces)
-    scale = ratio(uncancelled, scale)
-    return primal, dual, gap, row_error, force_error, scale, max_nan(max_nan(row_error, force_error), scale)
+    force_error = ratio_or_inf(max_or_nan(force_error, negative), forces)
+    scale = ratio_or_inf(uncancelled, scale)
+    return primal, dual, gap, row_error, force_error, scale, max_or_nan(max_or_nan(row_error, force_error), scale)

@@ -16,7 +16,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.block cimport norm2
-from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, get_friction_components, friction_components_t
 
 
 cdef enum:
@@ -34,7 +34,7 @@ cdef struct progress_t:
     double* before              # (m) N s, impulse of the check before
 
 
-cdef inline void open_progress(progress_t* s, double* workspace, int32_t m) noexcept nogil:
+cdef inline void begin_progress(progress_t* s, double* workspace, int32_t m) noexcept nogil:
     """Initialise s before the first check; workspace (2 m)."""
     s.n = 0
     s.last_at = s.before_at = -1
@@ -42,14 +42,14 @@ cdef inline void open_progress(progress_t* s, double* workspace, int32_t m) noex
     s.before = workspace + m
 
 
-cdef inline void see(progress_t* s, int32_t at, double r) noexcept nogil:
+cdef inline void record_residual(progress_t* s, int32_t at, double r) noexcept nogil:
     """Store the residual r of a check after `at` sweeps."""
     s.at[s.n % N_STORED_CHECKS] = at
     s.r[s.n % N_STORED_CHECKS] = r
     s.n += 1
 
 
-cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
+cdef inline void record_impulse(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
     """Store the impulse lam (m) of a check after `at` sweeps."""
     cdef double* x = s.before
     s.before = s.last
@@ -59,7 +59,7 @@ cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) n
     memcpy(x, lam, m * sizeof(double))
 
 
-cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noexcept nogil:
+cdef inline int32_t residual_envelope_slope(const progress_t* s, double* fall, double* low) noexcept nogil:
     """Return k of (1) at the last check, with f in `fall` and the later minimum in `low`; 0 if there are too few checks."""
     cdef int32_t i = s.n - 1, first = s.n - N_STORED_CHECKS if s.n > N_STORED_CHECKS else 0, t, at, late_at = 0, early_at = 0
     cdef double late = 1.0 / 0.0, early = 1.0 / 0.0, r
@@ -80,10 +80,10 @@ cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noe
     return late_at - early_at if late < 1.0 / 0.0 and early < 1.0 / 0.0 else 0
 
 
-cdef inline bint residual_moves(const progress_t* s, double target, double max_sweeps) noexcept nogil:
+cdef inline bint residual_reaches_target(const progress_t* s, double target, double max_sweeps) noexcept nogil:
     """Return whether the envelope reaches `target` within `max_sweeps` sweeps (1), or has risen sharply."""
     cdef double fall, r, n = 0.0
-    cdef int32_t k = envelope(s, &fall, &r)
+    cdef int32_t k = residual_envelope_slope(s, &fall, &r)
     if k == 0 or not fall < 1.0:
         return k > 0 and fall > 1.5
     while r > target and n <= max_sweeps:
@@ -92,7 +92,7 @@ cdef inline bint residual_moves(const progress_t* s, double target, double max_s
     return n <= max_sweeps
 
 
-cdef inline double speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
+cdef inline double row_speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
     """Return the slower of the last two speeds of row i [N s per sweep], 0 if its direction changed."""
     cdef double x = (lam[i] - s.last[i]) / (now - s.last_at), y = (s.last[i] - s.before[i]) / (s.last_at - s.before_at)
     if not x * y > 0.0:
@@ -100,24 +100,25 @@ cdef inline double speed(const progress_t* s, const double* lam, int32_t now, in
     return x if fabs(x) < fabs(y) else y
 
 
-cdef inline bint meets(double gap, double closing_speed, double max_sweeps) noexcept nogil:
+cdef inline bint closes_gap_within(double gap, double closing_speed, double max_sweeps) noexcept nogil:
     """Return whether a positive gap [N s] closes within `max_sweeps` sweeps."""
     return gap > 0.0 and closing_speed > 0.0 and gap <= max_sweeps * closing_speed
 
 
-cdef inline bint meets_disk(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end, double slope,
+cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end,
+                                        double slope,
                             double normal, double rate, double max_sweeps) noexcept nogil:
     """Return whether rows [first, end), with norm at most slope times the normal, reach that bound in time."""
     cdef double size = 0.0, along = 0.0, v = 0.0
     cdef int32_t k
     for k in range(first, end):
         size = norm2(size, lam[k])
-        along += lam[k] * speed(s, lam, now, k)
-        v = norm2(v, speed(s, lam, now, k))
-    return meets(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps)
+        along += lam[k] * row_speed(s, lam, now, k)
+        v = norm2(v, row_speed(s, lam, now, k))
+    return closes_gap_within(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps)
 
 
-cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
+cdef inline bint any_row_reaches_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
                              double max_sweeps) noexcept nogil:
     """Return whether (2) holds for a row within `max_sweeps` sweeps."""
     cdef int32_t i, j, k, g
@@ -127,21 +128,21 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
         return False
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        if is_rows(p, i):
+        if has_independent_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                v = speed(s, lam, now, k)
-                if meets(lam[k] - p.lower[k], -v, max_sweeps) or meets(p.upper[k] - lam[k], v, max_sweeps):
+                v = row_speed(s, lam, now, k)
+                if closes_gap_within(lam[k] - p.lower[k], -v, max_sweeps) or closes_gap_within(p.upper[k] - lam[k], v, max_sweeps):
                     return True
             continue
         if not lam[j] > 0.0:
             continue
-        rate = speed(s, lam, now, j)
-        if meets(lam[j], -rate, max_sweeps):
+        rate = row_speed(s, lam, now, j)
+        if closes_gap_within(lam[j], -rate, max_sweeps):
             return True
         get_friction_components(p, i, &q)
         for g in range(q.n):
             k = j + q.first[g]
-            if meets_disk(s, lam, now, k, k + q.size[g], q.friction_coefficient[g], lam[j], rate, max_sweeps):
+            if reaches_friction_bound(s, lam, now, k, k + q.size[g], q.friction_coefficient[g], lam[j], rate, max_sweeps):
                 return True
     return False
 
@@ -150,4 +151,4 @@ cdef inline bint has_stalled(const progress_t* s, const blocks_t* p, const doubl
                              double best) noexcept nogil:
     """Return whether neither (1) nor (2) is predicted after `now` sweeps with the impulse lam (m)."""
     cdef double max_sweeps = HORIZON_RATIO * <double>now
-    return not (residual_moves(s, 0.5 * best, max_sweeps) or meets_bound(s, p, lam, now, max_sweeps))
+    return not (residual_reaches_target(s, 0.5 * best, max_sweeps) or any_row_reaches_bound(s, p, lam, now, max_sweeps))

@@ -14,7 +14,7 @@ An island with (1) is at rest. Its references are the norms of s over the rows t
 
 If (2) is zero, no row acts: each row is compared with its own terms, a contact with its normal's terms (E0 = V0 = -1):
 
-    relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_by_rows`
+    relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_residual_by_rows`
 
 A row that does not act therefore does not change the residual of rows that do, however large its b is. Two kinds of rows
 have no scale of their own and are compared with all rows, sqrt(sum E0_i^2) and max V0_i: blocks that no impulse moves, and,
@@ -23,27 +23,28 @@ in (3), rows with b = 0 (there sqrt(d) |e| is divided by the former).
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length
-from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, is_rows, islands_t, get_friction_components,
+from lavender_ext.core.block cimport euclidean_norm
+from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, has_independent_rows, islands_t,
+                                            get_friction_components,
                                             friction_components_t)
-from lavender_ext.judge.score cimport relative
-from lavender_ext.judge.tally cimport block_at, empty_tally, relative_by_rows, tally_block, tally_t
+from lavender_ext.judge.score cimport relative_residual
+from lavender_ext.judge.tally cimport get_block_in_order, make_empty_tally, relative_residual_by_rows, add_block_error, tally_t
 
 
-cdef inline double reference_rounding() noexcept nogil:
+cdef inline double max_rounding_ratio() noexcept nogil:
     """Return 2^-48, the largest ratio of an error to the terms of its row that counts as rounding."""
     return 3.5527136788005009e-15
 
 
-cdef inline bint is_inactive_row(const blocks_t* p, int32_t k, double x, double w) noexcept nogil:
+cdef inline bint is_strictly_inactive_row(const blocks_t* p, int32_t k, double x, double w) noexcept nogil:
     """Return whether the bounded row k is strictly inactive at x with slack w."""
-    cdef double rounding = reference_rounding() * fabs(p.b[k])
+    cdef double rounding = max_rounding_ratio() * fabs(p.b[k])
     if p.lower[k] == p.upper[k]:
         return True
     return (x == p.lower[k] and w > rounding) or (x == p.upper[k] and -w > rounding)
 
 
-cdef inline bint is_inactive_contact(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
+cdef inline bint is_strictly_inactive_contact(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
     """Return whether contact i is strictly inactive at zero impulse with slack w (m)."""
     cdef int32_t g, j = p.ptr[i]
     cdef double gap = w[j], size = fabs(p.b[j])
@@ -51,21 +52,21 @@ cdef inline bint is_inactive_contact(const blocks_t* p, int32_t i, const double*
     if p.law == CONE:
         get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
-            size += q.friction_coefficient[g] * length(p.b + j + q.first[g], q.size[g])
-    return gap > reference_rounding() * size
+            gap -= q.friction_coefficient[g] * euclidean_norm(w + j + q.first[g], q.size[g])
+            size += q.friction_coefficient[g] * euclidean_norm(p.b + j + q.first[g], q.size[g])
+    return gap > max_rounding_ratio() * size
 
 
-cdef inline bint is_at_rest(const blocks_t* p, int32_t i, const double* e) noexcept nogil:
+cdef inline bint is_satisfied_at_zero(const blocks_t* p, int32_t i, const double* e) noexcept nogil:
     """Return whether (1) holds for the rows of block i."""
     cdef int32_t k
     for k in range(p.ptr[i], p.ptr[i + 1]):
-        if not p.d[k] * fabs(e[k]) <= reference_rounding() * fabs(p.b[k]):
+        if not p.d[k] * fabs(e[k]) <= max_rounding_ratio() * fabs(p.b[k]):
             return False
     return True
 
 
-cdef inline void add_terms(const blocks_t* p, int32_t k, int32_t n, double* energy, double* fast) noexcept nogil:
+cdef inline void add_row_terms(const blocks_t* p, int32_t k, int32_t n, double* energy, double* fast) noexcept nogil:
     """Add rows [k, k + n) to the sum and the maximum of (2); the maximum is over the norm of these rows."""
     cdef int32_t i
     cdef double t, both = 0.0
@@ -82,20 +83,20 @@ cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, 
     """Add the rows of block i that act to the sum and the maximum of (2)."""
     cdef int32_t k, g, j = p.ptr[i]
     cdef friction_components_t q
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
-            if not is_inactive_row(p, k, x[k], w[k]):
-                add_terms(p, k, 1, energy, fast)
+            if not is_strictly_inactive_row(p, k, x[k], w[k]):
+                add_row_terms(p, k, 1, energy, fast)
         return
-    if is_inactive_contact(p, i, w):
+    if is_strictly_inactive_contact(p, i, w):
         return
-    add_terms(p, j, 1, energy, fast)
+    add_row_terms(p, j, 1, energy, fast)
     get_row_groups(p, i, &q)
     for g in range(q.n):
-        add_terms(p, j + q.first[g], q.size[g], energy, fast)
+        add_row_terms(p, j + q.first[g], q.size[g], energy, fast)
 
 
-cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* x,
+cdef inline double compute_island_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* x,
                                  const double* w, const double* e, double* out) noexcept nogil:
     """Write E0 and V0 of blocks order[first:end] to out (2); return the relative residual of the zero impulse x.
 
@@ -104,11 +105,11 @@ cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_
     cdef int32_t a, i, k
     cdef double energy = 0.0, fast = 0.0, check = 0.0       # check: 0, or NaN once a slack is not finite
     cdef bint rest = True
-    cdef tally_t s = empty_tally()
+    cdef tally_t s = make_empty_tally()
     for a in range(first, end):
-        i = block_at(order, a)
-        rest = rest and is_at_rest(p, i, e)
-        tally_block(p, i, e, &s)
+        i = get_block_in_order(order, a)
+        rest = rest and is_satisfied_at_zero(p, i, e)
+        add_block_error(p, i, e, &s)
         for k in range(p.ptr[i], p.ptr[i + 1]):
             check += 0.0 * w[k]
     s.energy = sqrt(s.energy)
@@ -118,17 +119,17 @@ cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_
         return 1.0 / 0.0
     if not rest:
         out[0], out[1] = s.energy, s.fast
-        return relative(s.energy, s.fast, out[0], out[1])
+        return relative_residual(s.energy, s.fast, out[0], out[1])
     for a in range(first, end):
-        add_block_terms(p, block_at(order, a), x, w, &energy, &fast)
+        add_block_terms(p, get_block_in_order(order, a), x, w, &energy, &fast)
     if energy > 0.0:
         out[0], out[1] = sqrt(energy), sqrt(fast)
-        return relative(s.energy, s.fast, out[0], out[1])
+        return relative_residual(s.energy, s.fast, out[0], out[1])
     out[0] = out[1] = -1.0
-    return relative_by_rows(p, order, first, end, e, 0.0)   # 0, or bounded by (1)
+    return relative_residual_by_rows(p, order, first, end, e, 0.0)   # 0, or bounded by (1)
 
 
-cdef inline void reference_of(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
+cdef inline void compute_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
     """Write E0 [sqrt J], V0 [m/s] and the relative residual of the zero impulse x, slack w, error e (m each) to out (3).
 
     With several islands their references are set, and the first two are sqrt(sum E0_i^2) and max V0_i over the islands with
@@ -138,11 +139,11 @@ cdef inline void reference_of(blocks_t* p, const double* x, const double* w, con
     cdef int32_t i
     cdef double r, sum_ = 0.0
     if s == NULL:
-        out[2] = set_reference(p, NULL, 0, p.n_blocks, x, w, e, out)
+        out[2] = compute_island_reference(p, NULL, 0, p.n_blocks, x, w, e, out)
         return
     out[1] = out[2] = 0.0
     for i in range(s.n):
-        r = set_reference(p, s.order, s.ptr[i], s.ptr[i + 1], x, w, e, s.reference + 2 * i)
+        r = compute_island_reference(p, s.order, s.ptr[i], s.ptr[i + 1], x, w, e, s.reference + 2 * i)
         out[2] = r if r > out[2] else out[2]
         if s.reference[2 * i] > 0.0:
             sum_ += s.reference[2 * i] * s.reference[2 * i]
@@ -151,6 +152,6 @@ cdef inline void reference_of(blocks_t* p, const double* x, const double* w, con
     out[0] = s.energy = sqrt(sum_)
 
 
-cdef inline bint needs_rows(const blocks_t* p, const double* out) noexcept nogil:
+cdef inline bint reference_needs_islands(const blocks_t* p, const double* out) noexcept nogil:
     """Return whether (3) applies to a problem without an islands list, which then needs one."""
     return p.islands == NULL and out[0] < 0.0 and p.n_rows > 0

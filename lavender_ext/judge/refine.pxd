@@ -24,11 +24,11 @@ from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport bound_condition, get_condition, tree_solve
+from lavender_ext.core.generalized cimport bound_condition_by_determinant, get_condition, solve_mass_matrix
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.judge.forms cimport general_errors
-from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff
+from lavender_ext.judge.forms cimport score_generalized_slack
+from lavender_ext.judge.score cimport relative_residual, score_t, take_smallest_island_reference, unit_roundoff
 
 
 cdef enum:
@@ -38,7 +38,7 @@ cdef enum:
 # -- sums of two float64 -----------------------------------------------------------------------------
 
 
-cdef inline double upper_half(double x) noexcept nogil:
+cdef inline double truncate_to_upper_half(double x) noexcept nogil:
     """Return x truncated to its first 26 bits."""
     cdef uint64_t bits
     memcpy(&bits, &x, sizeof(bits))
@@ -47,23 +47,24 @@ cdef inline double upper_half(double x) noexcept nogil:
     return x
 
 
-cdef inline void add_product(double x, double y, double* high, double* low) noexcept nogil:
+cdef inline void add_product_double_double(double x, double y, double* high, double* low) noexcept nogil:
     """Add x y to high + low."""
-    cdef double a = upper_half(x), b = upper_half(y), c = x - a, d = y - b, product = x * y
+    cdef double a = truncate_to_upper_half(x), b = truncate_to_upper_half(y), c = x - a, d = y - b, product = x * y
     cdef double product_error = ((a * b - product) + a * d + c * b) + c * d
     cdef double total = high[0] + product, part = total - high[0]
     low[0] += ((high[0] - (total - part)) + (product - part)) + product_error
     high[0] = total
 
 
-cdef inline void add_number(double x, double* high, double* low) noexcept nogil:
+cdef inline void add_number_double_double(double x, double* high, double* low) noexcept nogil:
     """Add x to high + low."""
     cdef double total = high[0] + x, part = total - high[0]
     low[0] += (high[0] - (total - part)) + (x - part)
     high[0] = total
 
 
-cdef inline void add_force(const generalized_t* g, const double* lam, double* high, double* low) noexcept nogil:
+cdef inline void multiply_jacobian_transpose_double_double(const generalized_t* g, const double* lam, double* high,
+                                                           double* low) noexcept nogil:
     """Compute high + low (n) = J^T lam."""
     cdef int32_t i, q
     for i in range(g.n):
@@ -72,10 +73,10 @@ cdef inline void add_force(const generalized_t* g, const double* lam, double* hi
     for i in range(g.m):
         if lam[i] != 0.0:
             for q in range(g.jptr[i], g.jptr[i + 1]):
-                add_product(g.jval[q], lam[i], high + g.jidx[q], low + g.jidx[q])
+                add_product_double_double(g.jval[q], lam[i], high + g.jidx[q], low + g.jidx[q])
 
 
-cdef inline void subtract_momentum(const generalized_t* g, const double* x, const double* x_low, double* high,
+cdef inline void subtract_mass_product_double_double(const generalized_t* g, const double* x, const double* x_low, double* high,
                                    double* low) noexcept nogil:
     """Subtract M (x + x_low) from high + low (n)."""
     cdef int32_t i, j, q
@@ -84,17 +85,17 @@ cdef inline void subtract_momentum(const generalized_t* g, const double* x, cons
         for q in range(g.mptr[i], g.mptr[i + 1]):
             j = g.midx[q]
             a = -g.mval[q]
-            add_product(a, x[j], high + i, low + i)
+            add_product_double_double(a, x[j], high + i, low + i)
             low[i] += a * x_low[j]
             if j != i:
-                add_product(a, x[i], high + j, low + j)
+                add_product_double_double(a, x[i], high + j, low + j)
                 low[j] += a * x_low[i]
 
 
 # -- the pass ----------------------------------------------------------------------------------------
 
 
-cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* x,
+cdef inline double estimate_factor_loss(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* x,
                                   double reference_energy, double reference_velocity, double threshold) noexcept nogil:
     """Return the left side of (2), or 0 if it is at most `threshold`.
 
@@ -115,16 +116,16 @@ cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, con
     if g.n == 0 or energy == 0.0:                       # no impulse moves anything
         return 0.0
     energy = sqrt(fabs(energy))                         # negative only by rounding
-    smallest_reference(p, &reference_energy, &reference_velocity)
-    size = 0.1 * relative(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
+    take_smallest_island_reference(p, &reference_energy, &reference_velocity)
+    size = 0.1 * relative_residual(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
     size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
-    if g.condition == 0.0 and size * bound_condition(g) <= threshold:
+    if g.condition == 0.0 and size * bound_condition_by_determinant(g) <= threshold:
         return 0.0
     size *= get_condition(g, x)
     return size if size > threshold else 0.0
 
 
-cdef inline double refine_change(const generalized_t* g, const double* lam, double loss, double* x) noexcept nogil:
+cdef inline double refine_velocity_change(const generalized_t* g, const double* lam, double loss, double* x) noexcept nogil:
     """Compute x + x_low = M^-1 J^T lam by (3) in the first 2 n of x (6 n); return its remaining error in the norm of M.
 
     loss is n u |H^-1|.
@@ -136,26 +137,26 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
     cdef double* r = x + 4 * n
     cdef double* r_low = x + 5 * n
     cdef double norm, last, size, rate = loss if loss < 0.5 else 0.5
-    add_force(g, lam, force, force_low)
+    multiply_jacobian_transpose_double_double(g, lam, force, force_low)
     for i in range(n):
         x[i] = force[i]
         x_low[i] = 0.0
-    tree_solve(g, x)
+    solve_mass_matrix(g, x)
     norm = dot(force, x, n)
     norm = last = sqrt(fabs(norm))                    # negative only by rounding
     for _step in range(MAX_CORRECTIONS):
         memcpy(r, force, n * sizeof(double))
         memcpy(r_low, force_low, n * sizeof(double))
-        subtract_momentum(g, x, x_low, r, r_low)
+        subtract_mass_product_double_double(g, x, x_low, r, r_low)
         for i in range(n):
             r[i] += r_low[i]
             r_low[i] = r[i]
-        tree_solve(g, r_low)                            # the correction
+        solve_mass_matrix(g, r_low)                            # the correction
         size = sqrt(fabs(dot(r, r_low, n)))
         if not size < 0.5 * last:
             return 2.0 * last
         for i in range(n):
-            add_number(r_low[i], x + i, x_low + i)
+            add_number_double_double(r_low[i], x + i, x_low + i)
         if size > rate * last:
             rate = size / last
         last = size
@@ -164,21 +165,21 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
     return last
 
 
-cdef inline void refine_general(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+cdef inline void refine_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                 double* scratch, score_t* out) noexcept nogil:
     """Replace w (m) of the first pass by the refined one, with its errors e (m), norms and floor; scratch (6 n + 2 m)."""
     cdef int32_t i, q, n = g.n
     cdef double* extra = scratch
     cdef double* x = scratch + p.n_rows
-    cdef double remaining = refine_change(g, lam, n * unit_roundoff() * get_condition(g, x), x), high, low
+    cdef double remaining = refine_velocity_change(g, lam, n * unit_roundoff() * get_condition(g, x), x), high, low
     for i in range(p.n_rows):
         high = -p.b[i]
         low = 0.0
-        add_product(g.compliance[i], lam[i], &high, &low)
+        add_product_double_double(g.compliance[i], lam[i], &high, &low)
         for q in range(g.jptr[i], g.jptr[i + 1]):
-            add_product(g.jval[q], x[g.jidx[q]], &high, &low)
+            add_product_double_double(g.jval[q], x[g.jidx[q]], &high, &low)
             low += g.jval[q] * x[n + g.jidx[q]]
         high += low
         extra[i] = (fabs(high - w[i]) + sqrt(2.0 * p.d[i]) * remaining) / unit_roundoff()
         w[i] = high
-    general_errors(p, g, lam, w, e, x, extra, out)
+    score_generalized_slack(p, g, lam, w, e, x, extra, out)

@@ -10,11 +10,13 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport jac_transpose_times, jac_row, tree_solve, add_scaled_whitened_row
+from lavender_ext.core.generalized cimport (
+    multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix, add_scaled_whitened_row,
+)
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.judge.score cimport relative, score_t
-from lavender_ext.judge.tally cimport block_at
+from lavender_ext.judge.score cimport relative_residual, score_t
+from lavender_ext.judge.tally cimport get_block_in_order
 
 
 cdef struct mass_t:             # the lower triangle of M with its diagonal, columns ascending
@@ -23,7 +25,7 @@ cdef struct mass_t:             # the lower triangle of M with its diagonal, col
     const double* val
 
 
-cdef inline double square_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
+cdef inline double multiply_squared_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
     """Return (J_i)^2 x, with squared entries of row i."""
     cdef int32_t q
     cdef double s = 0.0
@@ -46,7 +48,7 @@ cdef inline void unwhiten_row(const generalized_t* g, int32_t panel, int32_t row
         z[k] = x
 
 
-cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
+cdef inline void compute_squared_float32_rounding(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
                            const double* lam, double* impulse, double* data, double* velocities,
                            double* work) noexcept nogil:
     """Compute (1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m) is scratch."""
@@ -58,8 +60,8 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
     cdef double* off = z + n
     cdef double unit = 5.9604644775390625e-08 * 5.9604644775390625e-08, s, row_square, soft, target
     cdef bint rigid = False
-    jac_transpose_times(g, lam, x)
-    tree_solve(g, x)
+    multiply_jacobian_transpose(g, lam, x)
+    solve_mass_matrix(g, x)
     for k in range(n):
         xx[k] = x[k] * x[k]
         f[k] = 0.0
@@ -76,13 +78,13 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
             if mass.idx[q] != k:
                 f[mass.idx[q]] += s * xx[k]
     for i in range(m):
-        row_square = square_row(g, i, xx)
+        row_square = multiply_squared_row(g, i, xx)
         soft = g.compliance[i] * lam[i]
         off[i] = 0.0
         if lam[i] != 0.0 and lam[i] != p.lower[i] and lam[i] != p.upper[i]:
             rigid |= g.compliance[i] == 0.0
             off[i] = (row_square + p.b[i] * p.b[i] + soft * soft) / (g.compliance[i] * g.compliance[i])
-        target = p.b[i] + jac_row(g, i, free)
+        target = p.b[i] + multiply_jacobian_row(g, i, free)
         data[i] = row_square + soft * soft + target * target
     for k in range(n):
         xx[k] = free[k] * free[k]
@@ -90,7 +92,7 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
         while g.prow[panel + 1] <= i:
             panel += 1
         unwhiten_row(g, panel, i, z)
-        data[i] += 2.0 * square_row(g, i, xx)
+        data[i] += 2.0 * multiply_squared_row(g, i, xx)
         for k in range(n):
             data[i] += z[k] * z[k] * f[k]
         data[i] *= unit
@@ -99,7 +101,7 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
         for j in range(i + 1):
             if lam[i] == 0.0 and lam[j] == 0.0:
                 continue
-            s = jac_row(g, j, z) + (g.compliance[i] if i == j else 0.0)
+            s = multiply_jacobian_row(g, j, z) + (g.compliance[i] if i == j else 0.0)
             s *= unit * s
             impulse[i] += s * (lam[j] * lam[j])
             velocities[i] += 0.0 if rigid else s * off[j]
@@ -108,7 +110,8 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
                 velocities[j] += 0.0 if rigid else s * off[i]
 
 
-cdef inline double relative_size(const blocks_t* p, int32_t island, const double* square, double e0, double v0) noexcept nogil:
+cdef inline double relative_size_of_change(const blocks_t* p, int32_t island, const double* square, double e0,
+                                           double v0) noexcept nogil:
     """Return the size of changes of w over an island relative to E0 and V0, from their squares (m); island -1 is all rows."""
     cdef int32_t a, i, k, first = 0, end = p.n_blocks
     cdef const int32_t* order = NULL
@@ -116,7 +119,7 @@ cdef inline double relative_size(const blocks_t* p, int32_t island, const double
     if island >= 0:
         order, first, end = p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1]
     for a in range(first, end):
-        i = block_at(order, a)
+        i = get_block_in_order(order, a)
         for k in range(p.ptr[i], p.ptr[i + 1]):
             energy += square[k] / p.d[k]
             v = sqrt(p.nu[k]) * sqrt(p.d[k]) * sqrt(square[k]) / p.d[k]
@@ -125,15 +128,16 @@ cdef inline double relative_size(const blocks_t* p, int32_t island, const double
             v = sqrt(square[k])
             if v > own * fabs(p.b[k]):                  # relative to the row's own terms
                 own = v / fabs(p.b[k]) if p.b[k] != 0.0 else 1.0 / 0.0
-    return own if island >= 0 and e0 < 0.0 else relative(sqrt(energy), velocity, e0, v0)
+    return own if island >= 0 and e0 < 0.0 else relative_residual(sqrt(energy), velocity, e0, v0)
 
 
-cdef inline bint rounds_in_float32(double residual, double floor) noexcept nogil:
+cdef inline bint is_float32_rounding(double residual, double floor) noexcept nogil:
     """Return whether rounding to float32 explains a relative residual: at most four times the root-mean-square floor."""
     return residual <= 4.0 * floor < 1.0 / 0.0 and residual < 1.0
 
 
-cdef inline double floor_in_float32(const blocks_t* p, const double* square, const score_t* s, double now, double e0, double v0,
+cdef inline double float32_floor_of_score(const blocks_t* p, const double* square, const score_t* s, double now, double e0,
+                                          double v0,
                                     double* above) noexcept nogil:
     """Return the float32 floor of a pass; with islands, the floor of the island with the largest residual.
 
@@ -142,14 +146,14 @@ cdef inline double floor_in_float32(const blocks_t* p, const double* square, con
     cdef int32_t i
     cdef double floor, worst = 0.0, own
     if p.islands == NULL:
-        floor = relative_size(p, -1, square, e0, v0)
-        above[0] = 0.0 if rounds_in_float32(now, floor) else now
+        floor = relative_size_of_change(p, -1, square, e0, v0)
+        above[0] = 0.0 if is_float32_rounding(now, floor) else now
         return floor
     above[0] = 0.0
     for i in range(p.islands.n):
-        floor = relative_size(p, i, square, p.islands.reference[2 * i], p.islands.reference[2 * i + 1])
+        floor = relative_size_of_change(p, i, square, p.islands.reference[2 * i], p.islands.reference[2 * i + 1])
         own = s.by_island[2 * i]
-        if not rounds_in_float32(own, floor) and own > above[0]:
+        if not is_float32_rounding(own, floor) and own > above[0]:
             above[0] = own
         if i == s.island:
             worst = floor

@@ -26,7 +26,7 @@ cdef struct score_t:
     double* by_island           # NULL, or (n, 2): receives (1) and E of each island
 
 
-cdef inline score_t new_score() noexcept nogil:
+cdef inline score_t make_empty_score() noexcept nogil:
     """Return the score of a problem without rows."""
     return score_t(0.0, 0.0, 0.0, 0.0, -1, 1, -1, -1.0, 0.0, 0.0, NULL)
 
@@ -36,7 +36,7 @@ cdef inline double unit_roundoff() noexcept nogil:
     return 1.1102230246251565e-16
 
 
-cdef inline int32_t are_numbers(const double* x, int32_t n) noexcept nogil:
+cdef inline int32_t all_finite_numbers(const double* x, int32_t n) noexcept nogil:
     """Return whether x holds neither NaN nor infinity. A bound can hide an overflowed slack, which has no meaningful sign."""
     cdef int32_t i
     cdef double s = 0.0                                 # This stays 0, or becomes NaN.
@@ -45,20 +45,21 @@ cdef inline int32_t are_numbers(const double* x, int32_t n) noexcept nogil:
     return s == 0.0
 
 
-cdef inline double ratio(double x, double reference) noexcept nogil:
+cdef inline double ratio_to_reference(double x, double reference) noexcept nogil:
     """Return x / reference: 0 if x is 0, inf if x is not finite or the reference is not positive."""
     if x == 0.0:
         return 0.0
     return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
 
 
-cdef inline double relative(double energy, double velocity, double reference_energy, double reference_velocity) noexcept nogil:
+cdef inline double relative_residual(double energy, double velocity, double reference_energy,
+                                     double reference_velocity) noexcept nogil:
     """Return the relative residual (1)."""
-    cdef double x = ratio(energy, reference_energy), y = ratio(velocity, reference_velocity)
+    cdef double x = ratio_to_reference(energy, reference_energy), y = ratio_to_reference(velocity, reference_velocity)
     return x if x > y else y
 
 
-cdef inline bint hides_residual(double floor) noexcept nogil:
+cdef inline bint floor_hides_residual(double floor) noexcept nogil:
     """Return whether the floor is at least a thousandth of the zero impulse's error; it then replaces the residual."""
     return floor >= 1e-3
 
@@ -70,15 +71,15 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     explain any residual. At a residual of 1e-5 the terms of A lambda are 1e11 times as large as their sum, or M^-1 J^T lambda
     in float64 has an equally large relative error, as with an M of condition 1e12 (judge/refine.pxd).
     """
-    return relative <= 2.0 * floor and relative <= 1e-5 and not hides_residual(floor)
+    return relative <= 2.0 * floor and relative <= 1e-5 and not floor_hides_residual(floor)
 
 
-cdef inline double above_floor(double relative, double floor) noexcept nogil:
+cdef inline double zero_if_at_floor(double relative, double floor) noexcept nogil:
     """Return 0 if rounding explains a relative residual (`is_at_floor`), otherwise that residual."""
     return 0.0 if is_at_floor(relative, floor) else relative
 
 
-cdef inline void smallest_reference(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+cdef inline void take_smallest_island_reference(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """Replace E0 and V0 of all rows by the smallest of any island, for estimates over all rows that must hold in each island."""
     cdef const double* own
     cdef int32_t i

@@ -25,7 +25,7 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best
-from lavender_ext.judge.progress cimport open_progress, progress_t
+from lavender_ext.judge.progress cimport begin_progress, progress_t
 
 
 cpdef enum:
@@ -82,10 +82,10 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
     s.reference_velocity = reference_velocity
     bind_best(&s.best, p, workspace)
     s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
-    open_progress(&s.progress, s.marked + s.best.n, p.n_rows)
+    begin_progress(&s.progress, s.marked + s.best.n, p.n_rows)
 
 
-cdef inline bint begins_again(stopping_test_t* s, int32_t patience) noexcept nogil:
+cdef inline bint restart_if_stalled(stopping_test_t* s, int32_t patience) noexcept nogil:
     """Return whether a STALLED run may restart from its best impulse without memory, once for each best impulse.
 
     This is for accelerated sweeps: their memory may be the reason of the stall. They get `patience` sweeps to find a better

@@ -8,62 +8,65 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, store_better_islands
-from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, refine_view, relative_of, scratch_of
-from lavender_ext.judge.progress cimport envelope, keep, has_stalled, see
-from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
+from lavender_ext.judge.best cimport count_islands, copy_score_without_islands, relative_residual_of_best, store_better_islands
+from lavender_ext.judge.measure cimport (
+    residual_above_floor, relative_floor_of_score, judge_view, refine_view, relative_residual_of_score,
+    count_judge_scratch,
+)
+from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, record_residual
+from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, N_EARLY_SWEEPS, RUNNING, STALLED,
                                                begin_stopping_test, sweep_t, stopping_test_workspace_size, stopping_test_t)
 
 
-cdef inline double relative_to_start(const stopping_test_t* s, const score_t* x) noexcept nogil:
+cdef inline double relative_residual_of_check(const stopping_test_t* s, const score_t* x) noexcept nogil:
     """Return the relative residual of a pass without a floor; inf if an error is not finite."""
     if x.relative >= 0.0:
         return x.relative
-    return relative(x.energy, x.velocity, s.reference_energy, s.reference_velocity) if x.finite else 1.0 / 0.0
+    return relative_residual(x.energy, x.velocity, s.reference_energy, s.reference_velocity) if x.finite else 1.0 / 0.0
 
 
-cdef inline bint is_rounding(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
+cdef inline bint is_explained_by_rounding(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
     """Return whether rounding explains the residuals above tol of a pass with a floor, in each island."""
-    return above_floor_of(x, now, floor_of(x, s.reference_energy, s.reference_velocity)) <= tol
+    return residual_above_floor(x, now, relative_floor_of_score(x, s.reference_energy, s.reference_velocity)) <= tol
 
 
 cdef inline double judge_with_floor(const stopping_test_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
     """Return the judge's relative residual of a pass with a floor."""
     judge_view(v, lam, s.w, s.e, s.v, True, x)
-    return relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
+    return relative_residual_of_score(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
 
 
-cdef inline double judge_closely(const stopping_test_t* s, const view_t* v, const double* lam, double tol, score_t* x,
+cdef inline double judge_with_refinement(const stopping_test_t* s, const view_t* v, const double* lam, double tol, score_t* x,
                                  bint* refined) noexcept nogil:
     """Return the judge's relative residual of a pass with a floor, refined if M is ill-conditioned."""
     cdef double now = judge_with_floor(s, v, lam, x)
     refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, x)
     if refined[0]:
-        now = relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
+        now = relative_residual_of_score(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
     return now
 
 
-cdef inline bint rounds_much(const stopping_test_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+cdef inline bint needs_floor(const stopping_test_t* s, const blocks_t* p, const double* lam) noexcept nogil:
     """Return whether rounding may hide the residual of a large impulse: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of an island."""
     cdef double size = 0.0, energy = s.reference_energy, velocity = s.reference_velocity
     cdef int32_t k
     for k in range(p.n_rows):
         size += p.d[k] * lam[k] * lam[k]
-    smallest_reference(p, &energy, &velocity)
+    take_smallest_island_reference(p, &energy, &velocity)
     return size > 8e17 * energy * energy and energy > 0.0
 
 
-cdef inline int32_t end_refined(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
+cdef inline int32_t status_after_refinement(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
     """Return the status of an impulse with a first pass within tol, from its refined residual."""
     if now <= tol:
         return CONVERGED
-    if is_rounding(s, x, now, tol):
+    if is_explained_by_rounding(s, x, now, tol):
         return AT_FLOOR
-    return STALLED if not floor_of(x, s.reference_energy, s.reference_velocity) <= tol else RUNNING
+    return STALLED if not relative_floor_of_score(x, s.reference_energy, s.reference_velocity) <= tol else RUNNING
 
 
-cdef inline int32_t until_next(const stopping_test_t* s, double now, double tol) noexcept nogil:
+cdef inline int32_t sweeps_until_next_check(const stopping_test_t* s, double now, double tol) noexcept nogil:
     """Return the number of sweeps until the next check."""
     cdef double min_sweeps = s.total >> 3, max_sweeps = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
     if min_sweeps < 1.0:
@@ -80,7 +83,7 @@ cdef inline int32_t until_next(const stopping_test_t* s, double now, double tol)
     return <int32_t>(n if n < max_sweeps else max_sweeps)
 
 
-cdef inline bint is_progress(stopping_test_t* s, double now, double tol) noexcept nogil:
+cdef inline bint is_check_better(stopping_test_t* s, double now, double tol) noexcept nogil:
     """Return whether a check is better (see the header of stopping_test.pxd), after `store_better_islands`."""
     cdef bint better = now < s.lowest
     cdef int32_t i
@@ -93,83 +96,83 @@ cdef inline bint is_progress(stopping_test_t* s, double now, double tol) noexcep
     return better
 
 
-cdef inline int32_t check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
+cdef inline int32_t perform_check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """Perform one check and schedule the next; return the status."""
-    cdef score_t x = new_score()
+    cdef score_t x = make_empty_score()
     cdef const blocks_t* p = &v.p
     cdef double now, last, inf = 1.0 / 0.0
     cdef bint refined = False, lost
     cdef int32_t end
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
-    now = relative_to_start(s, &x)
+    now = relative_residual_of_check(s, &x)
     if now <= tol:                                      # repeat the pass with a floor
-        now = judge_closely(s, v, lam, tol, &x, &refined)
-    elif rounds_much(s, p, lam):
+        now = judge_with_refinement(s, v, lam, tol, &x, &refined)
+    elif needs_floor(s, p, lam):
         now = judge_with_floor(s, v, lam, &x)
-    note_score(&s.best, p, &x, now)
+    copy_score_without_islands(&s.best, p, &x, now)
     lost = not now < inf and (s.reference_energy > 0.0 or not x.finite)
     if s.total <= N_EARLY_SWEEPS and s.start < now < inf:
         s.start = now
-    see(&s.progress, s.total, now)
-    s.check_at = s.total + until_next(s, now, tol)
+    record_residual(&s.progress, s.total, now)
+    s.check_at = s.total + sweeps_until_next_check(s, now, tol)
     s.last = now
     s.last_at = s.total
     if now <= tol:
         return CONVERGED
     if refined:
-        end = end_refined(s, &x, now, tol)
+        end = status_after_refinement(s, &x, now, tol)
         if end != RUNNING:
             return end
     if not lost or s.best.seen > 0:
         store_better_islands(&s.best, p, lam, tol)
-        s.best_relative = relative_of_best(&s.best)
+        s.best_relative = relative_residual_of_best(&s.best)
     if s.best_relative <= tol:                          # islands were solved at different checks
-        x = new_score()
-        last = judge_closely(s, v, s.best.impulse, tol, &x, &refined)
-        end = CONVERGED if last <= tol else end_refined(s, &x, last, tol) if refined else RUNNING
+        x = make_empty_score()
+        last = judge_with_refinement(s, v, s.best.impulse, tol, &x, &refined)
+        end = CONVERGED if last <= tol else status_after_refinement(s, &x, last, tol) if refined else RUNNING
         if end != RUNNING:
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return end
-    if not lost and is_progress(s, now, tol):
+    if not lost and is_check_better(s, now, tol):
         s.best_at = s.total
-        keep(&s.progress, s.total, lam, p.n_rows)
+        record_impulse(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
     if lost or 1e6 * (s.start if s.start > 1.0 else 1.0) < now < inf:
         if s.best_at >= 0:
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
-        x = new_score()
-        last = judge_closely(s, v, s.best.impulse, tol, &x, &refined)
-        if is_rounding(s, &x, last if refined else s.best_relative, tol):
+        x = make_empty_score()
+        last = judge_with_refinement(s, v, s.best.impulse, tol, &x, &refined)
+        if is_explained_by_rounding(s, &x, last if refined else s.best_relative, tol):
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and has_stalled(&s.progress, p, lam, s.total, s.lowest):
         memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return STALLED
-    keep(&s.progress, s.total, lam, p.n_rows)
+    record_impulse(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
 
 
 cdef inline int32_t confirm_status(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
                                    int32_t status) noexcept nogil:
     """Judge lam in another form of the problem; return `status` if it holds there, otherwise RUNNING or STALLED."""
-    cdef score_t x = new_score()
+    cdef score_t x = make_empty_score()
     cdef double now
     cdef bint within
     judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
-    now = relative_to_start(s, &x)
+    now = relative_residual_of_check(s, &x)
     if refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, &x):
         within = now <= tol
-        now = relative_of(&x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
+        now = relative_residual_of_score(&x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
         if within:
-            return end_refined(s, &x, now, tol)
+            return status_after_refinement(s, &x, now, tol)
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:
         return RUNNING
-    return AT_FLOOR if is_rounding(s, &x, now, tol) else STALLED
+    return AT_FLOOR if is_explained_by_rounding(s, &x, now, tol) else STALLED
 
 
 cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol,
@@ -182,7 +185,7 @@ cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view
     if not tol > 0.0:
         return RUNNING
     if s.total >= s.check_at:                           # total exceeds check_at after sweeps without checks
-        status = check(s, v, lam, tol)
+        status = perform_check(s, v, lam, tol)
         if confirm != NULL and (status == CONVERGED or status == AT_FLOOR):
             status = confirm_status(s, confirm, lam, tol, status)
     if s.check_at - s.total < step[0]:
@@ -227,7 +230,7 @@ cdef class StoppingTest:
             self.other = confirm.view()
             self.confirm = &self.other
         workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
-        scratch = np.empty(workspace + 2 * m + scratch_of(&self.other) + 4)
+        scratch = np.empty(workspace + 2 * m + count_judge_scratch(&self.other) + 4)
         self.keep = data, confirm, scratch
         begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
         self.state.w = &scratch[workspace]
@@ -249,27 +252,27 @@ cdef class StoppingTest:
     def keep_best(self, double[::1] lam, double tol):
         """Replace lam (m,), unless its residual is at most tol, by the best impulse of each island, including lam."""
         cdef stopping_test_t* s = &self.state
-        cdef score_t x = new_score()
+        cdef score_t x = make_empty_score()
         cdef double now
         if s.best.seen == 0 or lam.shape[0] == 0:
             return
         x.by_island = s.best.now
         with nogil:
             judge_view(&self.view, &lam[0], s.w, s.e, s.v, False, &x)
-            now = relative_to_start(s, &x)
-            if rounds_much(s, &self.view.p, &lam[0]):
+            now = relative_residual_of_check(s, &x)
+            if needs_floor(s, &self.view.p, &lam[0]):
                 now = judge_with_floor(s, &self.view, &lam[0], &x)
-            note_score(&s.best, &self.view.p, &x, now)
+            copy_score_without_islands(&s.best, &self.view.p, &x, now)
             if not now <= tol:
                 store_better_islands(&s.best, &self.view.p, &lam[0], tol)
-                s.best_relative = relative_of_best(&s.best)
+                s.best_relative = relative_residual_of_best(&s.best)
                 memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
 
     @property
     def sweeps_per_decade(self):
         """Sweeps per tenfold decrease of the residual, from its lower envelope at the last check; NaN if it does not fall."""
         cdef double fall = 0.0, low = 0.0
-        cdef int32_t k = envelope(&self.state.progress, &fall, &low)
+        cdef int32_t k = residual_envelope_slope(&self.state.progress, &fall, &low)
         return -k / log10(fall) if k > 0 and 0.0 < fall < 1.0 else NAN
 
     def run_python(self, sweep, double[::1] lam, int n, double tol):

@@ -2,10 +2,14 @@
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport block_error, length
-from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk, is_rows,
+from lavender_ext.core.block cimport compute_block_error, euclidean_norm
+from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk_friction_contact,
+                                            has_independent_rows,
                                             get_friction_components, friction_components_t)
-from lavender_ext.judge.score cimport above_floor, hides_residual, is_at_floor, ratio, relative, score_t, unit_roundoff
+from lavender_ext.judge.score cimport (
+    zero_if_at_floor, floor_hides_residual, is_at_floor, ratio_to_reference, relative_residual, score_t,
+    unit_roundoff,
+)
 
 
 cdef struct tally_t:
@@ -20,17 +24,17 @@ cdef struct floor_t:            # norms of F, the rounding of a slack
     double own                  # with islands: max F / |b|; rows of a contact use b of its normal
 
 
-cdef inline int32_t block_at(const int32_t* order, int32_t a) noexcept nogil:
+cdef inline int32_t get_block_in_order(const int32_t* order, int32_t a) noexcept nogil:
     """Return entry `a` of a list of blocks; a NULL list means all blocks."""
     return a if order == NULL else order[a]
 
 
-cdef inline double ratio_by_row(double size, double own, double scale) noexcept nogil:
+cdef inline double ratio_to_row_terms(double size, double own, double scale) noexcept nogil:
     """Return the size of an error [m/s] over the terms of its row; if these are 0, `scale`: sqrt(d) |e| over E0 of all rows."""
-    return ratio(size, own) if own > 0.0 or size == 0.0 else scale
+    return ratio_to_reference(size, own) if own > 0.0 or size == 0.0 else scale
 
 
-cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
+cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
                                     double total_energy) noexcept nogil:
     """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end).
 
@@ -39,22 +43,23 @@ cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int
     cdef int32_t a, i, j, k
     cdef double r, worst = 0.0, s
     for a in range(first, end):
-        i = block_at(order, a)
+        i = get_block_in_order(order, a)
         j = p.ptr[i]
-        if is_rows(p, i):
+        if has_independent_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                r = ratio_by_row(p.d[k] * fabs(e[k]), fabs(p.b[k]), ratio(sqrt(p.d[k]) * fabs(e[k]), total_energy))
+                r = ratio_to_row_terms(p.d[k] * fabs(e[k]), fabs(p.b[k]),
+                                       ratio_to_reference(sqrt(p.d[k]) * fabs(e[k]), total_energy))
                 worst = r if r > worst else worst
             continue
         s = 0.0
         for k in range(j, p.ptr[i + 1]):
             s += (p.d[k] * e[k]) * e[k]
-        r = ratio_by_row(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio(sqrt(s), total_energy))
+        r = ratio_to_row_terms(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio_to_reference(sqrt(s), total_energy))
         worst = r if r > worst else worst
     return worst
 
 
-cdef inline tally_t empty_tally() noexcept nogil:
+cdef inline tally_t make_empty_tally() noexcept nogil:
     """Return the tally of no rows."""
     cdef tally_t s
     s.energy = 0.0
@@ -63,7 +68,7 @@ cdef inline tally_t empty_tally() noexcept nogil:
     return s
 
 
-cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
+cdef inline void add_row_error(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
     """Add the error e of row k."""
     cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
     s.energy += v * e
@@ -72,7 +77,7 @@ cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) n
         s.worst = k
 
 
-cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
+cdef inline void add_pair_error(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
     """Add the errors of rows k and k + 1; the maximum is over the norm of the two."""
     cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
     s.energy += x * e[k] + y * e[k + 1]
@@ -82,27 +87,27 @@ cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally
         s.worst = k
 
 
-cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
+cdef inline void add_block_error(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
     """Add the errors of block i; e (m) is the error of all rows."""
     cdef int32_t k, g, j = p.ptr[i]
     cdef friction_components_t q
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
-            tally_row(p, k, e[k], s)
+            add_row_error(p, k, e[k], s)
         return
-    tally_row(p, j, e[j], s)
-    if is_disk(p, i):                                   # the common case, compiled with constant sizes
-        tally_pair(p, j + 1, e, s)
+    add_row_error(p, j, e[j], s)
+    if is_disk_friction_contact(p, i):                                   # the common case, compiled with constant sizes
+        add_pair_error(p, j + 1, e, s)
         return
     get_row_groups(p, i, &q)
     for g in range(q.n):
         if q.size[g] == 2:
-            tally_pair(p, j + q.first[g], e, s)
+            add_pair_error(p, j + q.first[g], e, s)
         else:
-            tally_row(p, j + q.first[g], e[j + q.first[g]], s)
+            add_row_error(p, j + q.first[g], e[j + q.first[g]], s)
 
 
-cdef inline int32_t first_nonfinite_row(const double* e, int32_t m) noexcept nogil:
+cdef inline int32_t find_nonfinite_row(const double* e, int32_t m) noexcept nogil:
     """Return the first row with a non-finite error, or -1."""
     cdef int32_t i
     for i in range(m):
@@ -111,7 +116,7 @@ cdef inline int32_t first_nonfinite_row(const double* e, int32_t m) noexcept nog
     return -1
 
 
-cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
+cdef inline void write_score_norms(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
     """Write the norms of e (m) to the score; the floor entries are not changed."""
     out.energy = sqrt(s.energy)
     out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
@@ -119,12 +124,12 @@ cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s
     out.finite = out.energy + out.velocity < 1.0 / 0.0
     if not out.finite:
         out.velocity = 1.0 / 0.0
-        out.worst = first_nonfinite_row(e, p.n_rows)
+        out.worst = find_nonfinite_row(e, p.n_rows)
         if out.worst < 0:
             out.worst = s.worst
 
 
-cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+cdef inline void rhs_energy_and_velocity_norms(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """Compute sqrt(sum b^2 / d) and max |b| sqrt(nu / d); two rows of a group count by their norm."""
     cdef int32_t i, j, k, g
     cdef double t, pair, sum_ = 0.0, fast = 0.0
@@ -149,17 +154,17 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
     velocity[0] = sqrt(fast)
 
 
-cdef inline floor_t no_floor() noexcept nogil:
+cdef inline floor_t make_empty_floor() noexcept nogil:
     """Return the floor of no rows."""
     return floor_t(0.0, 0.0, 0.0)
 
 
-cdef inline double row_rounding(const blocks_t* p, int32_t k, double size) noexcept nogil:
+cdef inline double slack_rounding_of_row(const blocks_t* p, int32_t k, double size) noexcept nogil:
     """Return F_k, the rounding of the slack of row k, with size = (|A| |lam|)_k."""
     return unit_roundoff() * (size + fabs(p.b[k]))
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f, floor_t* s) noexcept nogil:
+cdef inline void add_slack_rounding(const blocks_t* p, int32_t k, int32_t first, double f, floor_t* s) noexcept nogil:
     """Add the rounding f of the slack of row k to the floor; `first` is the normal of a contact, otherwise k."""
     cdef double t = f / p.d[k]
     s.energy += t * f
@@ -167,20 +172,22 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f
     if t > s.fast:
         s.fast = t
     if p.islands != NULL:
-        t = ratio_by_row(f * sqrt(p.d[first] / p.d[k]), fabs(p.b[first]), ratio(f / sqrt(p.d[k]), p.islands.energy))
+        t = ratio_to_row_terms(f * sqrt(p.d[first] / p.d[k]), fabs(p.b[first]),
+                               ratio_to_reference(f / sqrt(p.d[k]), p.islands.energy))
         if t > s.own:
             s.own = t
 
 
 cdef inline void add_row_floor(const blocks_t* p, int32_t k, double lam, double w, double size, floor_t* s) noexcept nogil:
     """Add the rounding of the bounded row k, unless its slack exceeds it and keeps the row at a bound: its error is then 0."""
-    cdef double f = row_rounding(p, k, size)
+    cdef double f = slack_rounding_of_row(p, k, size)
     # Without branches, because active rows are hard to predict.
     cdef bint is_active = ((lam == p.lower[k]) & (w > f)) | ((lam == p.upper[k]) & (-w > f))
-    add_floor(p, k, k, 0.0 if is_active else f, s)
+    add_slack_rounding(p, k, k, 0.0 if is_active else f, s)
 
 
-cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* size) noexcept nogil:
+cdef inline bint is_satisfied_at_zero_with_rounding(const blocks_t* p, int32_t i, const double* lam, const double* w,
+                                                    const double* size) noexcept nogil:
     """Return whether contact i has no impulse and its slack is positive beyond rounding: its error is then 0."""
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
     cdef double gap = w[j], rounding
@@ -188,13 +195,13 @@ cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, 
     for k in range(n):
         if lam[j + k] != 0.0:
             return False
-    rounding = row_rounding(p, j, size[0])
+    rounding = slack_rounding_of_row(p, j, size[0])
     if p.law == CONE:
         get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
+            gap -= q.friction_coefficient[g] * euclidean_norm(w + j + q.first[g], q.size[g])
             for k in range(q.first[g], q.first[g] + q.size[g]):
-                rounding += q.friction_coefficient[g] * row_rounding(p, j + k, size[k])
+                rounding += q.friction_coefficient[g] * slack_rounding_of_row(p, j + k, size[k])
     return gap > rounding
 
 
@@ -210,19 +217,19 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
     cdef friction_components_t q
     cdef double x, own
     cdef bint is_active
-    if is_rows(p, i):
+    if has_independent_rows(p, i):
         for k in range(n):
             add_row_floor(p, j + k, lam[j + k], w[j + k], size[k], s)
         return
     if n == 1:
-        x = row_rounding(p, j, size[0])
+        x = slack_rounding_of_row(p, j, size[0])
         is_active = (lam[j] == 0.0) & (w[j] > x)
-        add_floor(p, j, j, 0.0 if is_active else x, s)
+        add_slack_rounding(p, j, j, 0.0 if is_active else x, s)
         return
-    if holds_at_zero(p, i, lam, w, size):
+    if is_satisfied_at_zero_with_rounding(p, i, lam, w, size):
         return
-    add_floor(p, j, j, row_rounding(p, j, size[0]), s)
-    if is_disk(p, i):                                   # the common case, compiled with constant sizes
+    add_slack_rounding(p, j, j, slack_rounding_of_row(p, j, size[0]), s)
+    if is_disk_friction_contact(p, i):                                   # the common case, compiled with constant sizes
         get_disk_component(p, i, &q)
     else:
         get_row_groups(p, i, &q)
@@ -232,17 +239,17 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
             if q.size[g] == 2 and e[j + k] != w[j + k] / p.d[j + k]:
                 own = p.d[j + k] * fabs(lam[j + k])
                 x = own if own > x else x
-            add_floor(p, j + k, j, row_rounding(p, j + k, x), s)
+            add_slack_rounding(p, j + k, j, slack_rounding_of_row(p, j + k, x), s)
 
 
-cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
+cdef inline void write_score_floor(const floor_t* s, score_t* out) noexcept nogil:
     """Write the floor entries of the score."""
     out.floor_energy = sqrt(s.energy)
     out.floor_velocity = sqrt(s.fast)
 
 
-cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogil:
-    """Initialise the score before the first `close_island`; return the number of islands."""
+cdef inline int32_t begin_island_scores(const blocks_t* p, score_t* out) noexcept nogil:
+    """Initialise the score before the first `add_island_to_score`; return the number of islands."""
     if p.islands == NULL:
         return 1
     out.relative = out.floor = out.above_floor = 0.0
@@ -250,37 +257,37 @@ cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogi
     return p.islands.n
 
 
-cdef inline int32_t island_begin(const blocks_t* p, int32_t island) noexcept nogil:
+cdef inline int32_t index_of_island_begin(const blocks_t* p, int32_t island) noexcept nogil:
     """Return the index in `order` of the first block of an island; without islands all blocks form one."""
     return p.islands.ptr[island] if p.islands != NULL else 0
 
 
-cdef inline int32_t island_end(const blocks_t* p, int32_t island) noexcept nogil:
+cdef inline int32_t index_of_island_end(const blocks_t* p, int32_t island) noexcept nogil:
     """Return one past the index in `order` of the last block of an island."""
     return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
 
 
-cdef inline double island_relative(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
+cdef inline double relative_residual_of_island(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
     """Return the relative residual (1) of judge/score.pxd of one island."""
     cdef const double* reference = p.islands.reference + 2 * island
     cdef double energy = sqrt(s.energy), velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     if not energy + velocity < 1.0 / 0.0:
         return 1.0 / 0.0
     if reference[0] < 0.0:
-        return relative_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e,
+        return relative_residual_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e,
                                 p.islands.energy)
-    return relative(energy, velocity, reference[0], reference[1])
+    return relative_residual(energy, velocity, reference[0], reference[1])
 
 
-cdef inline double island_floor(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
+cdef inline double relative_floor_of_island(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
     """Return the floor of one island as a relative residual."""
     cdef const double* reference = p.islands.reference + 2 * island
     if reference[0] < 0.0:
         return f.own
-    return relative(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
+    return relative_residual(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
 
 
-cdef inline void close_island(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
+cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
                               const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
     """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
 
@@ -292,7 +299,7 @@ cdef inline void close_island(const blocks_t* p, int32_t island, const double* w
     if p.islands == NULL:
         total[0] = s[0]
         return
-    now = island_relative(p, island, e, s)
+    now = relative_residual_of_island(p, island, e, s)
     for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
         i = p.islands.order[a]
         for k in range(p.ptr[i], p.ptr[i + 1]):
@@ -300,8 +307,8 @@ cdef inline void close_island(const blocks_t* p, int32_t island, const double* w
     if check != 0.0:
         now = 1.0 / 0.0
     if f != NULL:
-        floor = island_floor(p, island, f)
-        if hides_residual(floor) and now < floor < 1.0 / 0.0:
+        floor = relative_floor_of_island(p, island, f)
+        if floor_hides_residual(floor) and now < floor < 1.0 / 0.0:
             now = floor
         if not is_at_floor(now, floor) and now > out.above_floor:
             out.above_floor = now
@@ -315,17 +322,17 @@ cdef inline void close_island(const blocks_t* p, int32_t island, const double* w
         total.fast, total.worst = s.fast, s.worst
 
 
-cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
     """Compute the errors e (m) of all blocks and their norms; the floor entries are not changed."""
-    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = empty_tally()
+    cdef tally_t own, s = make_empty_tally()
     for island in range(n):
-        own = empty_tally()
-        end = island_end(p, island)
-        for a in range(island_begin(p, island), end):
-            i = block_at(order, a)
-            block_error(p, i, lam, w, e)
-            tally_block(p, i, e, &own)
-        close_island(p, island, w, e, &own, NULL, &s, out)
-    score_from(p, e, &s, out)
+        own = make_empty_tally()
+        end = index_of_island_end(p, island)
+        for a in range(index_of_island_begin(p, island), end):
+            i = get_block_in_order(order, a)
+            compute_block_error(p, i, lam, w, e)
+            add_block_error(p, i, e, &own)
+        add_island_to_score(p, island, w, e, &own, NULL, &s, out)
+    write_score_norms(p, e, &s, out)

@@ -12,16 +12,16 @@ A solution is the same for every t > 0, but Newton's method may cycle for some t
 each time from the result of projected steps z = Pi(z - s / trace H). Of 8,000 random contacts with rolling friction and a W of
 condition 1e6 it fails on 305 for t = 1 alone, on 10 for all t of `solve_block_newton`.
 
-The rows of a friction component share one d, also those of a round cone. Prepared numbers of a block (`prepare_newton`):
+The rows of a friction component share one d, also those of a round cone. Prepared numbers of a block (`prepare_block_newton`):
 H (n, n), sqrt(d) (n), 1 / sqrt(d) (n).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length
-from lavender_ext.core.block_projection cimport active_bound, evaluate_natural_map
+from lavender_ext.core.block cimport euclidean_norm
+from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
+from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, solve_by_elimination
 
 
 cdef enum:
@@ -53,7 +53,7 @@ cdef struct scaled_block_t:
     double size                 # largest sum of absolute terms of a row, for the tolerance
 
 
-cdef inline void prepare_newton(int32_t n, const double* W, const double* d, const friction_components_t* components,
+cdef inline void prepare_block_newton(int32_t n, const double* W, const double* d, const friction_components_t* components,
                                 double* g) noexcept nogil:
     """Compute the prepared numbers g (n n + 2 n) of a block; components.n is 0 for bounded rows."""
     cdef double* root = g + n * n
@@ -71,7 +71,7 @@ cdef inline void prepare_newton(int32_t n, const double* W, const double* d, con
             g[n * i + j] = W[n * i + j] * (inverse[i] * inverse[j])
 
 
-cdef inline double evaluate_residual(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
+cdef inline double evaluate_natural_residual(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
     """Return |F| at z and compute Pi(y), F, P and `size`."""
     cdef double ts[MAX_ROWS]
     cdef double change[MAX_ROWS]
@@ -91,7 +91,7 @@ cdef inline double evaluate_residual(scaled_block_t* x, const int32_t n, double 
         for i in range(n * n):
             x.P[i] = 0.0
         for i in range(n):
-            side = active_bound(x.z[i] - ts[i], x.lower[i], x.upper[i])
+            side = classify_active_bound(x.z[i] - ts[i], x.lower[i], x.upper[i])
             x.projected[i] = x.z[i] - ts[i] if side == 0 else x.lower[i] if side < 0 else x.upper[i]
             x.F[i] = ts[i] if side == 0 else x.z[i] - x.projected[i]
             x.P[(n + 1) * i] = 1.0 if side == 0 else 0.0
@@ -102,12 +102,12 @@ cdef inline double evaluate_residual(scaled_block_t* x, const int32_t n, double 
     return sqrt(total)
 
 
-cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
+cdef inline bint run_damped_newton_iterations(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
     """Solve (1) from z; return whether |F| is 0 within rounding."""
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef double f[MAX_ROWS]
     cdef double z[MAX_ROWS]
-    cdef double now = evaluate_residual(x, n, t), next_, a, fraction
+    cdef double now = evaluate_natural_residual(x, n, t), next_, a, fraction
     cdef int32_t i, j, k, _step, _halving, slow = 0
     for _step in range(MAX_NEWTON_STEPS):
         if not now > 1e-15 * x.size:
@@ -120,19 +120,19 @@ cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) no
                 for k in range(n):
                     a += x.P[n * i + k] * x.H[n * k + j]
                 A[n * i + j] = (1.0 if i == j else 0.0) - x.P[n * i + j] + t * a
-        eliminate(n, A, f)
+        solve_by_elimination(n, A, f)
         fraction = 1.0
         for _halving in range(MAX_STEP_HALVINGS):
             for i in range(n):
                 x.z[i] = z[i] + fraction * f[i]
-            next_ = evaluate_residual(x, n, t)
+            next_ = evaluate_natural_residual(x, n, t)
             if next_ < now:
                 break
             fraction *= 0.5
         if not next_ < now and now <= 1e-13 * x.size:
             for i in range(n):
                 x.z[i] = z[i]
-            now = evaluate_residual(x, n, t)
+            now = evaluate_natural_residual(x, n, t)
             break
         slow += not next_ < 0.9 * now
         now = next_
@@ -141,34 +141,34 @@ cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) no
     return now <= 1e-13 * x.size
 
 
-cdef inline bint iterate_from_start(scaled_block_t* x, double t) noexcept nogil:
+cdef inline bint run_newton_from_start(scaled_block_t* x, double t) noexcept nogil:
     """Solve (1) from `start`; small blocks are compiled with constant sizes."""
     cdef int32_t i
     for i in range(x.n):
         x.z[i] = x.start[i]
     if x.n == 2:
-        return iterate_newton(x, 2, t)
+        return run_damped_newton_iterations(x, 2, t)
     if x.n == 3:
-        return iterate_newton(x, 3, t)
+        return run_damped_newton_iterations(x, 3, t)
     if x.n == 4:
-        return iterate_newton(x, 4, t)
-    return iterate_newton(x, x.n, t)
+        return run_damped_newton_iterations(x, 4, t)
+    return run_damped_newton_iterations(x, x.n, t)
 
 
-cdef inline bint solve_scaled(scaled_block_t* x, double t) noexcept nogil:
+cdef inline bint solve_scaled_block(scaled_block_t* x, double t) noexcept nogil:
     """Solve (1) from `start`, or else from the point with w = 0; return False if both fail."""
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef int32_t i
-    if iterate_from_start(x, t):
+    if run_newton_from_start(x, t):
         return True
     for i in range(x.n):
         x.z[i] = -x.s0[i]
     for i in range(x.n * x.n):
         A[i] = x.H[i]
-    eliminate(x.n, A, x.z)
+    solve_by_elimination(x.n, A, x.z)
     for i in range(x.n):
         x.z[i] += x.z0[i]
-    return iterate_newton(x, x.n, t)
+    return run_damped_newton_iterations(x, x.n, t)
 
 
 cdef inline void take_projected_steps(scaled_block_t* x) noexcept nogil:
@@ -179,12 +179,12 @@ cdef inline void take_projected_steps(scaled_block_t* x) noexcept nogil:
         x.z[i] = x.start[i]
         trace += fabs(x.H[(x.n + 1) * i])
     for _step in range(N_PROJECTED_STEPS if trace > 0.0 else 0):    # No eigenvalue of a symmetric H exceeds its trace.
-        evaluate_residual(x, x.n, 1.0 / trace)
+        evaluate_natural_residual(x, x.n, 1.0 / trace)
         for i in range(x.n):
             x.z[i] = x.start[i] = x.projected[i]
 
 
-cdef inline bint is_open(const scaled_block_t* x) noexcept nogil:
+cdef inline bint is_contact_open(const scaled_block_t* x) noexcept nogil:
     """Return whether lam = 0 solves a contact: whether s at z = 0 is in the dual cone."""
     cdef double s[MAX_ROWS]
     cdef int32_t i, j, g
@@ -195,11 +195,11 @@ cdef inline bint is_open(const scaled_block_t* x) noexcept nogil:
         if x.law != CONE or s[0] < 0.0:
             return s[0] >= 0.0
     for g in range(x.components.n):
-        s[0] -= x.components.friction_coefficient[g] * length(s + x.components.first[g], x.components.size[g])
+        s[0] -= x.components.friction_coefficient[g] * euclidean_norm(s + x.components.first[g], x.components.size[g])
     return s[0] >= 0.0
 
 
-cdef inline void store_impulse(const scaled_block_t* x, const double* inverse, double* lam) noexcept nogil:
+cdef inline void store_block_impulse(const scaled_block_t* x, const double* inverse, double* lam) noexcept nogil:
     """Write the impulse of Pi(y) to lam (n)."""
     cdef int32_t i
     for i in range(x.n):
@@ -227,15 +227,15 @@ cdef inline int32_t solve_block_newton(scaled_block_t* x, const double* g, const
     else:
         for i in range(x.components.n):
             x.components.friction_coefficient[i] *= root[x.components.first[i]] * inverse[0]
-        if is_open(x):
+        if is_contact_open(x):
             for i in range(x.n):
                 lam[i] = 0.0
             return OPEN
     for attempt in range(N_ROW_SCALES if x.bounded else N_SCALES):
-        if (x.bounded or x.H[0] > 0.0) and solve_scaled(x, t):
-            store_impulse(x, inverse, lam)
-            if attempt > 0 and iterate_newton(x, x.n, 1.0):         # F is most accurate for t = 1.
-                store_impulse(x, inverse, lam)
+        if (x.bounded or x.H[0] > 0.0) and solve_scaled_block(x, t):
+            store_block_impulse(x, inverse, lam)
+            if attempt > 0 and run_damped_newton_iterations(x, x.n, 1.0):         # F is most accurate for t = 1.
+                store_block_impulse(x, inverse, lam)
             return STICK
         take_projected_steps(x)
         if attempt == 0:

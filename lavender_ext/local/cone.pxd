@@ -13,10 +13,10 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport norm2
 from lavender_ext.local.coulomb cimport opposes_friction
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, is_slack_zero
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, safeguard_newton_step, is_slack_zero
 
 
-cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu, double s0, double s1,
+cdef inline int32_t minimize_energy_on_cone_ray(const double* W, const double* q, double mu, double s0, double s1,
                            double* lam) noexcept nogil:
     """Minimise the energy on the ray lam = l (1, mu s), l > 0, where lam.w = 0; FAILED if that is not a solution."""
     cdef double x0 = mu * s0, x1 = mu * s1
@@ -116,8 +116,8 @@ cdef inline int32_t solve_cone_disk(const double* W, const double* q, double mu,
               - side * mu * (v1[0] + 2.0 * beta * v2[0]))
         step = f / df
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        beta = newton_or_bisect(beta, step, lo, hi, &done)
+        beta = safeguard_newton_step(beta, step, lo, hi, &done)
     if not U > 0.0 or not done:
         return FAILED
     U = side / U
-    return minimize_on_ray(W, q, mu, v[1] * U, v[2] * U, lam)
+    return minimize_energy_on_cone_ray(W, q, mu, v[1] * U, v[2] * U, lam)

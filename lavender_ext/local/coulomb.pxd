@@ -17,15 +17,15 @@ Delta > 0 in between. For S = s I one step of Newton's method on the quotient of
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, safeguard_newton_step
 
 
 cdef enum:
     PREPARED = 25               # number of doubles of a prepared 3x3 block
-    ONE_PATTERN = 15            # index of a flag in them, which `prepare_disk` sets to 0
+    ONE_PATTERN = 15            # index of a flag in them, which `prepare_coulomb_disk` sets to 0
 
 
-cdef inline void prepare_disk(const double* W, double* g) noexcept nogil:
+cdef inline void prepare_coulomb_disk(const double* W, double* g) noexcept nogil:
     """Compute g (25): W, 1 / W_nn (0 if not positive), S, det S (0 if singular), 0, and W^-1 if det S > 0; row by row."""
     cdef double h0, h1, k0, k1, inv, det, size, t00, t01, t10, t11
     cdef int32_t i
@@ -167,7 +167,7 @@ cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double 
         step = f * U2 / (mu * (a * (tr + 2.0 * beta) + hr) * U2 + P * (x0 * r0 + x1 * r1))
         # Convergence is quadratic: the next point is exact within rounding.
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        beta = newton_or_bisect(beta, step, lo, hi, &done)
+        beta = safeguard_newton_step(beta, step, lo, hi, &done)
     n = U + mu * hu
     if not n > 0.0 or not a / n < 1.0 / 0.0 or not done:
         return FAILED

@@ -4,9 +4,9 @@ The prepared numbers of block i begin at g[start[i]]:
 
     one row                      nothing: lam <- clip(lam - w / d)
     rows, 2 to 8, all free       1, then W^-1 (n, n); if W is singular, as bounded rows
-    rows, 2 to 8, bounded        0, then `prepare_newton` of local/block_newton.pxd
-    normal, two tangents, disk   `prepare_disk` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows of A share one pattern
-    other contacts               1 if there are three rows and they share one pattern, then `prepare_newton`
+    rows, 2 to 8, bounded        0, then `prepare_block_newton` of local/block_newton.pxd
+    normal, two tangents, disk   `prepare_coulomb_disk` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows share one pattern
+    other contacts               1 if there are three rows and they share one pattern, then `prepare_block_newton`
 
 A sweep solves each block exactly with the others fixed: disks by local/coulomb.pxd and local/cone.pxd, all others, and disks
 that these reject, by local/block_newton.pxd:
@@ -17,31 +17,33 @@ that these reject, by local/block_newton.pxd:
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport relax_normal, relax_row
+from lavender_ext.core.block cimport project_normal_update, project_row_update
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk, is_rows, n_tangents, n_angular_rows,
+from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk_friction_contact, has_independent_rows, count_tangent_rows,
+                                            count_angular_rows,
                                       friction_components_t, get_friction_components)
 from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport apply_contact_changes
-from lavender_ext.core.row_forms cimport panel_of, row_form_t, row_slack, set_impulse
-from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, contact_jacobian, contact_velocity, cross, dot12,
-                                     dot3, joint_velocity, minv_times, relative_velocity)
+from lavender_ext.core.row_forms cimport find_panel, row_form_t, compute_row_slack, set_row_impulse
+from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, form_contact_jacobian, compute_contact_velocity,
+                                     cross, dot12,
+                                     dot3, joint_row_velocity, multiply_inverse_mass, compute_relative_velocity)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.local.block_newton cimport prepare_newton, scaled_block_t, solve_block_newton
+from lavender_ext.local.block_newton cimport prepare_block_newton, scaled_block_t, solve_block_newton
 from lavender_ext.local.cone cimport solve_cone_disk
-from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, update_coulomb_disk, prepare_disk
-from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
+from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, update_coulomb_disk, prepare_coulomb_disk
+from lavender_ext.local.small cimport FAILED, MAX_ROWS, solve_by_elimination
 
 
-cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline int32_t count_prepared_numbers(const blocks_t* p, int32_t i) noexcept nogil:
     """Return the number of prepared doubles of block i."""
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
-    if is_disk(p, i):
+    if is_disk_friction_contact(p, i):
         return PREPARED
     return 0 if n == 1 or n > MAX_ROWS else 1 + n * (n + 2)
 
 
-cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t one_pattern, double* g) noexcept nogil:
+cdef inline void prepare_exact_block(const blocks_t* p, int32_t i, double* W, int32_t one_pattern, double* g) noexcept nogil:
     """Compute g from the diagonal block W (n, n) of A, which is overwritten; 1 < n <= MAX_ROWS."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, q, k, free = 1
     cdef double inf = 1.0 / 0.0
@@ -50,9 +52,9 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
     cdef friction_components_t components
     get_friction_components(p, i, &components)
     # contacts
-    if not is_rows(p, i):
-        if is_disk(p, i):
-            prepare_disk(W, g)
+    if not has_independent_rows(p, i):
+        if is_disk_friction_contact(p, i):
+            prepare_coulomb_disk(W, g)
             g[ONE_PATTERN] = one_pattern
             if W[0] != p.d[j]:
                 g[9] = 0.0
@@ -60,7 +62,7 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
         if W[0] != p.d[j]:                              # d of the normal is a fallback value: W_nn is too small to divide by
             W[0] = 0.0
         g[0] = one_pattern and n == 3
-        prepare_newton(n, W, p.d + j, &components, g + 1)
+        prepare_block_newton(n, W, p.d + j, &components, g + 1)
         return
     # rows
     for q in range(j, p.ptr[i + 1]):
@@ -71,37 +73,38 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
             a[q] = W[q]
         for q in range(n):
             x[q] = 1.0 if q == k else 0.0
-        if eliminate(n, a, x) < n:
+        if solve_by_elimination(n, a, x) < n:
             free = 0
             break
         for q in range(n):
             g[1 + n * q + k] = x[q]
     g[0] = free
     if not free:
-        prepare_newton(n, W, p.d + j, &components, g + 1)
+        prepare_block_newton(n, W, p.d + j, &components, g + 1)
 
 
-cdef int32_t solve_other_block(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+cdef int32_t solve_block_without_closed_form(const blocks_t* p, int32_t i, const double* g, const double* w,
+                                             double* lam) noexcept nogil:
     """Solve block i without a closed form; return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i]
     cdef scaled_block_t x
-    x.law, x.n, x.bounded = p.law, p.ptr[i + 1] - j, is_rows(p, i)
+    x.law, x.n, x.bounded = p.law, p.ptr[i + 1] - j, has_independent_rows(p, i)
     get_friction_components(p, i, &x.components)
     return solve_block_newton(&x, g, w, p.lower + j, p.upper + j, lam) == FAILED
 
 
 cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    """Solve disk i, which its closed form rejects, with prepared numbers of `prepare_disk`; return 1 if the fallback was used."""
+    """Solve disk i, which its closed form rejects, with the numbers of `prepare_coulomb_disk`; return 1 if it used the fallback."""
     cdef double h[15]
     cdef friction_components_t components
     get_friction_components(p, i, &components)
-    prepare_newton(3, g, p.d + p.ptr[i], &components, h)
+    prepare_block_newton(3, g, p.d + p.ptr[i], &components, h)
     if not g[9] > 0.0:
         h[0] = 0.0
-    return solve_other_block(p, i, h, w, lam)
+    return solve_block_without_closed_form(p, i, h, w, lam)
 
 
-cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
+cdef inline int32_t solve_block_exactly(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
     """Solve block i exactly from its slack w; lam points at its first row. Return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t
@@ -109,11 +112,11 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
     cdef double s
     # one row
     if n == 1:
-        lam[0] = (relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j]) if is_rows(p, i)
-                  else relax_normal(lam[0], w[0], p.step[j]))
+        lam[0] = (project_row_update(lam[0], w[0], p.step[j], p.lower[j], p.upper[j]) if has_independent_rows(p, i)
+                  else project_normal_update(lam[0], w[0], p.step[j]))
         return 0
     # free rows
-    if is_rows(p, i) and g[0] != 0.0:
+    if has_independent_rows(p, i) and g[0] != 0.0:
         for k in range(n):
             s = 0.0
             for t in range(n):
@@ -122,8 +125,8 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         for k in range(n):
             lam[k] -= x[k]
         return 0
-    if not is_disk(p, i):
-        return solve_other_block(p, i, g + 1, w, lam)
+    if not is_disk_friction_contact(p, i):
+        return solve_block_without_closed_form(p, i, g + 1, w, lam)
     # a disk
     if p.law != CONE:
         if update_coulomb_disk(g, w, p.mu[i], lam) != FAILED:
@@ -139,7 +142,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
     return solve_rejected_disk(p, i, g, w, lam)
 
 
-cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
+cdef inline void multiply_three_csr_rows(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
     """Compute rows i, i + 1, i + 2 of A x, which share one pattern."""
     cdef int32_t p, n = a.indptr[i + 1] - a.indptr[i]
     cdef const int32_t* idx = a.indices + a.indptr[i]
@@ -168,38 +171,39 @@ cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* ou
     out[2] = s2 + t2
 
 
-cdef inline void block_slack(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, const double* lam,
+cdef inline void compute_block_slack(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, const double* lam,
                              const double* v, double* w) noexcept nogil:
     """Compute the slacks w (n) of block i."""
-    cdef int32_t j = p.ptr[i], panel = panel_of(form, i), k
+    cdef int32_t j = p.ptr[i], panel = find_panel(form, i), k
     if row_form_t is csr_t:
-        if p.ptr[i + 1] - j == 3 and not is_rows(p, i) and g[ONE_PATTERN if is_disk(p, i) else 0] != 0.0:
-            csr_dot3(form, j, lam, w)
+        if (p.ptr[i + 1] - j == 3 and not has_independent_rows(p, i)
+                and g[ONE_PATTERN if is_disk_friction_contact(p, i) else 0] != 0.0):
+            multiply_three_csr_rows(form, j, lam, w)
             w[0] -= p.b[j]
             w[1] -= p.b[j + 1]
             w[2] -= p.b[j + 2]
             return
     for k in range(p.ptr[i + 1] - j):
-        w[k] = row_slack(form, p, panel, j + k, lam, v)
+        w[k] = compute_row_slack(form, p, panel, j + k, lam, v)
 
 
 cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
     """Update block i over A by (1), or over J and M by (3) with v = Y^T lam; return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, panel = panel_of(form, i), k, fallback
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, panel = find_panel(form, i), k, fallback
     cdef double w[MAX_ROWS]
     cdef double impulse[MAX_ROWS]
     if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
-            w[0] = row_slack(form, p, panel, k, lam, v)
-            set_impulse(form, panel, k, relax_row(lam[k], w[0], p.step[k], p.lower[k], p.upper[k]), lam, v)
+            w[0] = compute_row_slack(form, p, panel, k, lam, v)
+            set_row_impulse(form, panel, k, project_row_update(lam[k], w[0], p.step[k], p.lower[k], p.upper[k]), lam, v)
         return 1
-    block_slack(p, form, i, g, lam, v, w)
+    compute_block_slack(p, form, i, g, lam, v, w)
     for k in range(n):
         impulse[k] = lam[j + k]
-    fallback = solve_block(p, i, g, w, impulse)
+    fallback = solve_block_exactly(p, i, g, w, impulse)
     for k in range(n):
-        set_impulse(form, panel, j + k, impulse[k], lam, v)
+        set_row_impulse(form, panel, j + k, impulse[k], lam, v)
     return fallback
 
 
@@ -217,14 +221,14 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     cdef const double* normal = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
     cdef const double* inv_inertia_arm = r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints])
-    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
+    compute_relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
     cross(normal, t1, t2)
     w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
     w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
     w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
     k = 0
     if update_coulomb_disk(g, w, p.mu[i], lam) == FAILED:
-        k = solve_block(p, i, g, w, lam)
+        k = solve_block_exactly(p, i, g, w, lam)
     change[0] = lam[0] - n
     change[1] = lam[1] - x
     change[2] = lam[2] - y
@@ -249,7 +253,7 @@ cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32
     cdef const double* normal
     cdef const double* t1
     t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and is_disk(p, i) and p.law != CONE:
+    if c >= 0 and is_disk_friction_contact(p, i) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
@@ -258,24 +262,24 @@ cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for k in range(n):
-            w[k] = joint_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
+            w[k] = joint_row_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
             previous[k] = lam[j + k]
-        fallbacks = solve_block(p, i, g, w, lam + j)
+        fallbacks = solve_block_exactly(p, i, g, w, lam + j)
         for k in range(n):
             apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - previous[k], v, a, b)
         return fallbacks
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
-    n_angular = n_angular_rows(p, i)
-    nt = n_tangents(p, i)
+    n_angular = count_angular_rows(p, i)
+    nt = count_tangent_rows(p, i)
     roll = 1 + nt + (n_angular & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c
-    contact_velocity(r, c, nt, n_angular, v, w)
+    compute_contact_velocity(r, c, nt, n_angular, v, w)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
         previous[k] = lam[j + k]
-    fallbacks = solve_block(p, i, g, w, lam + j)
+    fallbacks = solve_block_exactly(p, i, g, w, lam + j)
     for k in range(n):
         w[k] = lam[j + k] - previous[k]
     for k in range(3):
@@ -298,13 +302,13 @@ cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32
     return fallbacks
 
 
-cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
+cdef double index_prepared_numbers(const blocks_t* p, int32_t* start) noexcept nogil:
     """Write the first index of the prepared numbers of each block to start (k); return the total number."""
     cdef int32_t i
     cdef double n = 0
     for i in range(p.n_blocks):
         start[i] = <int32_t>n
-        n += prepared_size(p, i)
+        n += count_prepared_numbers(p, i)
     return n
 
 
@@ -333,12 +337,13 @@ cdef inline void form_rows_diagonal_block(const blocks_t* p, const rows_t* r, in
     cdef const double* row = r.jac + 12 * j
     cdef const double* change
     if c >= 0:
-        contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac)
+        form_contact_jacobian(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), jac)
         row = jac
     for k in range(n):
         change = r.minv_jac + 12 * (j + k)
         if c >= 0:
-            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], minv_jac_row)
+            multiply_inverse_mass(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1],
+                                  minv_jac_row)
             change = minv_jac_row
         for q in range(n):
             W[n * q + k] = dot12(row + 12 * q, change)
@@ -359,13 +364,13 @@ cdef inline void form_generalized_diagonal_block(const blocks_t* p, const genera
         W[(n + 1) * k] += o.compliance[j + k]
 
 
-cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil:
-    """Prepare the diagonal blocks of A in g (`prepared_sizes`, zero-initialised)."""
+cdef void prepare_exact_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil:
+    """Prepare the diagonal blocks of A in g (`index_prepared_numbers`, zero-initialised)."""
     cdef int32_t i
     cdef bint one
     cdef double W[MAX_ROWS * MAX_ROWS]
     for i in range(v.p.n_blocks):
-        if prepared_size(&v.p, i) == 0:
+        if count_prepared_numbers(&v.p, i) == 0:
             continue
         one = False
         if v.g != NULL:
@@ -374,7 +379,7 @@ cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexc
             form_rows_diagonal_block(&v.p, v.r, i, W)
         else:
             one = form_csr_diagonal_block(&v.p, v.a, i, W)
-        prepare_block(&v.p, i, W, one, g + start[i])
+        prepare_exact_block(&v.p, i, W, one, g + start[i])
 
 
 ctypedef fused exact_form_t:
@@ -383,7 +388,7 @@ ctypedef fused exact_form_t:
     rows_t
 
 
-cdef inline int32_t solve_in_order(const blocks_t* p, const exact_form_t* form, const int32_t* start, const double* g,
+cdef inline int32_t sweep_exact_blocks_of_form(const blocks_t* p, const exact_form_t* form, const int32_t* start, const double* g,
                                    const int32_t* order, double* lam, double* v) noexcept nogil:
     """Sweep once over one form of A; return the number of fallbacks."""
     cdef int32_t k, i, fallbacks = 0
@@ -396,11 +401,11 @@ cdef inline int32_t solve_in_order(const blocks_t* p, const exact_form_t* form, 
     return fallbacks
 
 
-cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
+cdef int32_t sweep_exact_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
     """Sweep once over A (`a`), J and M (`o`) or bodies (`r`), with velocities v; return the number of fallbacks."""
     if o != NULL:
-        return solve_in_order(p, o, start, g, order, lam, v)
+        return sweep_exact_blocks_of_form(p, o, start, g, order, lam, v)
     if a != NULL:
-        return solve_in_order(p, a, start, g, order, lam, v)
-    return solve_in_order(p, r, start, g, order, lam, v)
+        return sweep_exact_blocks_of_form(p, a, start, g, order, lam, v)
+    return sweep_exact_blocks_of_form(p, r, start, g, order, lam, v)

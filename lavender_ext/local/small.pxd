@@ -16,7 +16,7 @@ cdef enum:
     MAX_ROWS = 8                # Blocks of more rows are not solved exactly.
 
 
-cdef inline double newton_or_bisect(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
+cdef inline double safeguard_newton_step(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
     """Return x - step if it lies between lo and hi, otherwise their midpoint, or 4 x if hi is unknown (negative).
 
     `done` is set if lo and hi are equal within rounding.
@@ -27,7 +27,7 @@ cdef inline double newton_or_bisect(double x, double step, double lo, double hi,
     return 0.5 * (lo + hi) if hi >= 0.0 else 4.0 * x
 
 
-cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
+cdef inline int32_t solve_by_elimination(int32_t n, double* a, double* x) noexcept nogil:
     """Overwrite x (n) with a^-1 x by elimination with row pivoting; return the rank of a (n, n), which is overwritten.
 
     The entries of x of dependent columns are 0.

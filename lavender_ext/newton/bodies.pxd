@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
-from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
+from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport (bind_block_factor, block_factor_index_size, block_factor_size,
                                          block_pattern_index_size)
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
@@ -99,7 +99,7 @@ cdef inline int64_t order_elements(const scaled_t* s, pattern_t* a, const rows_t
     cdef const int32_t* body
     a.k = s.e.n
     for i in range(a.k):
-        body = bodies_of(r, s.block[i])
+        body = get_block_bodies(r, s.block[i])
         a.body[2 * i] = body[0]
         a.body[2 * i + 1] = body[1]
     return order_bodies(a)

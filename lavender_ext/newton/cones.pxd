@@ -6,7 +6,7 @@ the normal and on the rows of the component. No entry of G is below 1, so that G
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length
+from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -21,12 +21,12 @@ cdef enum:                      # stored for each cone after w (n), T = eta [w_0
 
 cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
     """Return x_0 - |x_1..|."""
-    return x[0] - length(x + 1, n - 1)
+    return x[0] - euclidean_norm(x + 1, n - 1)
 
 
 cdef inline double cone_det(const double* x, int32_t n) noexcept nogil:
     """Return x_0^2 - |x_1..|^2."""
-    cdef double t = length(x + 1, n - 1)
+    cdef double t = euclidean_norm(x + 1, n - 1)
     return (x[0] - t) * (x[0] + t)
 
 
@@ -205,7 +205,7 @@ cdef inline void scale_cone(const double* s, const double* u, int32_t n, double 
     w[SCALING_INV_ETA] = 1.0 / eta
     w[SCALING_INV_SUM] = 1.0 / (1.0 + w[0])
     apply_scaling(w, n, u, w + SCALING_V)
-    size = length(w + 1, nt)
+    size = euclidean_norm(w + 1, nt)
     grow = eta * (w[0] + size)
     shrink = eta / (w[0] + size)
     grow = grow * grow

@@ -11,8 +11,8 @@ LU.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length
-from lavender_ext.core.block_projection cimport active_bound, evaluate_natural_map
+from lavender_ext.core.block cimport euclidean_norm
+from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
 from lavender_ext.newton.elements cimport load_components, elements_t, invert_small, is_row
 
@@ -41,7 +41,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
         if is_row(e, i):
-            side = active_bound(z[j] - s[j], e.lower[j], e.upper[j])
+            side = classify_active_bound(z[j] - s[j], e.lower[j], e.upper[j])
             f[j] = s[j] if side == 0 else z[j] - (e.lower[j] if side < 0 else e.upper[j])
             p[q] = 1.0 if side == 0 else 0.0
             total += f[j] * f[j]
@@ -97,7 +97,7 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
         x = fabs(f[0]) * speed[j]
         worst = x if x > worst else worst
         for g in range(e.part[i], e.part[i + 1]):
-            x = length(f + e.first[g] - j, e.size[g]) * speed[e.first[g]]
+            x = euclidean_norm(f + e.first[g] - j, e.size[g]) * speed[e.first[g]]
             worst = x if x > worst else worst
     energy[0] = sqrt(total)
     velocity[0] = worst

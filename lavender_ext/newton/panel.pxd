@@ -2,9 +2,9 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block_types cimport blocks_t, n_angular_rows, n_tangents
-from lavender_ext.core.rows cimport contact_jacobian
-from lavender_ext.core.view cimport bodies_of, rows_t
+from lavender_ext.core.block_types cimport blocks_t, count_angular_rows, count_tangent_rows
+from lavender_ext.core.rows cimport form_contact_jacobian
+from lavender_ext.core.view cimport get_block_bodies, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -134,13 +134,13 @@ cdef inline void compute_panel(const blocks_t* p, const rows_t* r, const double*
         if c < 0:
             row = r.jac + 12 * j
         else:
-            contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac)
+            form_contact_jacobian(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q
             x = 1.0 / sqrt(p.d[q])
             for h in range(2):
-                body = bodies_of(r, i)[h]
+                body = get_block_bodies(r, i)[h]
                 for k in range(6):
                     out[6 * h + k] = 0.0
                 if body >= 0:

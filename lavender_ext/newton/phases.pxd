@@ -18,10 +18,10 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block_projection cimport active_bound
+from lavender_ext.core.block_projection cimport classify_active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.block_types cimport CONE
-from lavender_ext.judge.score cimport relative
+from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, INTERIOR_POINT,
@@ -99,7 +99,7 @@ cdef inline void store_active_bounds(const elements_t* e, const double* z, const
     """Store the bound that is active on each row: -1, 0 or 1."""
     cdef int32_t j
     for j in range(e.m):
-        bound[j] = active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
+        bound[j] = classify_active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
 
 
 cdef inline int32_t count_active_bound_changes(const elements_t* e, const double* z, const double* hz,
@@ -107,7 +107,7 @@ cdef inline int32_t count_active_bound_changes(const elements_t* e, const double
     """Return the number of rows whose active bound differs from the stored one."""
     cdef int32_t j, changed = 0
     for j in range(e.m):
-        changed += active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j]) != bound[j]
+        changed += classify_active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j]) != bound[j]
     return changed
 
 
@@ -314,7 +314,7 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
             return
         k.steps += 1
         n.counts[N_INTERIOR] += 1
-        residual = relative(n.ip.energy, n.ip.velocity, n.problem.e0, n.problem.v0)
+        residual = relative_residual(n.ip.energy, n.ip.velocity, n.problem.e0, n.problem.v0)
         gains = residual < 0.5 * k.lowest
         k.idle = 0 if gains or n.ip.gap < 0.5 * n.ip.min_gap else k.idle + 1
         k.stalled = 0 if gains else k.stalled + 1

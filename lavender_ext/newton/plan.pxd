@@ -34,7 +34,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.method cimport CERTIFICATE, MORE, REACHED, ROUNDOFF_LIMIT, SPENT, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
-from lavender_ext.judge.score cimport relative
+from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
@@ -146,7 +146,7 @@ cdef inline void refine_point(newton_t* n, double* z, int32_t max_refinements, d
             x = n.sc.speed[j] * (n.r[j] if n.r[j] > 0.0 else -n.r[j])
             velocity = x if x > velocity else velocity
         size = sqrt(size)                               # |F| if all rows stay inside their bounds.
-        residual = relative(size, velocity, n.problem.e0, n.problem.v0)
+        residual = relative_residual(size, velocity, n.problem.e0, n.problem.v0)
         if not size < contraction * before or residual <= 1e-3 * n.tol:
             break
     if residual <= n.tol:

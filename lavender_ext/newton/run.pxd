@@ -10,9 +10,12 @@ from libc.string cimport memcpy, memset
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.linear cimport linear_t
-from lavender_ext.judge.best cimport best_t, best_workspace_size, bind_best, note_score, relative_of_best, store_better_islands
-from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
-from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
+from lavender_ext.judge.best cimport (
+    best_t, best_workspace_size, bind_best, copy_score_without_islands, relative_residual_of_best,
+    store_better_islands,
+)
+from lavender_ext.judge.measure cimport residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score
+from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.newton.interior cimport interior_t
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.scaling cimport (bind_element_workspace, bind_scaling_workspace, scale_elements,
@@ -365,21 +368,21 @@ cdef inline void set_reference(problem_t* o, double e0, double v0) noexcept nogi
     With islands it is the smallest of their references, so that no estimate is too low for an island.
     """
     o.e0, o.v0 = e0, v0
-    smallest_reference(&o.p, &o.e0, &o.v0)
+    take_smallest_island_reference(&o.p, &o.e0, &o.v0)
 
 
 cdef inline double judge_point(newton_t* n, const double* z, bint floor) noexcept nogil:
     """Return the judge's relative residual of z; with `floor` write the part above the round-off limit to n.above_floor."""
-    cdef score_t s = new_score()
+    cdef score_t s = make_empty_score()
     cdef const problem_t* o = &n.problem
     cdef view_t v = view_t(o.p, o.a, o.r, o.g)
     cdef double residual
     write_impulse(n, z, n.lam)
     s.by_island = n.island_best.now
     judge_view(&v, n.lam, o.w, o.error, o.x, floor, &s)
-    residual = relative_of(&s, o.w, o.p.n_rows, o.e0, o.v0)
-    note_score(&n.island_best, &o.p, &s, residual)
-    n.above_floor = above_floor_of(&s, residual, floor_of(&s, o.e0, o.v0)) if floor and s.finite else residual
+    residual = relative_residual_of_score(&s, o.w, o.p.n_rows, o.e0, o.v0)
+    copy_score_without_islands(&n.island_best, &o.p, &s, residual)
+    n.above_floor = residual_above_floor(&s, residual, relative_floor_of_score(&s, o.e0, o.v0)) if floor and s.finite else residual
     return residual
 
 
@@ -393,7 +396,7 @@ cdef inline double score_point(newton_t* n, const double* z) noexcept nogil:
         n.best = residual
         copy_vector(n, n.best_z, z)
     if store_better_islands(&n.island_best, &n.problem.p, n.lam, n.tol) and n.island_best.n > 1 and not n.best <= n.tol:
-        combined = relative_of_best(&n.island_best)
+        combined = relative_residual_of_best(&n.island_best)
         if combined <= n.tol:
             n.best = combined
             write_unknown(n, n.island_best.impulse, n.best_z)
@@ -404,7 +407,7 @@ cdef inline double convex_residual(newton_t* n, const double* z, const double* h
     """Return the relative residual of the convex law from hz = H z, without the judge."""
     cdef double energy, velocity
     convex_error(n.s.e, z, hz, n.sc.speed, &energy, &velocity)
-    return relative(energy, velocity, n.problem.e0, n.problem.v0)
+    return relative_residual(energy, velocity, n.problem.e0, n.problem.v0)
 
 
 cdef inline bint is_budget_spent(const newton_t* n) noexcept nogil:

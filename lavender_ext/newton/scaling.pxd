@@ -10,10 +10,12 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_round, is_rows
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.block_types cimport (
+    blocks_t, friction_components_t, get_friction_components, is_round_cone_contact, has_independent_rows,
+)
+from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport csr_t, rows_t, view_t
-from lavender_ext.judge.slack cimport general_slack, rows_slack
+from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
 from lavender_ext.newton.cones cimport CONE_SCALING_SIZE
 from lavender_ext.newton.elements cimport elements_t
 
@@ -33,24 +35,24 @@ cdef inline bint is_known(const blocks_t* p) noexcept nogil:
     """Return whether the problem has no round cones of more than two tangents."""
     cdef int32_t i
     for i in range(p.n_blocks):
-        if is_round(p, i):
+        if is_round_cone_contact(p, i):
             return False
     return True
 
 
 cdef inline bint is_row(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether block i has bounded rows, or is a contact of a normal alone."""
-    return is_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
+    return has_independent_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
 
 
 cdef inline double lower_bound(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
     """Return the lower bound of row j of block i; 0 for rows of a contact."""
-    return p.lower[j] if is_rows(p, i) else 0.0
+    return p.lower[j] if has_independent_rows(p, i) else 0.0
 
 
 cdef inline double upper_bound(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
     """Return the upper bound of row j of block i; infinity for rows of a contact."""
-    return p.upper[j] if is_rows(p, i) else 1.0 / 0.0
+    return p.upper[j] if has_independent_rows(p, i) else 1.0 / 0.0
 
 
 cdef inline double component_coefficient(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
@@ -213,10 +215,10 @@ cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double*
     cdef double x
     cdef bint any_fixed_impulse = write_fixed_impulses(s, v)
     if any_fixed_impulse and v.r != NULL:
-        rows_velocity(p, v.r, s.fixed, scratch)
-        rows_slack(p, v.r, s.fixed, scratch, w)
+        compute_velocity_change(p, v.r, s.fixed, scratch)
+        compute_body_slack(p, v.r, s.fixed, scratch, w)
     elif any_fixed_impulse and v.g != NULL:
-        general_slack(p, v.g, s.fixed, scratch, w)
+        compute_generalized_slack(p, v.g, s.fixed, scratch, w)
     for i in range(s.e.n):
         for q in range(s.e.ptr[i], s.e.ptr[i + 1]):
             j = s.keep[q]

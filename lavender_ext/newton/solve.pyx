@@ -11,7 +11,7 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport address, zeros
+from lavender_ext.core.arrays cimport get_data_pointer, allocate_zeros
 from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
 from lavender_ext.core.block_types cimport COULOMB
@@ -211,7 +211,7 @@ cdef void call_solve(void* at, double* x) noexcept with gil:
 
 
 cdef inline object part(object array, const void* at, Py_ssize_t n):
-    cdef Py_ssize_t i = (<const char*>at - <const char*>address(array)) // <Py_ssize_t>array.itemsize
+    cdef Py_ssize_t i = (<const char*>at - <const char*>get_data_pointer(array)) // <Py_ssize_t>array.itemsize
     return array[i:i + n]
 
 
@@ -234,7 +234,7 @@ cdef class Layout:
         cdef int64_t k = body.shape[0], below
         cdef int32_t i
         self.index = np.empty(order_index_size(n, k) + 2, np.int32)
-        bind_pattern_workspace(a, <int32_t*>address(self.index), n, k)
+        bind_pattern_workspace(a, <int32_t*>get_data_pointer(self.index), n, k)
         if k:
             memcpy(a.body, &body[0, 0], 2 * k * sizeof(int32_t))
         with nogil:
@@ -242,7 +242,7 @@ cdef class Layout:
         if s * below >= 2**31:
             raise OverflowError("the factor has 2^31 rows of blocks or more")
         self.pattern = np.empty(block_pattern_index_size(n, s, a.nptr[n], below), np.int32)
-        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, <int32_t*>address(self.pattern))
+        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, <int32_t*>get_data_pointer(self.pattern))
         self.n, self.s, self.supernodes = n, s, self.blocks.factor.supernodes
         for i in range(n):
             self.work += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
@@ -285,17 +285,17 @@ cdef class Solve(Method):
         cdef int64_t rows = data.blocks.n_rows, k
         self.data, self.view, self.own = data, data.view(), method_t(NULL, NULL, system_step)
         self.index = np.zeros(head() + method_index_size(rows) + 1, np.int32)
-        self.space.index = <int32_t*>address(self.index)
+        self.space.index = <int32_t*>get_data_pointer(self.index)
         n = self.n = state_of(&self.space)
         set_problem(n, &self.view.p, self.view.a, self.view.r, self.view.g)
         set_reference(&n.problem, data.reference_energy, data.reference_velocity)
-        judge = zeros(judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g))
+        judge = allocate_zeros(judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
-        bind_judge_workspace(n, <double*>address(judge))
+        bind_judge_workspace(n, <double*>get_data_pointer(judge))
         bind_index_workspace(n, rows, self.space.index + head())
         find_elements(&n.sc, &v)
-        self.real = zeros(method_real_size(rows, n.sc.small))
-        bind_real_workspace(n, &v, <double*>address(self.real))
+        self.real = allocate_zeros(method_real_size(rows, n.sc.small))
+        bind_real_workspace(n, &v, <double*>get_data_pointer(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
         self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)
@@ -342,10 +342,10 @@ cdef class Solve(Method):
         cdef double[::1] matrix = np.empty(len(h) + 1), y = np.empty(self.m)
         self.held += [indptr, indices, values, to, other, h, diagonal, matrix, y]
         self.n.s.form, self.n.s.symmetric, self.n.s.y = SPARSE, symmetric, &y[0]
-        self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>address(indptr), <int32_t*>address(indices)
-        self.n.s.a.data = <double*>address(values)
-        self.n.s.coupled.to, self.n.s.coupled.other = <int32_t*>address(to), <int32_t*>address(other)
-        self.n.s.coupled.diagonal, self.n.s.coupled.h = <int32_t*>address(diagonal), <double*>address(h)
+        self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>get_data_pointer(indptr), <int32_t*>get_data_pointer(indices)
+        self.n.s.a.data = <double*>get_data_pointer(values)
+        self.n.s.coupled.to, self.n.s.coupled.other = <int32_t*>get_data_pointer(to), <int32_t*>get_data_pointer(other)
+        self.n.s.coupled.diagonal, self.n.s.coupled.h = <int32_t*>get_data_pointer(diagonal), <double*>get_data_pointer(h)
         linear.lend(np.asarray(matrix)[:len(h)], PIVOT_TOLERANCE)
         self.n.s.coupled.indptr = linear.f.rows.indptr
         self.linear, self.n.s.linear = linear, &linear.f
@@ -361,7 +361,7 @@ cdef class Solve(Method):
         cdef int64_t i, rows = self.data.blocks.n_rows
         cdef int32_t used = 0
         panel = np.zeros((rows, 12))
-        cdef double* k = <double*>address(panel)
+        cdef double* k = <double*>get_data_pointer(panel)
         cdef double[::1] root = np.empty(10 * r.n_bodies + 1)
         with nogil:
             if column is not None:
@@ -383,11 +383,12 @@ cdef class Solve(Method):
         cdef int32_t factored = a.n * layout.s
         f[0] = layout.blocks
         own = np.empty(block_factor_index_size(a.n, layout.s) + len(self.ptr) + 1, np.int32)
-        a.group = <int32_t*>address(own) + block_factor_index_size(a.n, layout.s)
+        a.group = <int32_t*>get_data_pointer(own) + block_factor_index_size(a.n, layout.s)
         values = np.empty(factored + block_factor_size(f, lu) + 1)
         self.held += [panel, layout, own, values]
-        bind_factor(self.n, &a, <double*>address(panel), &columns[0], layout.s, lu, wide and has_wide(), <int32_t*>address(own),
-                    <double*>address(values), <double*>address(values) + factored)
+        bind_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
+                    <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
+                    <double*>get_data_pointer(values) + factored)
 
     # -- start and step ----------------------------------------------------------------------------
 

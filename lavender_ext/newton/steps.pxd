@@ -26,7 +26,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport length
+from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.newton.cones cimport add_cone_transpose, has_lower_bound, has_upper_bound, load_dual
 from lavender_ext.newton.elements cimport elements_t, is_row
@@ -143,7 +143,7 @@ cdef inline double contact_shift(const elements_t* e, int32_t i, const double* s
             phi += a * fabs(s[first])
             psi[first] = fraction * a * (1.0 if s[first] > 0.0 else -1.0 if s[first] < 0.0 else 0.0)
             continue
-        t = length(s + first, n)
+        t = euclidean_norm(s + first, n)
         for k in range(first, first + n):
             psi[k] = fraction * (a * s[k] / t) if t > 0.0 else 0.0
         phi += a * t

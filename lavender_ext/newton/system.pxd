@@ -12,7 +12,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.csr cimport csr_dot
+from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
@@ -91,7 +91,7 @@ cdef inline void system_times(system_t* s, const double* x, double* out) noexcep
             out[j] = dot(s.h + <int64_t>j * m, x, m)
     else:
         for j in range(m):
-            out[j] = csr_dot(&s.a, j, x)
+            out[j] = csr_row_dot(&s.a, j, x)
 
 
 # -- dense rows ------------------------------------------------------------------------------------------------

@@ -4,44 +4,44 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport row_error
-from lavender_ext.core.block_types cimport COULOMB, blocks_t, is_rows
+from lavender_ext.core.block cimport compute_row_error
+from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_independent_rows
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport dot6
 from lavender_ext.core.start cimport is_zero_impulse
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.linear cimport analyse_band, linear_factor, linear_solve, linear_t
-from lavender_ext.judge.measure cimport score_slack
-from lavender_ext.judge.score cimport new_score, relative, score_t
-from lavender_ext.judge.slack cimport rows_slack
-from lavender_ext.judge.tally cimport empty_tally, tally_row, tally_t
+from lavender_ext.judge.measure cimport score_given_slack
+from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
+from lavender_ext.judge.slack cimport compute_body_slack
+from lavender_ext.judge.tally cimport make_empty_tally, add_row_error, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEP_CHECK, JUDGED, MAX_BAND_WIDTH, MAX_TRACED_SCORES,
                                              MAX_WARM_ROWS, MAX_WARM_SWEEPS, MIN_SWEEPS_TO_GIVE_UP, SOLVED, SWEPT,
                                              UNDECIDED, bind_warm_workspace, warm_t, warm_workspace_size)
-from lavender_ext.sweep.pgs cimport relax_bodies_in_sequence
+from lavender_ext.sweep.pgs cimport sweep_bodies_in_sequence
 
 
 cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """Compute E0, V0 of lam = 0, w = -b; return 0 if the judge may use another reference."""
     cdef int32_t i, j
     cdef double e, rhs = 0.0, min_diagonal = 1.0 / 0.0, inf = 1.0 / 0.0
-    cdef tally_t s = empty_tally()
+    cdef tally_t s = make_empty_tally()
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if not 0.0 < p.d[j] < inf:
                 return 0
             min_diagonal = p.d[j] if p.d[j] < min_diagonal else min_diagonal
             rhs += p.b[j] * p.b[j]
-            if is_rows(p, i):
+            if has_independent_rows(p, i):
                 if not p.lower[j] <= 0.0 <= p.upper[j]:
                     return 0
-                e = row_error(0.0, -p.b[j], p.d[j], p.lower[j], p.upper[j])
+                e = compute_row_error(0.0, -p.b[j], p.d[j], p.lower[j], p.upper[j])
             elif j == p.ptr[i]:
-                e = row_error(0.0, -p.b[j], p.d[j], 0.0, inf)
+                e = compute_row_error(0.0, -p.b[j], p.d[j], 0.0, inf)
             else:
                 continue                                # The disk of lam_n = 0 has radius 0: e = 0.
-            tally_row(p, j, e, &s)
+            add_row_error(p, j, e, &s)
     energy[0] = sqrt(s.energy)
     velocity[0] = sqrt(s.fast)
     # Below 2^-48 of the norm of b the judge uses another reference.
@@ -84,14 +84,14 @@ cdef inline void store_score(const blocks_t* p, const rows_t* r, warm_t* s, doub
 cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
                           double v0) noexcept nogil:
     """Return the judge's relative residual of lam, given v = M^-1 J^T lam; infinite if it is not finite."""
-    cdef score_t x = new_score()
-    rows_slack(p, r, lam, v, s.slack)
-    score_slack(p, lam, s.slack, s.error, &x)
+    cdef score_t x = make_empty_score()
+    compute_body_slack(p, r, lam, v, s.slack)
+    score_given_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
         store_score(p, r, s, x.energy)
     if x.relative >= 0.0:                               # The residual of the worst island.
         return x.relative
-    return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
+    return relative_residual(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 
 cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
@@ -149,7 +149,7 @@ cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexce
 cdef double judge_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
                           double v0) noexcept nogil:
     """Return the judge's relative residual of lam, with v computed from lam."""
-    rows_velocity(p, r, lam, v)
+    compute_velocity_change(p, r, lam, v)
     return score_impulse(p, r, s, lam, v, e0, v0)
 
 
@@ -185,7 +185,7 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     cdef double before, now = s.relative, predicted
     while n < MAX_WARM_SWEEPS:
         while n < next_:
-            relax_bodies_in_sequence(p, r, lam, v)
+            sweep_bodies_in_sequence(p, r, lam, v)
             n += 1
         s.sweeps = n
         before = now
@@ -218,7 +218,7 @@ cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double to
     if is_zero_impulse(p, lam) or p.n_rows > MAX_WARM_ROWS or p.law != COULOMB or not zero_impulse_errors(p, &e0, &v0):
         return UNDECIDED
     if not has_velocity:
-        rows_velocity(p, r, lam, v)
+        compute_velocity_change(p, r, lam, v)
     s.relative = score_impulse(p, r, s, lam, v, e0, v0)
     if s.relative <= tol:
         return JUDGED
@@ -232,7 +232,7 @@ cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double to
     if result == UNDECIDED:
         for j in range(p.n_rows):
             lam[j] = s.start[j]
-        rows_velocity(p, r, lam, v)
+        compute_velocity_change(p, r, lam, v)
     return result
 
 

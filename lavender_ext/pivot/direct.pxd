@@ -1,11 +1,12 @@
 """The method of `direct`, step by step, for hosts with or without Python (states in direct.pyx).
 
     t.v, t.e0, t.v0, t.least, t.sweeps, t.linear, t.symmetric, and a, p, band, order, linear.tiny of t.s are set
-    bind_direct_workspace(&t, real, integers)       arrays of `direct_workspace_doubles` and `direct_workspace_integers` entries
-    begin_direct(&t, start), or begin_exchanges(&t) from the bounds in t.s.at
-    step_direct(&t, max_rounds)                     until t.is_over
+    bind_direct_workspace(&t, real, integers)       arrays of as many numbers as the two counts below
+    begin_direct_solve(&t, start), or begin_bound_exchanges(&t) from the bounds in t.s.at
+    step_direct_solve(&t, max_rounds)               until t.is_over
 
-After each step `best` is the best judged impulse.
+The counts are `count_direct_workspace_doubles` and `count_direct_workspace_integers`. After each step `best` is the best judged
+impulse.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -58,7 +59,7 @@ cdef struct direct_t:
     int32_t refined             # corrections
     int32_t shifts
     int32_t searches            # step lengths that were tried
-    int32_t next_shift          # index of the next shift of `path_shift`; N_SHIFTS: keep the present one
+    int32_t next_shift          # index of the next shift of `get_proximal_shift`; N_SHIFTS: keep the present one
     double larger_shift         # if positive, the next shift
     int32_t passes              # begun
     int32_t waited              # passes since the best residual was halved
@@ -66,13 +67,13 @@ cdef struct direct_t:
     double halved_from          # residual that the next pass has to halve
 
 
-cdef int64_t direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil
-cdef int64_t direct_workspace_integers(const view_t* v) noexcept nogil
+cdef int64_t count_direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil
+cdef int64_t count_direct_workspace_integers(const view_t* v) noexcept nogil
 cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexcept nogil
-cdef void begin_direct(direct_t* t, const double* start) noexcept nogil
-cdef void begin_exchanges(direct_t* t) noexcept nogil
-cdef int32_t step_direct(direct_t* t, int32_t max_rounds) noexcept nogil
-cdef int32_t is_solved(const direct_t* t) noexcept nogil
+cdef void begin_direct_solve(direct_t* t, const double* start) noexcept nogil
+cdef void begin_bound_exchanges(direct_t* t) noexcept nogil
+cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil
+cdef int32_t is_solved_to_rounding(const direct_t* t) noexcept nogil
 cdef void judge_iterate(direct_t* t) noexcept nogil
 
 

@@ -10,7 +10,7 @@
 
 (Bertsekas 1982.) (3) is monotone, so no set of free rows returns, which pivoting cannot guarantee on a nearly singular A.
 
-`step_direct` does at most a number of rounds of one state, so that hosts can check their clock between steps. States, and the
+`step_direct_solve` does at most a number of rounds of one state, so that hosts can check their clock between steps. States, and the
 results that change them; ROUNDS_USED keeps the state:
 
     GUESS     sweeps guess the free rows, or all rows are free; then as EXCHANGE
@@ -32,14 +32,19 @@ from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.linear cimport CHOLESKY, LU
-from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, judged_from, relative_of, scratch_of
-from lavender_ext.judge.score cimport is_at_floor, new_score, score_t
+from lavender_ext.judge.measure cimport (
+    residual_above_floor, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
+    count_judge_scratch,
+)
+from lavender_ext.judge.score cimport is_at_floor, make_empty_score, score_t
 from lavender_ext.pivot.direct cimport (CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED,
                                         direct_t)
-from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_workspace,
-                                           compute_slack, correct_free_rows, exchange_infeasible_rows, factor_all_rows,
-                                           factor_free_rows, guess_free_rows, pivoting_t, reset_patience, reset_pivoting,
-                                           run_rounds, set_shift, solve_all_rows)
+from lavender_ext.pivot.principal cimport (
+    INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_workspace, compute_slack_and_rounding,
+    correct_free_row_solution, exchange_infeasible_rows, factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps,
+    pivoting_t, reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
+    solve_with_all_rows_free,
+)
 
 
 cdef enum:
@@ -52,13 +57,13 @@ cdef enum:
 
 # -- workspace and begin -----------------------------------------------------------------------------------------
 
-cdef int64_t direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil:
+cdef int64_t count_direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil:
     """Return the number of doubles that `bind_direct_workspace` needs; half bandwidth -1: without a compiled factor."""
     cdef int64_t m = v.p.n_rows
-    return 16 * m + m * (band + 1) + 1 + scratch_of(v)
+    return 16 * m + m * (band + 1) + 1 + count_judge_scratch(v)
 
 
-cdef int64_t direct_workspace_integers(const view_t* v) noexcept nogil:
+cdef int64_t count_direct_workspace_integers(const view_t* v) noexcept nogil:
     """Return the number of integers that `bind_direct_workspace` needs."""
     return 4 * <int64_t>v.p.n_rows + 1
 
@@ -70,13 +75,13 @@ cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexc
     t.start, t.origin, t.slope, t.step = real + 6 * m, real + 7 * m, real + 8 * m, real + 9 * m
     t.scratch = real + 10 * m
     t.side = index + 3 * m
-    bind_pivoting_workspace(&t.s, t.scratch + scratch_of(&t.v), index)
+    bind_pivoting_workspace(&t.s, t.scratch + count_judge_scratch(&t.v), index)
     if not t.symmetric:
         t.s.linear.swap, t.s.linear.by = index + 2 * m, LU
-    reset_direct(t)
+    reset_direct_solve(t)
 
 
-cdef inline void reset_direct(direct_t* t) noexcept nogil:
+cdef inline void reset_direct_solve(direct_t* t) noexcept nogil:
     reset_pivoting(&t.s)
     t.relative = INFINITY
     t.floor = 0.0
@@ -84,32 +89,32 @@ cdef inline void reset_direct(direct_t* t) noexcept nogil:
     t.state = GUESS
 
 
-cdef void begin_direct(direct_t* t, const double* start) noexcept nogil:
+cdef void begin_direct_solve(direct_t* t, const double* start) noexcept nogil:
     """Begin a solve at start (m) [N s]."""
-    reset_direct(t)
+    reset_direct_solve(t)
     memcpy(t.start, start, t.s.n * sizeof(double))
 
 
-cdef void begin_exchanges(direct_t* t) noexcept nogil:
+cdef void begin_bound_exchanges(direct_t* t) noexcept nogil:
     """Begin with exchanges from the bounds in s.at; the best impulse is kept."""
-    set_shift(&t.s, 0.0)
+    set_diagonal_shift(&t.s, 0.0)
     t.passes = t.is_over = 0
     t.state = EXCHANGE
 
 
 # -- judging and refinement --------------------------------------------------------------------------------------
 
-cdef inline int32_t is_good(const direct_t* t) noexcept nogil:
+cdef inline int32_t is_best_impulse_accurate(const direct_t* t) noexcept nogil:
     """Return whether the best residual is at most `least`, or at a floor that excuses it."""
     return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))
 
 
-cdef int32_t is_solved(const direct_t* t) noexcept nogil:
-    """Return `is_good`, or for a linear system whether only rounding is left."""
-    return is_good(t) or (t.linear and is_at_floor(t.relative, t.floor))
+cdef int32_t is_solved_to_rounding(const direct_t* t) noexcept nogil:
+    """Return `is_best_impulse_accurate`, or for a linear system whether only rounding is left."""
+    return is_best_impulse_accurate(t) or (t.linear and is_at_floor(t.relative, t.floor))
 
 
-cdef inline void clip_rows(const direct_t* t, const double* x, double* out) noexcept nogil:
+cdef inline void clip_rows_to_bounds(const direct_t* t, const double* x, double* out) noexcept nogil:
     cdef int32_t i
     for i in range(t.s.n):
         out[i] = clip(x[i], t.s.p.lower[i], t.s.p.upper[i])
@@ -117,29 +122,29 @@ cdef inline void clip_rows(const direct_t* t, const double* x, double* out) noex
 
 cdef void judge_iterate(direct_t* t) noexcept nogil:
     """Judge s.x, clipped to its bounds, and keep it if it is the best."""
-    cdef score_t score = new_score()
+    cdef score_t score = make_empty_score()
     cdef double* x = t.x
     cdef double* w = x + t.s.n
-    clip_rows(t, t.s.x, x)
+    clip_rows_to_bounds(t, t.s.x, x)
     judge_view(&t.v, x, w, w + t.s.n, t.scratch, True, &score)
-    t.now = relative_of(&score, w, t.s.n, t.e0, t.v0)
+    t.now = relative_residual_of_score(&score, w, t.s.n, t.e0, t.v0)
     if t.now < t.relative:
         t.relative = t.now
-        t.floor = floor_of(&score, t.e0, t.v0)
+        t.floor = relative_floor_of_score(&score, t.e0, t.v0)
         t.score = score
         t.x, t.best = t.best, x
 
 
-cdef inline int32_t refine(direct_t* t) noexcept nogil:
+cdef inline int32_t refine_free_rows(direct_t* t) noexcept nogil:
     """Correct the free rows while that halves the residual; return ROUNDS_USED if a row was exchanged, else SOLVED."""
     cdef double previous = INFINITY
     cdef int32_t _
     for _ in range(MAX_CORRECTIONS):
-        if is_good(t) or not t.now < 0.5 * previous:
+        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous:
             break
         previous = t.now
-        correct_free_rows(&t.s)
-        compute_slack(&t.s)
+        correct_free_row_solution(&t.s)
+        compute_slack_and_rounding(&t.s)
         t.refined += 1
         if exchange_infeasible_rows(&t.s):
             return ROUNDS_USED
@@ -147,7 +152,7 @@ cdef inline int32_t refine(direct_t* t) noexcept nogil:
     return SOLVED
 
 
-cdef inline int32_t judge_rounds(direct_t* t, int32_t code) noexcept nogil:
+cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexcept nogil:
     """Judge and refine the result of rounds that ended with `code`; return `code`, or ROUNDS_USED if a row was exchanged.
 
     Rows whose signs differ by rounding may be exchanged without end; the judge then finds that only rounding is left.
@@ -158,15 +163,15 @@ cdef inline int32_t judge_rounds(direct_t* t, int32_t code) noexcept nogil:
     if code != SOLVED or t.s.linear.shift != 0.0:
         return code
     t.solved = 1
-    if is_good(t):
+    if is_best_impulse_accurate(t):
         return SOLVED
-    compute_slack(&t.s)
-    return refine(t)
+    compute_slack_and_rounding(&t.s)
+    return refine_free_rows(t)
 
 
 # -- linear systems and exchanges --------------------------------------------------------------------------------
 
-cdef inline int32_t factor_linear(direct_t* t) noexcept nogil:
+cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
     """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
     if not t.s.is_factored:
         factor_all_rows(&t.s)
@@ -178,35 +183,35 @@ cdef inline int32_t factor_linear(direct_t* t) noexcept nogil:
     return SMALL_PIVOT
 
 
-cdef inline int32_t step_linear(direct_t* t) noexcept nogil:
+cdef inline int32_t step_linear_solve(direct_t* t) noexcept nogil:
     """Factor and solve with all rows free."""
-    cdef int32_t code = factor_linear(t)
+    cdef int32_t code = factor_linear_system(t)
     if code != SOLVED:
         return code
     t.s.n_rounds += 1
-    solve_all_rows(&t.s)
-    return judge_rounds(t, SOLVED)
+    solve_with_all_rows_free(&t.s)
+    return judge_and_refine_exchanges(t, SOLVED)
 
 
-cdef inline int32_t step_guess(direct_t* t, int32_t max_rounds) noexcept nogil:
+cdef inline int32_t step_guess_and_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
     """Guess the free rows, then do at most `max_rounds` rounds."""
-    t.swept = not guess_free_rows(&t.s, t.start, t.sweeps, max_rounds)
-    return judge_rounds(t, run_rounds(&t.s, max_rounds) if t.swept else SOLVED)
+    t.swept = not guess_free_rows_by_sweeps(&t.s, t.start, t.sweeps, max_rounds)
+    return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds) if t.swept else SOLVED)
 
 
 cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
     """Do at most `max_rounds` rounds."""
-    return judge_rounds(t, run_rounds(&t.s, max_rounds))
+    return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds))
 
 
 # -- passes with a shift -----------------------------------------------------------------------------------------
 
-cdef inline double path_shift(int32_t i) noexcept nogil:
+cdef inline double get_proximal_shift(int32_t i) noexcept nogil:
     """Return the i-th shift s. The last one is far above the rounding of a factor and far below a mass ratio of 1e8."""
     return 1e-2 if i == 0 else 1e-4 if i == 1 else 1e-6 if i == 2 else 1e-8 if i == 3 else 1e-10
 
 
-cdef inline void begin_passes(direct_t* t, int32_t state) noexcept nogil:
+cdef inline void begin_proximal_passes(direct_t* t, int32_t state) noexcept nogil:
     """Prepare passes from the best impulse, with every shift for DESCENT and with the smallest for PASS."""
     cdef bint has_best = t.relative < INFINITY and t.floor <= 1e-6
     memcpy(t.s.x, t.best if has_best else t.start, t.s.n * sizeof(double))
@@ -218,49 +223,49 @@ cdef inline void begin_passes(direct_t* t, int32_t state) noexcept nogil:
     t.halved_from = INFINITY
 
 
-cdef inline void recenter(direct_t* t) noexcept nogil:
+cdef inline void recenter_proximal_term(direct_t* t) noexcept nogil:
     memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
 
 
-cdef inline void begin_pass(direct_t* t) noexcept nogil:
+cdef inline void begin_proximal_pass(direct_t* t) noexcept nogil:
     t.is_pass_over = 0
     t.passes += 1
-    recenter(t)
+    recenter_proximal_term(t)
     if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
-        set_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else path_shift(t.next_shift))
+        set_diagonal_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else get_proximal_shift(t.next_shift))
         t.next_shift += t.larger_shift == 0.0
         t.larger_shift = 0.0
         t.shifts += 1
-    reset_patience(&t.s)
+    reset_exchange_patience(&t.s)
 
 
-cdef inline void repeat_pass(direct_t* t) noexcept nogil:
+cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
     """Repeat the pass on its free rows with its factor while that halves the residual, whatever the signs are."""
     cdef double previous = INFINITY
     cdef int32_t _
     for _ in range(MAX_CORRECTIONS):
-        if is_good(t) or not t.now < 0.5 * previous:
+        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous:
             break
         previous = t.now
-        recenter(t)
-        compute_slack(&t.s)
-        correct_free_rows(&t.s)
-        compute_slack(&t.s)
+        recenter_proximal_term(t)
+        compute_slack_and_rounding(&t.s)
+        correct_free_row_solution(&t.s)
+        compute_slack_and_rounding(&t.s)
         t.refined += 1
         judge_iterate(t)
         if not t.now < previous:
             memcpy(t.s.x, t.s.center, t.s.n * sizeof(double))
 
 
-cdef inline int32_t step_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
+cdef inline int32_t step_proximal_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
     """Do at most `max_rounds` rounds of a pass; the header has its results."""
     cdef int32_t code, i
     if t.is_pass_over and t.passes == MAX_PASSES:
         return PASSES_USED
     if t.is_pass_over:
-        begin_pass(t)
-    code = descend(t, max_rounds) if t.state == DESCENT else step_exchanges(t, max_rounds)
-    if is_solved(t):
+        begin_proximal_pass(t)
+    code = run_descent_steps(t, max_rounds) if t.state == DESCENT else step_exchanges(t, max_rounds)
+    if is_solved_to_rounding(t):
         return SOLVED
     if code == ROUNDS_USED:
         return ROUNDS_USED
@@ -270,10 +275,10 @@ cdef inline int32_t step_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
             return CYCLING
         t.state = DESCENT
         t.next_shift = 0
-        clip_rows(t, t.s.center, t.s.x)
+        clip_rows_to_bounds(t, t.s.center, t.s.x)
         return STUCK
     if code != SOLVED:
-        if t.s.linear.shift >= path_shift(0):
+        if t.s.linear.shift >= get_proximal_shift(0):
             return INDEFINITE
         t.larger_shift = 100.0 * t.s.linear.shift
         t.next_shift = N_SHIFTS
@@ -281,8 +286,8 @@ cdef inline int32_t step_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
         return SMALL_PIVOT
     for i in range(t.s.n):
         t.step[i] = t.s.x[i] - t.s.center[i]
-    repeat_pass(t)
-    if is_solved(t):
+    repeat_proximal_pass(t)
+    if is_solved_to_rounding(t):
         return SOLVED
     if t.next_shift < N_SHIFTS or t.relative <= 0.5 * t.halved_from:
         t.halved_from = t.relative
@@ -311,7 +316,7 @@ cdef inline bint choose_free_rows(direct_t* t) noexcept nogil:
     return s.is_factored and changed == 0
 
 
-cdef inline double search_line(direct_t* t) noexcept nogil:
+cdef inline double search_step_length(direct_t* t) noexcept nogil:
     """Find the step length (4), and compute x and w at its end.
 
     phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x) has no cancellation.
@@ -322,7 +327,7 @@ cdef inline double search_line(direct_t* t) noexcept nogil:
     for _ in range(MAX_STEP_LENGTHS):
         for i in range(s.n):
             s.x[i] = clip(t.origin[i] + length * t.step[i], s.p.lower[i], s.p.upper[i])
-        compute_slack(s)
+        compute_slack_and_rounding(s)
         t.searches += 1
         gained = promised = 0.0
         for i in range(s.n):
@@ -335,7 +340,7 @@ cdef inline double search_line(direct_t* t) noexcept nogil:
     return length
 
 
-cdef inline bint is_minimum(const direct_t* t) noexcept nogil:
+cdef inline bint is_descent_minimum(const direct_t* t) noexcept nogil:
     """Return whether the complete step was within the bounds, and no w pushes a row off its bound."""
     cdef const pivoting_t* s = &t.s
     cdef int32_t i
@@ -350,13 +355,13 @@ cdef inline bint is_minimum(const direct_t* t) noexcept nogil:
     return True
 
 
-cdef inline int32_t descend(direct_t* t, int32_t max_steps) noexcept nogil:
+cdef inline int32_t run_descent_steps(direct_t* t, int32_t max_steps) noexcept nogil:
     """Do at most `max_steps` steps (3) and judge the result: SOLVED, ROUNDS_USED, SMALL_PIVOT or INDEFINITE."""
     cdef pivoting_t* s = &t.s
     cdef int32_t i, _, code = ROUNDS_USED
     cdef double length
-    clip_rows(t, s.x, s.x)
-    compute_slack(s)
+    clip_rows_to_bounds(t, s.x, s.x)
+    compute_slack_and_rounding(s)
     for _ in range(max_steps):
         memcpy(t.origin, s.x, s.n * sizeof(double))
         memcpy(t.slope, s.w, s.n * sizeof(double))
@@ -368,11 +373,11 @@ cdef inline int32_t descend(direct_t* t, int32_t max_steps) noexcept nogil:
                 s.n_rounds += 1
                 return INDEFINITE if s.linear.pivots.negative > 0 else SMALL_PIVOT
         s.n_rounds += 1
-        correct_free_rows(s)
+        correct_free_row_solution(s)
         for i in range(s.n):
             t.step[i] = s.x[i] - t.origin[i]
-        length = search_line(t)
-        if length == 1.0 and is_minimum(t):
+        length = search_step_length(t)
+        if length == 1.0 and is_descent_minimum(t):
             code = SOLVED
             break
     judge_iterate(t)
@@ -381,13 +386,13 @@ cdef inline int32_t descend(direct_t* t, int32_t max_steps) noexcept nogil:
 
 # -- the driver --------------------------------------------------------------------------------------------------
 
-cdef inline bint is_final(const direct_t* t, int32_t code) noexcept nogil:
+cdef inline bint is_final_result(const direct_t* t, int32_t code) noexcept nogil:
     return code == SOLVED or code == INDEFINITE or code == PASSES_USED or code == CYCLING
 
 
-cdef inline int32_t leave_exchanges(direct_t* t, int32_t code) noexcept nogil:
+cdef inline int32_t choose_state_after_exchanges(direct_t* t, int32_t code) noexcept nogil:
     """Choose what follows exchanges or a linear solve that ended with `code`; return the result of the step."""
-    if is_solved(t):
+    if is_solved_to_rounding(t):
         return SOLVED
     if code == ROUNDS_USED or code == INDEFINITE:
         return code
@@ -395,31 +400,31 @@ cdef inline int32_t leave_exchanges(direct_t* t, int32_t code) noexcept nogil:
         return CYCLING
     if not t.symmetric and t.linear:
         return INDEFINITE if code == SMALL_PIVOT else PASSES_USED
-    begin_passes(t, DESCENT if code == STUCK else PASS)
+    begin_proximal_passes(t, DESCENT if code == STUCK else PASS)
     return SMALL_PIVOT if code == SMALL_PIVOT else STUCK
 
 
-cdef int32_t step_direct(direct_t* t, int32_t max_rounds) noexcept nogil:
+cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil:
     """Do at most `max_rounds` rounds of the present state; the header has states and results."""
     cdef int32_t code
     if t.state == GUESS or t.state == EXCHANGE:
         if t.linear:
-            code = step_linear(t)
+            code = step_linear_solve(t)
         elif t.state == GUESS:
-            code = step_guess(t, max_rounds)
+            code = step_guess_and_exchanges(t, max_rounds)
         else:
             code = step_exchanges(t, max_rounds)
         t.state = EXCHANGE
-        code = leave_exchanges(t, code)
+        code = choose_state_after_exchanges(t, code)
     else:
-        code = step_pass(t, max_rounds)
-    t.is_over = is_final(t, code)
+        code = step_proximal_pass(t, max_rounds)
+    t.is_over = is_final_result(t, code)
     return code
 
 
 # -- for Python --------------------------------------------------------------------------------------------------
 
-cdef int32_t factor_outside(void* owner, const int32_t* _place, int32_t n_free, double shift) noexcept with gil:
+cdef int32_t call_python_factor(void* owner, const int32_t* _place, int32_t n_free, double shift) noexcept with gil:
     """Call the factor of Python; return -1 if it was not started or has raised."""
     cdef Pivoting rows = <Pivoting>owner
     cdef Py_ssize_t m = rows.t.s.n
@@ -432,7 +437,7 @@ cdef int32_t factor_outside(void* owner, const int32_t* _place, int32_t n_free, 
         return -1
 
 
-cdef void solve_outside(void* owner, int32_t n_free, double* y) noexcept with gil:
+cdef void call_python_solve(void* owner, int32_t n_free, double* y) noexcept with gil:
     """Solve with the factor of Python."""
     cdef Pivoting rows = <Pivoting>owner
     cdef const double[::1] solution
@@ -491,15 +496,15 @@ cdef class Pivoting:
             if m:
                 self.t.s.order = &row_order[0]
         # One array for the vectors and the factor: two allocations in all.
-        self.reals = np.zeros(direct_workspace_doubles(&self.t.v, band))
-        self.ints = np.zeros(direct_workspace_integers(&self.t.v), np.int32)
+        self.reals = np.zeros(count_direct_workspace_doubles(&self.t.v, band))
+        self.ints = np.zeros(count_direct_workspace_integers(&self.t.v), np.int32)
         reals, ints = self.reals, self.ints
         bind_direct_workspace(&self.t, &reals[0], &ints[0])
         if outside is not None:
             self.t.s.linear.by = CHOLESKY
             self.t.s.outside = <void*>self
-            self.t.s.factor_outside = factor_outside
-            self.t.s.solve_outside = solve_outside
+            self.t.s.factor_outside = call_python_factor
+            self.t.s.solve_outside = call_python_solve
 
     cdef int raise_error(self, int32_t code) except -1:
         """Raise the error of the factor of Python, if any; else return `code`."""
@@ -512,7 +517,7 @@ cdef class Pivoting:
         """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
         cdef int32_t code
         with nogil:
-            code = factor_linear(&self.t)
+            code = factor_linear_system(&self.t)
         return self.raise_error(code)
 
     def begin(self, const double[::1] start, double least, int sweeps):
@@ -524,7 +529,7 @@ cdef class Pivoting:
         """Do at most `max_rounds` rounds, refined and judged; return the result of the step (states in direct.pyx)."""
         cdef int32_t code
         with nogil:
-            code = step_direct(&self.t, max_rounds)
+            code = step_direct_solve(&self.t, max_rounds)
         return self.raise_error(code)
 
     @property
@@ -545,7 +550,7 @@ cdef class Pivoting:
     @property
     def above_floor(self):
         """Part of the best relative residual that rounding does not explain, inf before the first impulse."""
-        return above_floor_of(&self.t.score, self.t.relative, self.t.floor) if self.t.relative < INFINITY else INFINITY
+        return residual_above_floor(&self.t.score, self.t.relative, self.t.floor) if self.t.relative < INFINITY else INFINITY
 
     @property
     def changed(self):
@@ -588,7 +593,7 @@ cdef class Pivoting:
             return None
         at = 0 if self.t.best < self.t.x else 3 * m     # The two arrays change places.
         numbers = self.reals[at:at + 3 * m].copy()
-        return judged_from(self.judged, numbers[:m], numbers[m:], &self.t.score, self.t.relative, self.t.floor)
+        return make_judged(self.judged, numbers[:m], numbers[m:], &self.t.score, self.t.relative, self.t.floor)
 
     def skipped(self):
         """Return the rows whose pivots were small in the last factorisation, in order of elimination."""

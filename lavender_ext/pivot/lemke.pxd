@@ -1,14 +1,17 @@
-"""Lemke's method for other kernels: bind a workspace, then call `follow_paths` until it returns DONE (states in lemke.pyx)."""
+"""Lemke's method for other kernels: bind a workspace, then call `follow_lemke_paths` until it returns DONE.
+
+The states are in lemke.pyx.
+"""
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.pivot.direct cimport direct_t
 
 
-cpdef enum:                     # results of `follow_paths`
+cpdef enum:                     # results of `follow_lemke_paths`
     DONE = 0                    # the residual is at rounding, or every path has ended
     PIVOTS = 1                  # the pivots of the call are used up
-    RAY = 2                     # no variable leaves: `get_ray` may be a certificate
+    RAY = 2                     # no variable leaves: `get_ray_direction` may be a certificate
     LATE = 3                    # a factor at the end of a path was not started, because of the deadline
 
 
@@ -40,7 +43,7 @@ cdef struct lemke_t:
 cdef int64_t lemke_workspace_doubles(const blocks_t* p) noexcept nogil
 cdef int64_t lemke_workspace_integers(const blocks_t* p) noexcept nogil
 cdef void bind_lemke_workspace(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil
-cdef void begin_paths(lemke_t* l) noexcept nogil
-cdef int32_t follow_paths(lemke_t* l, int32_t pivots) noexcept nogil
+cdef void begin_lemke_solve(lemke_t* l) noexcept nogil
+cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil
 cdef void judge_unfinished_path(lemke_t* l) noexcept nogil
-cdef void get_ray(const lemke_t* l, double* y) noexcept nogil
+cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil

@@ -43,8 +43,9 @@ import numpy as np
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.pivot.direct cimport (Pivoting, begin_direct, begin_exchanges, direct_t, is_solved, judge_iterate,
-                                        step_direct)
+from lavender_ext.pivot.direct cimport (Pivoting, begin_direct_solve, begin_bound_exchanges, direct_t, is_solved_to_rounding,
+                                        judge_iterate,
+                                        step_direct_solve)
 from lavender_ext.pivot.lemke cimport DONE, LATE, PIVOTS, RAY, dictionary_t, lemke_t
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE
 
@@ -72,27 +73,27 @@ cdef enum:
 
 # -- the dictionary ----------------------------------------------------------------------------------------------
 
-cdef inline int32_t complement(const dictionary_t* d, int32_t variable) noexcept nogil:
+cdef inline int32_t complementary_variable(const dictionary_t* d, int32_t variable) noexcept nogil:
     """Return s_k of w_k, and w_k of s_k."""
     return variable - d.n_pairs if variable >= d.n_pairs else variable + d.n_pairs
 
 
-cdef inline int32_t row_of(const dictionary_t* d, int32_t variable) noexcept nogil:
+cdef inline int32_t row_of_basic_variable(const dictionary_t* d, int32_t variable) noexcept nogil:
     """Return the row of a basic variable, or -1."""
     return d.position[variable]
 
 
-cdef inline int32_t column_of(const dictionary_t* d, int32_t variable) noexcept nogil:
+cdef inline int32_t column_of_nonbasic_variable(const dictionary_t* d, int32_t variable) noexcept nogil:
     """Return the column of a nonbasic variable."""
     return -1 - d.position[variable]
 
 
-cdef inline void set_basic(dictionary_t* d, int32_t row, int32_t variable) noexcept nogil:
+cdef inline void set_basic_variable(dictionary_t* d, int32_t row, int32_t variable) noexcept nogil:
     d.basic[row] = variable
     d.position[variable] = row
 
 
-cdef inline void set_nonbasic(dictionary_t* d, int32_t column, int32_t variable) noexcept nogil:
+cdef inline void set_nonbasic_variable(dictionary_t* d, int32_t column, int32_t variable) noexcept nogil:
     d.nonbasic[column] = variable
     d.position[variable] = -1 - column
 
@@ -105,7 +106,8 @@ cdef inline double inverse_basis_entry(const dictionary_t* d, int32_t row, int32
     return 1.0 if at == row else 0.0
 
 
-cdef inline bint precedes(const dictionary_t* d, int32_t i, int32_t k, double divisor_i, double divisor_k) noexcept nogil:
+cdef inline bint precedes_lexicographically(const dictionary_t* d, int32_t i, int32_t k, double divisor_i,
+                                            double divisor_k) noexcept nogil:
     """Return whether beta_i / divisor_i is lexicographically below beta_k / divisor_k."""
     cdef int32_t j
     cdef double x, y, tolerance
@@ -120,7 +122,7 @@ cdef inline bint precedes(const dictionary_t* d, int32_t i, int32_t k, double di
     return i < k
 
 
-cdef inline void pivot(dictionary_t* d, int32_t r, int32_t c) noexcept nogil:
+cdef inline void pivot_dictionary(dictionary_t* d, int32_t r, int32_t c) noexcept nogil:
     """Exchange the basic variable of row r and the nonbasic variable of column c."""
     cdef int32_t i, j, n = d.n + FIRST, leaving = d.basic[r]
     cdef double* pivot_row = d.t + r * d.width
@@ -137,11 +139,11 @@ cdef inline void pivot(dictionary_t* d, int32_t r, int32_t c) noexcept nogil:
         row[c] = 0.0
         for j in range(n):
             row[j] += factor * pivot_row[j]
-    set_basic(d, r, d.nonbasic[c])
-    set_nonbasic(d, c, leaving)
+    set_basic_variable(d, r, d.nonbasic[c])
+    set_nonbasic_variable(d, c, leaving)
 
 
-cdef inline int32_t limiting_row(const dictionary_t* d, int32_t c) noexcept nogil:
+cdef inline int32_t find_leaving_row(const dictionary_t* d, int32_t c) noexcept nogil:
     """Return the row (3) whose variable leaves if the variable of column c enters, or -1. Among equal ratios z leaves."""
     cdef int32_t i, best = -1
     cdef double column_scale = 0.0, value_scale = 0.0, divisor, value, ratio, min_ratio = 0.0, tolerance
@@ -161,38 +163,38 @@ cdef inline int32_t limiting_row(const dictionary_t* d, int32_t c) noexcept nogi
         if best < 0 or ratio < min_ratio - tolerance:
             best, min_ratio = i, ratio
         elif ratio <= min_ratio + tolerance and d.basic[best] != 2 * d.n_pairs:
-            if d.basic[i] == 2 * d.n_pairs or precedes(d, i, best, divisor, -d.t[best * d.width + c]):
+            if d.basic[i] == 2 * d.n_pairs or precedes_lexicographically(d, i, best, divisor, -d.t[best * d.width + c]):
                 best, min_ratio = i, ratio
     return best
 
 
 # -- bounded rows as pairs ---------------------------------------------------------------------------------------
 
-cdef inline bint is_free(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint is_free_row(const blocks_t* p, int32_t i) noexcept nogil:
     return p.lower[i] == -INFINITY and p.upper[i] == INFINITY
 
 
-cdef inline bint has_cap(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline bint has_two_bounds(const blocks_t* p, int32_t i) noexcept nogil:
     """Return whether row i has two bounds, which differ."""
     return p.lower[i] > -INFINITY and p.upper[i] < INFINITY and p.lower[i] != p.upper[i]
 
 
-cdef inline double base(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline double impulse_at_zero_variable(const blocks_t* p, int32_t i) noexcept nogil:
     """Return lambda_i at s = 0."""
     return p.lower[i] if p.lower[i] > -INFINITY else (p.upper[i] if p.upper[i] < INFINITY else 0.0)
 
 
-cdef inline double scale(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline double impulse_per_variable(const blocks_t* p, int32_t i) noexcept nogil:
     """Return (lambda_i - base) / s."""
     cdef double size = 1.0 / sqrt(p.d[i])
     return size if p.lower[i] > -INFINITY or p.upper[i] == INFINITY else -size
 
 
-cdef inline int32_t count_pairs(const blocks_t* p) noexcept nogil:
+cdef inline int32_t count_complementary_pairs(const blocks_t* p) noexcept nogil:
     cdef int32_t i, n = 0
     for i in range(p.n_rows):
         if p.lower[i] != p.upper[i]:
-            n += 1 + has_cap(p, i)
+            n += 1 + has_two_bounds(p, i)
     return n
 
 
@@ -201,29 +203,29 @@ cdef inline int32_t first_free_pair(const lemke_t* l) noexcept nogil:
     return l.n_bounded + l.n_caps
 
 
-cdef inline void number_pairs(lemke_t* l, int32_t* pair_of) noexcept nogil:
+cdef inline void number_complementary_pairs(lemke_t* l, int32_t* pair_of) noexcept nogil:
     """Number the pairs: bounded rows, their caps, free rows. Write the pair of each row to `pair_of`; -1 for a fixed row."""
     cdef const blocks_t* p = l.t.s.p
     cdef int32_t i, k, n = 0
     for i in range(p.n_rows):
         pair_of[i] = -1
-        if p.lower[i] != p.upper[i] and not is_free(p, i):
+        if p.lower[i] != p.upper[i] and not is_free_row(p, i):
             pair_of[i], l.row[n] = n, i
             n += 1
     l.n_bounded = n
     for k in range(l.n_bounded):
-        if has_cap(p, l.row[k]):
+        if has_two_bounds(p, l.row[k]):
             l.row[n] = k
             n += 1
     l.n_caps = n - l.n_bounded
     for i in range(p.n_rows):
-        if is_free(p, i):
+        if is_free_row(p, i):
             pair_of[i], l.row[n] = n, i
             n += 1
     l.d.n_pairs = l.d.n = n
 
 
-cdef inline void build_dictionary(lemke_t* l) noexcept nogil:
+cdef inline void build_lemke_dictionary(lemke_t* l) noexcept nogil:
     """Build (1) as a dictionary in which every w is basic; z has no column yet."""
     cdef dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
@@ -231,10 +233,10 @@ cdef inline void build_dictionary(lemke_t* l) noexcept nogil:
     cdef int32_t i, j, k, q
     cdef double w
     cdef double* row
-    number_pairs(l, pair_of)
+    number_complementary_pairs(l, pair_of)
     for k in range(d.n):
-        set_basic(d, k, k)
-        set_nonbasic(d, k + FIRST, d.n + k)
+        set_basic_variable(d, k, k)
+        set_nonbasic_variable(d, k + FIRST, d.n + k)
         row = d.t + k * d.width
         for j in range(d.n + FIRST):
             row[j] = 0.0
@@ -246,10 +248,10 @@ cdef inline void build_dictionary(lemke_t* l) noexcept nogil:
         w = -p.b[i]
         for q in range(l.t.s.a.indptr[i], l.t.s.a.indptr[i + 1]):
             j = l.t.s.a.indices[q]
-            w += l.t.s.a.data[q] * base(p, j)
+            w += l.t.s.a.data[q] * impulse_at_zero_variable(p, j)
             if pair_of[j] >= 0:
-                row[pair_of[j] + FIRST] = scale(p, i) * l.t.s.a.data[q] * scale(p, j)
-        row[VALUES] = scale(p, i) * w
+                row[pair_of[j] + FIRST] = impulse_per_variable(p, i) * l.t.s.a.data[q] * impulse_per_variable(p, j)
+        row[VALUES] = impulse_per_variable(p, i) * w
     # caps
     for k in range(l.n_bounded, first_free_pair(l)):
         j = l.row[k]
@@ -271,18 +273,18 @@ cdef inline void swap_entries(double* x, double* y, int32_t n, int64_t stride) n
         y[k * stride] = old
 
 
-cdef inline void swap_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
+cdef inline void swap_dictionary_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
     cdef int32_t variable = d.basic[i]
     swap_entries(d.t + i * d.width, d.t + j * d.width, d.n + FIRST, 1)
-    set_basic(d, i, d.basic[j])
-    set_basic(d, j, variable)
+    set_basic_variable(d, i, d.basic[j])
+    set_basic_variable(d, j, variable)
 
 
-cdef inline void swap_columns(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
+cdef inline void swap_dictionary_columns(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
     cdef int32_t variable = d.nonbasic[i]
     swap_entries(d.t + i, d.t + j, d.n_pairs, d.width)
-    set_nonbasic(d, i, d.nonbasic[j])
-    set_nonbasic(d, j, variable)
+    set_nonbasic_variable(d, i, d.nonbasic[j])
+    set_nonbasic_variable(d, j, variable)
 
 
 cdef inline bint find_free_pivot(const lemke_t* l, int32_t* r, int32_t* c) noexcept nogil:
@@ -298,7 +300,7 @@ cdef inline bint find_free_pivot(const lemke_t* l, int32_t* r, int32_t* c) noexc
     return best > 1e-11
 
 
-cdef inline int32_t find_pivot_pair(lemke_t* l, int32_t* r, int32_t* c) noexcept nogil:
+cdef inline int32_t find_pivot_pair_of_free_rows(lemke_t* l, int32_t* r, int32_t* c) noexcept nogil:
     """Find a free w (row r), a free s (column c), and a bounded pair between them; return its row, or -1.
 
     The product of the two entries, relative to their rows, is the largest: it is the determinant of both pivots, since w and s
@@ -323,7 +325,7 @@ cdef inline int32_t find_pivot_pair(lemke_t* l, int32_t* r, int32_t* c) noexcept
     return found
 
 
-cdef inline void retire_free_rows(lemke_t* l) noexcept nogil:
+cdef inline void pivot_out_free_rows(lemke_t* l) noexcept nogil:
     """Make s of every free row basic and w nonbasic, and retire both: move them behind the others.
 
     Retired rows still follow the pivots of the path; retired columns do not, because their variables stay 0.
@@ -333,29 +335,29 @@ cdef inline void retire_free_rows(lemke_t* l) noexcept nogil:
     while d.n > first_free_pair(l):
         r, c = d.n - 1, d.n - 1 + FIRST                 # Without a pivot the row depends on others, and s stays 0.
         if find_free_pivot(l, &r, &c):
-            pivot(d, r, c)
+            pivot_dictionary(d, r, c)
         else:
-            bounded = find_pivot_pair(l, &r, &c)
+            bounded = find_pivot_pair_of_free_rows(l, &r, &c)
             if bounded >= 0:
-                pivot(d, r, bounded + FIRST)
-                pivot(d, bounded, c)
-                swap_rows(d, r, bounded)
-                swap_columns(d, c, bounded + FIRST)
-        swap_rows(d, r, d.n - 1)
-        swap_columns(d, c, d.n - 1 + FIRST)
+                pivot_dictionary(d, r, bounded + FIRST)
+                pivot_dictionary(d, bounded, c)
+                swap_dictionary_rows(d, r, bounded)
+                swap_dictionary_columns(d, c, bounded + FIRST)
+        swap_dictionary_rows(d, r, d.n - 1)
+        swap_dictionary_columns(d, c, d.n - 1 + FIRST)
         d.n -= 1
 
 
 # -- a path ------------------------------------------------------------------------------------------------------
 
-cdef inline void begin_path(lemke_t* l) noexcept nogil:
+cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
     """Build the dictionary, retire free rows, draw c unless this is the first path, and make z basic if a value is negative."""
     cdef dictionary_t* d = &l.d
     cdef int32_t i, entering, r = 0
     cdef double* row
     cdef double* first_row
-    build_dictionary(l)
-    retire_free_rows(l)
+    build_lemke_dictionary(l)
+    pivot_out_free_rows(l)
     # covering vector
     for i in range(d.n_pairs):
         row = d.t + i * d.width
@@ -371,37 +373,37 @@ cdef inline void begin_path(lemke_t* l) noexcept nogil:
     l.n_paths += 1
     l.max_pivots = l.n_pivots + PIVOTS_PER_PAIR * d.n + EXTRA_PIVOTS
     l.state = WALK
-    set_nonbasic(d, COVER, 2 * d.n_pairs)
+    set_nonbasic_variable(d, COVER, 2 * d.n_pairs)
     d.entering = NO_COLUMN
     if d.n > 0 and d.t[r * d.width + VALUES] < 0.0:
-        entering = complement(d, d.basic[r])
-        pivot(d, r, COVER)
-        d.entering = column_of(d, entering)
+        entering = complementary_variable(d, d.basic[r])
+        pivot_dictionary(d, r, COVER)
+        d.entering = column_of_nonbasic_variable(d, entering)
         l.n_pivots += 1
 
 
-cdef inline int32_t walk(lemke_t* l, int32_t max_pivots) noexcept nogil:
+cdef inline int32_t follow_lemke_path(lemke_t* l, int32_t max_pivots) noexcept nogil:
     """Pivot until z leaves (DONE), no variable leaves (RAY), or there are `max_pivots` pivots (PIVOTS)."""
     cdef dictionary_t* d = &l.d
     cdef int32_t r, leaving
     if d.entering == NO_COLUMN:
         return DONE
     while l.n_pivots < max_pivots:
-        r = limiting_row(d, d.entering)
+        r = find_leaving_row(d, d.entering)
         if r < 0:
             return RAY
         leaving = d.basic[r]
-        pivot(d, r, d.entering)
+        pivot_dictionary(d, r, d.entering)
         l.n_pivots += 1
         if leaving == 2 * d.n_pairs:
             return DONE
-        d.entering = column_of(d, complement(d, leaving))
+        d.entering = column_of_nonbasic_variable(d, complementary_variable(d, leaving))
     return PIVOTS
 
 
 # -- the end of a path -------------------------------------------------------------------------------------------
 
-cdef inline void read_column(const lemke_t* l, int32_t c, double min_entry, double* x) noexcept nogil:
+cdef inline void read_dictionary_column(const lemke_t* l, int32_t c, double min_entry, double* x) noexcept nogil:
     """Write lambda (m) in column c to x: its value without the base, or its change with the entering variable."""
     cdef const dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
@@ -412,32 +414,32 @@ cdef inline void read_column(const lemke_t* l, int32_t c, double min_entry, doub
     for k in range(d.n_pairs):
         if l.n_bounded <= k < first_free_pair(l):
             continue
-        r = row_of(d, d.n_pairs + k)
-        s = d.t[r * d.width + c] if r >= 0 else (column_of(d, d.n_pairs + k) == c)
+        r = row_of_basic_variable(d, d.n_pairs + k)
+        s = d.t[r * d.width + c] if r >= 0 else (column_of_nonbasic_variable(d, d.n_pairs + k) == c)
         if s > min_entry or k >= first_free_pair(l):
-            x[l.row[k]] = scale(p, l.row[k]) * s
+            x[l.row[k]] = impulse_per_variable(p, l.row[k]) * s
 
 
-cdef inline void judge_path(lemke_t* l) noexcept nogil:
+cdef inline void judge_path_impulse(lemke_t* l) noexcept nogil:
     """Judge the present impulse, and store the bound of each row."""
     cdef const dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
     cdef int32_t* at = l.t.s.at
     cdef int32_t i, k
-    read_column(l, VALUES, 0.0, l.t.s.x)
+    read_dictionary_column(l, VALUES, 0.0, l.t.s.x)
     for i in range(p.n_rows):
-        l.t.s.x[i] += base(p, i)
+        l.t.s.x[i] += impulse_at_zero_variable(p, i)
         at[i] = FREE if p.lower[i] != p.upper[i] else AT_LOWER
     for k in range(l.n_bounded):
-        if row_of(d, d.n_pairs + k) < 0:
+        if row_of_basic_variable(d, d.n_pairs + k) < 0:
             at[l.row[k]] = AT_LOWER if p.lower[l.row[k]] > -INFINITY else AT_UPPER
     for k in range(l.n_bounded, first_free_pair(l)):
-        if row_of(d, d.n_pairs + k) >= 0:               # The multiplier of the cap is positive.
+        if row_of_basic_variable(d, d.n_pairs + k) >= 0:               # The multiplier of the cap is positive.
             at[l.row[l.row[k]]] = AT_UPPER
     judge_iterate(l.t)
 
 
-cdef void get_ray(const lemke_t* l, double* y) noexcept nogil:
+cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil:
     """Write the direction (m) of the ray that ended the path; rows with two bounds have none."""
     cdef const dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
@@ -445,7 +447,7 @@ cdef void get_ray(const lemke_t* l, double* y) noexcept nogil:
     cdef int32_t i
     for i in range(d.n):
         size = max(size, fabs(d.t[i * d.width + d.entering]))
-    read_column(l, d.entering, 1e-11 * size, y)
+    read_dictionary_column(l, d.entering, 1e-11 * size, y)
     for i in range(p.n_rows):
         if p.lower[i] > -INFINITY and p.upper[i] < INFINITY:
             y[i] = 0.0
@@ -455,25 +457,25 @@ cdef void get_ray(const lemke_t* l, double* y) noexcept nogil:
 
 cdef int64_t lemke_workspace_doubles(const blocks_t* p) noexcept nogil:
     """Return the number of doubles that `bind_lemke_workspace` needs."""
-    cdef int64_t n = count_pairs(p)
+    cdef int64_t n = count_complementary_pairs(p)
     return n * (n + FIRST) + 1
 
 
 cdef int64_t lemke_workspace_integers(const blocks_t* p) noexcept nogil:
     """Return the number of integers that `bind_lemke_workspace` needs."""
-    return 6 * <int64_t>count_pairs(p) + FIRST + 1
+    return 6 * <int64_t>count_complementary_pairs(p) + FIRST + 1
 
 
 cdef void bind_lemke_workspace(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil:
     """Bind the arrays of l, for the rows of t, whose arrays are bound."""
-    cdef int32_t n = count_pairs(t.s.p)
+    cdef int32_t n = count_complementary_pairs(t.s.p)
     l.t = t
     l.d.t, l.d.width = real, n + FIRST
     l.row, l.d.initial, l.d.basic = index, index + n, index + 2 * n
     l.d.nonbasic, l.d.position = index + 3 * n, index + 4 * n + FIRST
 
 
-cdef void begin_paths(lemke_t* l) noexcept nogil:
+cdef void begin_lemke_solve(lemke_t* l) noexcept nogil:
     """Begin a solve, and judge t.start (m)."""
     l.state = START
     l.n_pivots = l.n_paths = 0
@@ -482,7 +484,7 @@ cdef void begin_paths(lemke_t* l) noexcept nogil:
     judge_iterate(l.t)
 
 
-cdef int32_t follow_paths(lemke_t* l, int32_t pivots) noexcept nogil:
+cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
     """Do at most so many more pivots: DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
 
     Several calls give the bits of one.
@@ -492,29 +494,29 @@ cdef int32_t follow_paths(lemke_t* l, int32_t pivots) noexcept nogil:
         if l.state == START:
             if l.n_pivots >= max_pivots:
                 return PIVOTS
-            begin_path(l)
+            begin_lemke_path(l)
         if l.state == WALK:
-            code = walk(l, min(max_pivots, l.max_pivots))
+            code = follow_lemke_path(l, min(max_pivots, l.max_pivots))
             if code == PIVOTS and l.n_pivots < l.max_pivots:
                 return PIVOTS
-            judge_path(l)
-            begin_exchanges(l.t)
+            judge_path_impulse(l)
+            begin_bound_exchanges(l.t)
             l.state = FINISH
-            if code == RAY and not is_solved(l.t):
+            if code == RAY and not is_solved_to_rounding(l.t):
                 return RAY
         if l.state == FINISH:
             while not l.t.is_over:
-                code = step_direct(l.t, FINISH_ROUNDS)
+                code = step_direct_solve(l.t, FINISH_ROUNDS)
                 if l.t.s.late:
                     return LATE
-            l.state = OVER if is_solved(l.t) or l.n_paths == MAX_PATHS else START
+            l.state = OVER if is_solved_to_rounding(l.t) or l.n_paths == MAX_PATHS else START
     return DONE
 
 
 cdef void judge_unfinished_path(lemke_t* l) noexcept nogil:
     """Judge the present impulse of a path that is not continued."""
     if l.state == WALK:
-        judge_path(l)
+        judge_path_impulse(l)
 
 
 cdef class Lemke:
@@ -539,14 +541,14 @@ cdef class Lemke:
 
     def begin(self, const double[::1] start):
         """Begin a solve at start (m,) [N s]."""
-        begin_direct(&self.rows.t, &start[0])
-        begin_paths(&self.l)
+        begin_direct_solve(&self.rows.t, &start[0])
+        begin_lemke_solve(&self.l)
 
     def run(self, int pivots):
         """Do at most so many more pivots: DONE, PIVOTS, RAY or LATE."""
         cdef int32_t code
         with nogil:
-            code = follow_paths(&self.l, pivots)
+            code = follow_lemke_paths(&self.l, pivots)
         return self.rows.raise_error(code)
 
     def judge(self):
@@ -557,7 +559,7 @@ cdef class Lemke:
     def ray(self):
         """Direction (m,) of the ray, after RAY."""
         cdef double[::1] y = np.empty(self.rows.t.s.n)
-        get_ray(&self.l, &y[0])
+        get_ray_direction(&self.l, &y[0])
         return y.base
 
     @property

@@ -55,13 +55,13 @@ cdef struct pivoting_t:
 
 cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil
 cdef void reset_pivoting(pivoting_t* s) noexcept nogil
-cdef void set_shift(pivoting_t* s, double shift) noexcept nogil
-cdef void reset_patience(pivoting_t* s) noexcept nogil
+cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil
+cdef void reset_exchange_patience(pivoting_t* s) noexcept nogil
 cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil
 cdef void factor_all_rows(pivoting_t* s) noexcept nogil
-cdef void solve_all_rows(pivoting_t* s) noexcept nogil
-cdef int32_t guess_free_rows(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil
-cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil
-cdef void compute_slack(pivoting_t* s) noexcept nogil
-cdef void correct_free_rows(pivoting_t* s) noexcept nogil
+cdef void solve_with_all_rows_free(pivoting_t* s) noexcept nogil
+cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil
+cdef int32_t run_exchange_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil
+cdef void compute_slack_and_rounding(pivoting_t* s) noexcept nogil
+cdef void correct_free_row_solution(pivoting_t* s) noexcept nogil
 cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil

@@ -13,8 +13,8 @@ factors D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with row exchanges for the largest
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport relax_row
-from lavender_ext.core.csr cimport csr_dot
+from lavender_ext.core.block cimport project_row_update
+from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport no_pivots
 from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_band, analyse_dense, linear_factor, linear_solve
@@ -27,7 +27,7 @@ cdef enum:
     MAX_PATIENCE = 8            # exchanges without a smaller number of infeasible rows, after which rounds are stuck
 
 
-cdef inline void factor_by_owner(pivoting_t* s) noexcept nogil:
+cdef inline void call_outside_factor(pivoting_t* s) noexcept nogil:
     """Call the outside factor."""
     cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.linear.shift)
     s.late = small < 0
@@ -99,7 +99,7 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
     s.n_free = k
     s.linear.ahead = x
     if s.factor_outside != NULL:
-        factor_by_owner(s)
+        call_outside_factor(s)
         return
     if s.linear.by == LU:
         fill_rows(s)
@@ -110,7 +110,7 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
     s.is_factored = 1
 
 
-cdef inline void solve_factored(pivoting_t* s, double* y) noexcept nogil:
+cdef inline void solve_free_rows(pivoting_t* s, double* y) noexcept nogil:
     """Compute y (n_free) <- (A_FF + s D_FF)^-1 y."""
     if s.solve_outside != NULL:
         s.solve_outside(s.outside, s.n_free, y)
@@ -127,19 +127,19 @@ cdef void factor_all_rows(pivoting_t* s) noexcept nogil:
     factor_free_rows(s, s.x if s.natural and s.linear.by != LU and s.factor_outside == NULL else NULL)
 
 
-cdef void correct_free_rows(pivoting_t* s) noexcept nogil:
+cdef void correct_free_row_solution(pivoting_t* s) noexcept nogil:
     """Compute x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
     cdef int32_t i
     for i in range(s.n):
         if s.place[i] >= 0:
             s.y[s.place[i]] = s.w[i]
-    solve_factored(s, s.y)
+    solve_free_rows(s, s.y)
     for i in range(s.n):
         if s.place[i] >= 0:
             s.x[i] -= s.y[s.place[i]]
 
 
-cdef void compute_slack(pivoting_t* s) noexcept nogil:
+cdef void compute_slack_and_rounding(pivoting_t* s) noexcept nogil:
     """Compute w (2) and its rounding f."""
     cdef int32_t i, q, end
     cdef const int32_t* idx = s.a.indices
@@ -170,7 +170,7 @@ cdef void compute_slack(pivoting_t* s) noexcept nogil:
             s.w[i] += s.linear.shift * s.p.d[i] * (s.x[i] - s.center[i])
 
 
-cdef inline int32_t exchanged_side(const pivoting_t* s, int32_t i) noexcept nogil:
+cdef inline int32_t choose_bound_after_exchange(const pivoting_t* s, int32_t i) noexcept nogil:
     """Return where row i is after an exchange (3). The tolerance 8 f is a few roundings of w, or of x = w / d."""
     cdef double lower = s.p.lower[i], upper = s.p.upper[i], slop = 8.0 * s.f[i]
     if lower == upper:
@@ -191,7 +191,7 @@ cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
     """Exchange (4); return the number of infeasible rows (3) before it, negated if patience is used up and none is exchanged."""
     cdef int32_t i, n_infeasible = 0
     for i in range(s.n):
-        n_infeasible += exchanged_side(s, i) != s.at[i]
+        n_infeasible += choose_bound_after_exchange(s, i) != s.at[i]
     if n_infeasible == 0:
         return 0
     if n_infeasible < s.min_infeasible:
@@ -203,12 +203,12 @@ cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
         return -n_infeasible
     s.is_factored = 0
     for i in range(s.n):
-        s.at[i] = exchanged_side(s, i)
+        s.at[i] = choose_bound_after_exchange(s, i)
     s.exchanged += n_infeasible
     return n_infeasible
 
 
-cdef inline void place_bound_rows(pivoting_t* s) noexcept nogil:
+cdef inline void set_bound_rows_to_bounds(pivoting_t* s) noexcept nogil:
     """Set x of bound rows to their bounds."""
     cdef int32_t i
     for i in range(s.n):
@@ -218,7 +218,7 @@ cdef inline void place_bound_rows(pivoting_t* s) noexcept nogil:
             s.x[i] = s.p.upper[i]
 
 
-cdef inline void predict_bounds(pivoting_t* s) noexcept nogil:
+cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
     """Decide from x - w / d which rows are free and which are at a bound; w belongs to this x."""
     cdef int32_t i
     cdef double y
@@ -233,7 +233,7 @@ cdef inline void predict_bounds(pivoting_t* s) noexcept nogil:
     s.is_factored = 0
 
 
-cdef inline void sweep_rows(pivoting_t* s, int32_t n) noexcept nogil:
+cdef inline void run_symmetric_sweeps(pivoting_t* s, int32_t n) noexcept nogil:
     """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first and 1 in the others.
 
     Along a stack, each contact gets 0.85 of the change of the previous one with omega = 1.7, so that a change passes through
@@ -245,14 +245,14 @@ cdef inline void sweep_rows(pivoting_t* s, int32_t n) noexcept nogil:
     for k in range(n):
         omega = 1.7 if k == 0 else 1.0
         for i in range(s.n):
-            w = csr_dot(s.a, i, x) - s.p.b[i]
-            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+            w = csr_row_dot(s.a, i, x) - s.p.b[i]
+            x[i] = project_row_update(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
         for i in range(s.n - 1, -1, -1):
-            w = csr_dot(s.a, i, x) - s.p.b[i]
-            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+            w = csr_row_dot(s.a, i, x) - s.p.b[i]
+            x[i] = project_row_update(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
 
 
-cdef void solve_all_rows(pivoting_t* s) noexcept nogil:
+cdef void solve_with_all_rows_free(pivoting_t* s) noexcept nogil:
     """Compute x = A^-1 b with all rows free and factored; w is unchanged."""
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
@@ -261,13 +261,13 @@ cdef void solve_all_rows(pivoting_t* s) noexcept nogil:
         return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
-    solve_factored(s, y)
+    solve_free_rows(s, y)
     if not s.natural:
         for i in range(s.n):
             s.x[i] = y[s.place[i]]
 
 
-cdef inline bint try_all_free(pivoting_t* s) noexcept nogil:
+cdef inline bint is_solved_with_all_rows_free(pivoting_t* s) noexcept nogil:
     """Solve with all rows free; return whether A is positive definite and x is within its bounds, so that x is the solution."""
     cdef int32_t i
     for i in range(s.n):
@@ -277,7 +277,7 @@ cdef inline bint try_all_free(pivoting_t* s) noexcept nogil:
     if s.linear.pivots.negative > 0 or s.linear.pivots.small > 0:
         s.is_factored = 0
         return False
-    solve_all_rows(s)
+    solve_with_all_rows_free(s)
     for i in range(s.n):
         if not s.p.lower[i] <= s.x[i] <= s.p.upper[i]:
             s.is_factored = 0
@@ -285,13 +285,13 @@ cdef inline bint try_all_free(pivoting_t* s) noexcept nogil:
     return True
 
 
-cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
+cdef int32_t run_exchange_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
     """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or an outside factor is not started."""
     cdef int32_t _, n_infeasible
     for _ in range(max_rounds):
         s.n_rounds += 1
-        place_bound_rows(s)
-        compute_slack(s)
+        set_bound_rows_to_bounds(s)
+        compute_slack_and_rounding(s)
         if not s.is_factored:
             factor_free_rows(s, NULL)
         if s.late:
@@ -301,8 +301,8 @@ cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
             return INDEFINITE
         if s.linear.pivots.small > 0 and (s.linear.shift == 0.0 or s.linear.by == LU or s.factor_outside != NULL):
             return SMALL_PIVOT
-        correct_free_rows(s)
-        compute_slack(s)
+        correct_free_row_solution(s)
+        compute_slack_and_rounding(s)
         n_infeasible = exchange_infeasible_rows(s)
         if n_infeasible == 0:
             return SOLVED
@@ -311,7 +311,7 @@ cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
     return ROUNDS_USED
 
 
-cdef int32_t guess_free_rows(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil:
+cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil:
     """Return 1 if all rows are free at the solution x; else guess the free rows by `sweeps` symmetric sweeps from start (m).
 
     All rows free are tried only if their factor costs less than the sweeps, and `max_rounds` allows a round.
@@ -320,28 +320,28 @@ cdef int32_t guess_free_rows(pivoting_t* s, const double* start, int32_t sweeps,
     # Multiply-adds: (band + 1)^2 / 2 per row of the factor, two per nonzero of a sweep.
     cdef bint is_cheap = s.band >= 0 and max_rounds > 0 and s.n > 0 and (
         (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
-    if is_cheap and try_all_free(s):
+    if is_cheap and is_solved_with_all_rows_free(s):
         s.n_rounds += 1
         return 1
     for i in range(s.n):
         s.x[i] = start[i]
-    sweep_rows(s, sweeps)
-    compute_slack(s)
-    predict_bounds(s)
+    run_symmetric_sweeps(s, sweeps)
+    compute_slack_and_rounding(s)
+    predict_active_bounds(s)
     return 0
 
 
-cdef void reset_patience(pivoting_t* s) noexcept nogil:
+cdef void reset_exchange_patience(pivoting_t* s) noexcept nogil:
     """Allow exchanges to begin anew."""
     s.min_infeasible = s.n + 1
     s.patience = MAX_PATIENCE
 
 
-cdef void set_shift(pivoting_t* s, double shift) noexcept nogil:
+cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil:
     """Set the shift, which makes the factor invalid and exchanges begin anew."""
     s.linear.shift = shift
     s.is_factored = 0
-    reset_patience(s)
+    reset_exchange_patience(s)
 
 
 cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
@@ -351,7 +351,7 @@ cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
         s.at[i] = FREE
     s.exchanged = s.factorisations = s.n_rounds = s.late = 0
     no_pivots(&s.linear.pivots)
-    set_shift(s, 0.0)
+    set_diagonal_shift(s, 0.0)
 
 
 cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil:

@@ -1,4 +1,4 @@
-"""Solver call for small problems: `lay_few` once, then `solve_small` from any start, in any thread on its own copy."""
+"""Solver call for small problems: `derive_small_problem` once, then `solve_small` from any start, in any thread on its own copy."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport workspace_t
@@ -43,10 +43,10 @@ cdef struct solve_workspaces_t:
     workspace_t more            # of Newton's method, or of Lemke's paths
 
 
-cdef bint supports_blocks(const blocks_t* p) noexcept nogil
-cdef bint are_bounded(const blocks_t* p) noexcept nogil
-cdef bint lay_few(small_problem_t* s, workspace_t* workspace) noexcept nogil
-cdef void judge_small(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil
+cdef bint can_use_small_call(const blocks_t* p) noexcept nogil
+cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil
+cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexcept nogil
+cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil
 cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
                          double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil
 

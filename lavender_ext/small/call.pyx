@@ -15,26 +15,32 @@ from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles
-from lavender_ext.core.csr cimport scan_entries
-from lavender_ext.core.order cimport sort_by_level
+from lavender_ext.core.arrays cimport as_double_pointer
+from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
+from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
-                                            is_rows, bind_friction_arrays)
+                                            has_independent_rows, bind_friction_arrays)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
+from lavender_ext.core.view cimport get_block_bodies, csr_t, rows_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, Rules, small_problem_t,
                                       small_rules_t, solve_workspaces_t)
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
-from lavender_ext.small.limits cimport is_linear
-from lavender_ext.small.workspace cimport has_workspace_size, free_workspace
-from lavender_ext.judge.measure cimport set_zero_impulse, floor_of, judge_view, judged_from, relative_of, scratch_of
-from lavender_ext.judge.score cimport new_score
-from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
-from lavender_ext.pivot.direct cimport (PASS, PASS_HALVED, begin_direct, bind_direct_workspace, direct_t,
-                                        direct_workspace_doubles, direct_workspace_integers, is_solved, step_direct)
-from lavender_ext.pivot.lemke cimport (RAY, begin_paths, bind_lemke_workspace, follow_paths, lemke_t, lemke_workspace_doubles,
+from lavender_ext.small.limits cimport has_only_free_rows
+from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
+from lavender_ext.judge.measure cimport (
+    set_zero_impulse, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
+    count_judge_scratch,
+)
+from lavender_ext.judge.score cimport make_empty_score
+from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
+from lavender_ext.pivot.direct cimport (
+    PASS, PASS_HALVED, begin_direct_solve, bind_direct_workspace, direct_t, count_direct_workspace_doubles,
+    count_direct_workspace_integers, is_solved_to_rounding, step_direct_solve,
+)
+from lavender_ext.pivot.lemke cimport (RAY, begin_lemke_solve, bind_lemke_workspace, follow_lemke_paths, lemke_t,
+                                       lemke_workspace_doubles,
                                        lemke_workspace_integers)
 from lavender_ext.pivot.principal cimport SMALL_PIVOT
 
@@ -50,16 +56,16 @@ cdef enum:
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
-cdef bint are_bounded(const blocks_t* p) noexcept nogil:
+cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
     """Return whether every row has fixed bounds only: no friction."""
     cdef int32_t i
     for i in range(p.n_blocks):
-        if not is_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
+        if not has_independent_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
             return False
     return True
 
 
-cdef bint lay_few(small_problem_t* s, workspace_t* workspace) noexcept nogil:
+cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexcept nogil:
     """Compute a small problem's remaining fields in `workspace`, which it keeps; return False without memory.
 
     Both views and the residual of the zero impulse are given.
@@ -67,24 +73,24 @@ cdef bint lay_few(small_problem_t* s, workspace_t* workspace) noexcept nogil:
     cdef const blocks_t* p = &s.v.p
     cdef int32_t band[2]
     cdef int64_t n
-    s.pivots, s.linear, s.at, s.prepared = are_bounded(p), is_linear(p), NULL, NULL
+    s.pivots, s.linear, s.at, s.prepared = are_all_rows_bounded(p), has_only_free_rows(p), NULL, NULL
     s.split = s.v.r.n_joints if s.v.r != NULL else 0
-    if not has_workspace_size(workspace, p.n_blocks + 1 + p.n_rows, 0):
+    if not grow_workspace_to(workspace, p.n_blocks + 1 + p.n_rows, 0):
         return False
     if s.pivots:
-        s.symmetric = scan_entries(s.over.a, s.over.p.d, p.n_rows, workspace.index, band) <= 1e-14
+        s.symmetric = measure_asymmetry_and_bandwidth(s.over.a, s.over.p.d, p.n_rows, workspace.index, band) <= 1e-14
         s.band = max(band[0], band[1]) if s.symmetric else p.n_rows - 1
     elif p.law == CONE or s.v.a != NULL:                # the units of a given matrix may differ within a contact
-        n = <int64_t>prepared_sizes(p, workspace.index) + 1
-        if not has_workspace_size(workspace, 0, n):
+        n = <int64_t>index_prepared_numbers(p, workspace.index) + 1
+        if not grow_workspace_to(workspace, 0, n):
             return False
         memset(workspace.real, 0, n * sizeof(double))
-        prepare_blocks(&s.over, workspace.index, workspace.real)
+        prepare_exact_blocks(&s.over, workspace.index, workspace.real)
         s.at, s.prepared = workspace.index, workspace.real
     return True
 
 
-cdef bint supports_blocks(const blocks_t* p) noexcept nogil:
+cdef bint can_use_small_call(const blocks_t* p) noexcept nogil:
     """Return whether this solver supports every block: no round cones, no rolling friction."""
     cdef int32_t i
     for i in range(p.n_blocks):
@@ -93,16 +99,17 @@ cdef bint supports_blocks(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef void judge_small(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
+cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
     """Judge lam: write w and e to both (2 m), and score, floor and relative residual to s; scratch as `judge_view`."""
     cdef int32_t m = s.v.p.n_rows
-    s.score = new_score()
+    s.score = make_empty_score()
     judge_view(&s.v, lam, both, both + m, scratch, True, &s.score)
-    s.floor = floor_of(&s.score, s.zero_residual[0], s.zero_residual[1])
-    s.relative = relative_of(&s.score, both, m, s.zero_residual[0], s.zero_residual[1])
+    s.floor = relative_floor_of_score(&s.score, s.zero_residual[0], s.zero_residual[1])
+    s.relative = relative_residual_of_score(&s.score, both, m, s.zero_residual[0], s.zero_residual[1])
 
 
-cdef bint set_small_start(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double* both,
+cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
+                                     double* both,
                     double* scratch) noexcept nogil:
     """Set the start `own` (m) [N s], the zero impulse if `cold`; return whether it is a solution, which is then judged.
 
@@ -118,7 +125,7 @@ cdef bint set_small_start(small_problem_t* s, const small_rules_t* rules, double
         return False
     cold = memcmp(own, scratch, m * sizeof(double)) == 0
     if not cold or residual <= tol:
-        judge_small(s, own, both, scratch + m)
+        judge_small_impulse(s, own, both, scratch + m)
         residual = residual if cold else s.relative
     if residual <= tol:
         return True
@@ -127,15 +134,15 @@ cdef bint set_small_start(small_problem_t* s, const small_rules_t* rules, double
     return False
 
 
-cdef inline bint is_converged(const direct_t* t, double tol, bint tol_suffices) noexcept nogil:
+cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint tol_suffices) noexcept nogil:
     """Return whether the residual is below tol and exchanges have ended, or are at rounding.
 
     With `tol_suffices`, solved bounded rows need not be refined to rounding.
     """
-    return t.relative <= tol and (is_solved(t) or (tol_suffices and t.solved and not t.linear))
+    return t.relative <= tol and (is_solved_to_rounding(t) or (tol_suffices and t.solved and not t.linear))
 
 
-cdef inline int32_t remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
+cdef inline int32_t count_remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
     """Return the rounds of the next step: at most MAX_PASS_EXCHANGES, and `max_rounds` in total."""
     cdef double remaining = max_rounds - t.s.n_rounds
     return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
@@ -147,16 +154,16 @@ cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bin
     Passes with a shifted matrix end if one does not halve the residual or is stuck, or after `max_rounds` rounds in total.
     """
     cdef int32_t code
-    begin_direct(t, start)
-    code = step_direct(t, remaining_rounds(t, max_rounds))
+    begin_direct_solve(t, start)
+    code = step_direct_solve(t, count_remaining_rounds(t, max_rounds))
     # singular: passes with a shift
     if t.symmetric and t.state == PASS and (code == SMALL_PIVOT or t.linear):
         code = PASS_HALVED
         while code == PASS_HALVED and t.s.n_rounds < max_rounds:
-            code = step_direct(t, remaining_rounds(t, max_rounds))
+            code = step_direct_solve(t, count_remaining_rounds(t, max_rounds))
             if not t.relative < INFINITY:
                 return False
-    return is_converged(t, tol, tol_suffices)
+    return is_direct_solve_converged(t, tol, tol_suffices)
 
 
 cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_cost, workspace_t* workspace) noexcept nogil:
@@ -168,18 +175,18 @@ cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_c
     cdef double each = 2.0 * <double>t.s.n ** 2
     cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
     cdef int32_t last = limit if remaining_cost[0] > limit * each else <int32_t>(remaining_cost[0] / each)
-    if not has_workspace_size(workspace, lemke_workspace_integers(t.s.p), lemke_workspace_doubles(t.s.p)):
+    if not grow_workspace_to(workspace, lemke_workspace_integers(t.s.p), lemke_workspace_doubles(t.s.p)):
         return -1
     bind_lemke_workspace(&l, t, workspace.real, workspace.index)
-    begin_paths(&l)
-    while follow_paths(&l, last - l.n_pivots) == RAY:
+    begin_lemke_solve(&l)
+    while follow_lemke_paths(&l, last - l.n_pivots) == RAY:
         pass
     if last < limit:
         remaining_cost[0] -= l.n_pivots * each
     return l.n_pivots if t.relative <= tol else -1
 
 
-cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,
+cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,
                       solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve free or bounded rows by factorisations and exchanges; return whether there is a result.
 
@@ -191,7 +198,7 @@ cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint fo
     cdef int32_t path = 0, m = s.v.p.n_rows
     cdef double each = EXCHANGE_NS_PER_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
     cdef bint ended
-    if not has_workspace_size(&workspaces.work, direct_workspace_integers(&s.v), direct_workspace_doubles(&s.v, s.band)):
+    if not grow_workspace_to(&workspaces.work, count_direct_workspace_integers(&s.v), count_direct_workspace_doubles(&s.v, s.band)):
         return False
     t.v, t.e0, t.v0, t.least = s.v, s.zero_residual[0], s.zero_residual[1], 1e-13
     t.linear, t.symmetric, t.sweeps = s.linear, s.symmetric, ACTIVE_SET_SWEEPS
@@ -212,20 +219,20 @@ cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint fo
     return ended
 
 
-cdef inline void store_counts(const friction_run_t* o, int32_t n_subproblems, int32_t* counts) noexcept nogil:
+cdef inline void store_work_counts(const friction_run_t* o, int32_t n_subproblems, int32_t* counts) noexcept nogil:
     """Write the counters: longest subproblem, sweeps, undone sweeps, factorisations, factorised subproblems, subproblems."""
     counts[0], counts[1], counts[2] = o.longest, <int32_t>o.swept, <int32_t>o.undone
     counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.factorised, n_subproblems
 
 
-cdef bint sweep_small(const small_problem_t* s, double* own, double tol, int32_t swept, double* remaining_cost,
+cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int32_t swept, double* remaining_cost,
                       solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
-    """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_counts`."""
+    """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_work_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef subproblem_t sub
     cdef friction_run_t o = friction_run_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, remaining_cost[0], 0, 0)
     cdef bint good
-    if not has_workspace_size(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
+    if not grow_workspace_to(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
         return False
     sub.v, sub.lam, sub.answer, sub.split = s.over, own, workspaces.work.real, s.split
     sub.at, sub.prepared, sub.relative_at_zero = s.at, s.prepared, s.zero_residual[2]
@@ -233,25 +240,25 @@ cdef bint sweep_small(const small_problem_t* s, double* own, double tol, int32_t
     good = solve_subproblem(&sub, &o, &workspaces.more, workspaces.work.real + m, workspaces.work.index)
     memcpy(own, sub.answer, m * sizeof(double))
     remaining_cost[0] = o.remaining_cost
-    store_counts(&o, 1, counts)
+    store_work_counts(&o, 1, counts)
     return good or not o.remaining_cost > 0.0
 
 
 cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
                          double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code."""
-    cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
+    cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
     memset(counts, 0, N_COUNTS * sizeof(int32_t))
-    if not has_workspace_size(&workspaces.work, 0, scratch):
+    if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
-    if set_small_start(s, rules, own, cold, tol, both, workspaces.work.real):
+    if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
         return RESULT_IS_START
-    if not (pivot_small(s, own, tol, rules.follows, &max_cost, workspaces, counts) if s.pivots
-            else sweep_small(s, own, tol, rules.swept, &max_cost, workspaces, counts)):
+    if not (solve_by_pivoting(s, own, tol, rules.follows, &max_cost, workspaces, counts) if s.pivots
+            else solve_by_sweeps(s, own, tol, rules.swept, &max_cost, workspaces, counts)):
         return RESULT_FAILED
-    if not has_workspace_size(&workspaces.work, 0, scratch):
+    if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
-    judge_small(s, own, both, workspaces.work.real)
+    judge_small_impulse(s, own, both, workspaces.work.real)
     return RESULT_SOLVED if s.pivots or s.relative <= tol or not max_cost > 0.0 else RESULT_FAILED
 
 
@@ -281,14 +288,14 @@ cdef struct island_t:           # copied from A or the bodies; its doubles and i
     int64_t n_integers
 
 
-cdef inline double* take_next(double** at, int64_t n) noexcept nogil:
+cdef inline double* take_next_numbers(double** at, int64_t n) noexcept nogil:
     """Return the next n numbers and advance `at`."""
     cdef double* x = at[0]
     at[0] = x + n
     return x
 
 
-cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int32_t* size, int32_t n) noexcept nogil:
+cdef inline void bind_island_arrays(island_t* x, double* numbers, int32_t* integers, const int32_t* size, int32_t n) noexcept nogil:
     """Bind the arrays of an island with the given sizes (N_SIZES) and n bodies, and of its result.
 
     n < 0: over A, without joints.
@@ -298,23 +305,26 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int3
     cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], c = k - size[4]
     x.numbers, x.integers = numbers, integers
     p.n_blocks, p.n_rows, p.islands = k, m, NULL
-    p.lower, p.upper, p.b = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
-    p.d, p.nu, p.step, x.s.lam = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
-    bind_friction_arrays(p, take_next(&numbers, N_FRICTION_ARRAYS * k), k)
+    p.lower, p.upper, p.b = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
+    p.d, p.nu = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
+    p.step, x.s.lam = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
+    bind_friction_arrays(p, take_next_numbers(&numbers, N_FRICTION_ARRAYS * k), k)
     p.ptr, p.kind = integers, integers + k + 1
     integers += 2 * k + 1
     x.s.v.a = x.s.v.r = x.s.v.g = NULL
     if n < 0:
-        x.a.data, x.a.indptr, x.a.indices = take_next(&numbers, nnz), integers, integers + m + 1
+        x.a.data, x.a.indptr, x.a.indices = take_next_numbers(&numbers, nnz), integers, integers + m + 1
         integers += m + 1 + nnz
         x.s.v.a = &x.a
     else:
         r.n_bodies, r.n_joints, r.n_contacts = n, size[4], c
-        r.jac, r.minv_jac = take_next(&numbers, 12 * mj), take_next(&numbers, 12 * mj)
-        r.normal, r.tangent = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c)
-        r.arm_a, r.arm_b, r.coupling = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c), take_next(&numbers, 5 * c)
-        r.inv_inertia_arm, r.compliance = take_next(&numbers, CONTACT_ROW_DOUBLES * (m - mj)), take_next(&numbers, m)
-        r.inv_mass, r.inv_inertia = take_next(&numbers, n), take_next(&numbers, 9 * n)
+        r.jac, r.minv_jac = take_next_numbers(&numbers, 12 * mj), take_next_numbers(&numbers, 12 * mj)
+        r.normal, r.tangent = take_next_numbers(&numbers, 3 * c), take_next_numbers(&numbers, 3 * c)
+        r.arm_a, r.arm_b = take_next_numbers(&numbers, 3 * c), take_next_numbers(&numbers, 3 * c)
+        r.coupling = take_next_numbers(&numbers, 5 * c)
+        r.inv_inertia_arm = take_next_numbers(&numbers, CONTACT_ROW_DOUBLES * (m - mj))
+        r.compliance = take_next_numbers(&numbers, m)
+        r.inv_mass, r.inv_inertia = take_next_numbers(&numbers, n), take_next_numbers(&numbers, 9 * n)
         r.joint_body, r.contact_body = integers, integers + 2 * size[4]
         integers += 2 * k
         x.s.v.r = r
@@ -322,7 +332,7 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int3
     x.s.answer = numbers
 
 
-cdef inline void copy_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
+cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
                              int32_t* place) noexcept nogil:
     """Copy the blocks `block` of the complete problem; place (rows of the problem) receives the row indices in the island."""
     cdef const double* of_row[ROW_DOUBLES]
@@ -349,7 +359,7 @@ cdef inline void copy_blocks(island_t* x, const blocks_t* p, const int32_t* bloc
         ptr[k + 1] = n
 
 
-cdef inline void copy_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
+cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
                             const int32_t* place) noexcept nogil:
     """Copy the island's entries of A."""
     cdef int32_t i, k, q, row, at = 0, n = 0
@@ -366,12 +376,13 @@ cdef inline void copy_matrix(island_t* x, const blocks_t* p, const csr_t* a, con
             indptr[n] = at
 
 
-cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number, int32_t* body) noexcept nogil:
+cdef inline int32_t number_island_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number,
+                                         int32_t* body) noexcept nogil:
     """Assign indices to the bodies of k blocks by appearance: `body` lists them, `number` is the inverse. Return their count."""
     cdef const int32_t* two
     cdef int32_t i, side, n = 0
     for i in range(k):
-        two = bodies_of(r, block[i])
+        two = get_block_bodies(r, block[i])
         for side in range(2):
             if two[side] >= 0 and number[two[side]] < 0:
                 number[two[side]] = n
@@ -380,12 +391,12 @@ cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t
     return n
 
 
-cdef inline void copy_entry(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
+cdef inline void copy_entry_numbers(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
     """Copy the n numbers of entry i."""
     memcpy(<void*>to, x + n * i, n * sizeof(double))
 
 
-cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
+cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
                           const int32_t* body) noexcept nogil:
     """Copy the island's joints, contacts and bodies."""
     cdef const blocks_t* own = &x.s.v.p
@@ -395,7 +406,7 @@ cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, co
     cdef int32_t* pair
     for k in range(own.n_blocks):
         i, m, n = block[k], own.ptr[k], own.ptr[k + 1] - own.ptr[k]
-        j, two, pair = p.ptr[i], bodies_of(r, i), <int32_t*>bodies_of(y, k)
+        j, two, pair = p.ptr[i], get_block_bodies(r, i), <int32_t*>get_block_bodies(y, k)
         for c in range(2):
             pair[c] = number[two[c]] if two[c] >= 0 else -1
         memcpy(<void*>(y.compliance + m), r.compliance + j, n * sizeof(double))
@@ -407,24 +418,24 @@ cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, co
                r.inv_inertia_arm + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
                CONTACT_ROW_DOUBLES * n * sizeof(double))
         c, i = k - y.n_joints, i - r.n_joints
-        copy_entry(y.normal + 3 * c, 3, r.normal, i)
-        copy_entry(y.tangent + 3 * c, 3, r.tangent, i)
-        copy_entry(y.arm_a + 3 * c, 3, r.arm_a, i)
-        copy_entry(y.arm_b + 3 * c, 3, r.arm_b, i)
-        copy_entry(y.coupling + 5 * c, 5, r.coupling, i)
+        copy_entry_numbers(y.normal + 3 * c, 3, r.normal, i)
+        copy_entry_numbers(y.tangent + 3 * c, 3, r.tangent, i)
+        copy_entry_numbers(y.arm_a + 3 * c, 3, r.arm_a, i)
+        copy_entry_numbers(y.arm_b + 3 * c, 3, r.arm_b, i)
+        copy_entry_numbers(y.coupling + 5 * c, 5, r.coupling, i)
     for k in range(y.n_bodies):
-        copy_entry(y.inv_mass + k, 1, r.inv_mass, body[k])
-        copy_entry(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
+        copy_entry_numbers(y.inv_mass + k, 1, r.inv_mass, body[k])
+        copy_entry_numbers(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
 
 
-cdef inline bint are_identical(const island_t* x, const island_t* y) noexcept nogil:
+cdef inline bint are_islands_identical(const island_t* x, const island_t* y) noexcept nogil:
     """Return whether two islands have bitwise identical data."""
     return (x.n_numbers == y.n_numbers and x.n_integers == y.n_integers
             and memcmp(x.numbers, y.numbers, x.n_numbers * sizeof(double)) == 0
             and memcmp(x.integers, y.integers, x.n_integers * sizeof(int32_t)) == 0)
 
 
-cdef inline int32_t first_sweeps(const blocks_t* p, int32_t max_sweeps) noexcept nogil:
+cdef inline int32_t count_first_sweeps(const blocks_t* p, int32_t max_sweeps) noexcept nogil:
     """Return the sweeps of an island before its factorisations: fewer for many rows, none under the cone law."""
     if p.n_rows <= FULL_SWEEP_ROWS:
         return max_sweeps
@@ -453,7 +464,7 @@ cdef class Small:
         self.at.v, self.at.over = data.view(), over.view()
         self.at.zero_residual[0], self.at.zero_residual[1] = data.reference_energy, data.reference_velocity
         self.at.zero_residual[2] = data.relative_at_zero
-        if not lay_few(&self.at, &self.workspace):
+        if not derive_small_problem(&self.at, &self.workspace):
             raise MemoryError(f"{data.blocks.n_rows} rows")
 
     def __dealloc__(self):
@@ -473,13 +484,13 @@ cdef class Small:
         cdef int32_t code
         memset(&workspaces, 0, sizeof(workspaces))
         if impulse is not None:
-            memcpy(&own[0], doubles(impulse, m), m * sizeof(double))
+            memcpy(&own[0], as_double_pointer(impulse, m), m * sizeof(double))
         try:
             code = self.run_kernel(&s, &rules.at, &own[0], impulse is None, tol, max_cost, &both[0], &workspaces, counts)
         finally:
             free_workspace(&workspaces.work)
             free_workspace(&workspaces.more)
-        judged = judged_from(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
+        judged = make_judged(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
         return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
@@ -519,23 +530,23 @@ cdef class Islands(Small):
             if i < joints:
                 size[label[i], 3] += rows
                 size[label[i], 4] += 1
-        sort_by_level(k, &label[0], count, &first[0], &block[0])
+        sort_blocks_by_level(k, &label[0], count, &first[0], &block[0])
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
                             double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
-        cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
+        cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
         cdef friction_run_t o = friction_run_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, max_cost, 0, 0)
         cdef bint good
-        if not has_workspace_size(&workspaces.work, 0, scratch):
+        if not grow_workspace_to(&workspaces.work, 0, scratch):
             raise MemoryError(f"{m} rows")
-        if set_small_start(s, rules, own, cold, tol, both, workspaces.work.real):
+        if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
             return RESULT_IS_START
         good = self.solve_islands(own, &o, &workspaces.more)
         memset(counts, 0, N_COUNTS * sizeof(int32_t))
-        store_counts(&o, self.count, counts)
+        store_work_counts(&o, self.count, counts)
         if not good:
             return RESULT_FAILED
-        judge_small(s, own, both, workspaces.work.real)
+        judge_small_impulse(s, own, both, workspaces.work.real)
         return RESULT_SOLVED if s.relative <= tol or not o.remaining_cost > 0.0 else RESULT_FAILED
 
     cdef bint solve_islands(self, double* own, friction_run_t* o, workspace_t* r) except -1:
@@ -570,14 +581,14 @@ cdef class Islands(Small):
                 x, last = &two[i % 2], &two[1 - i % 2]
                 m, k = size[i, 0], size[i, 1]
                 if over_bodies:
-                    n = number_bodies(rows, &block[first], k, &number[0], &body[0])
-                lay(x, &numbers[(i % 2) * each], &integers[(i % 2) * whole], &size[i, 0], n)
-                copy_blocks(x, p, &block[first], own, &place[0])
+                    n = number_island_bodies(rows, &block[first], k, &number[0], &body[0])
+                bind_island_arrays(x, &numbers[(i % 2) * each], &integers[(i % 2) * whole], &size[i, 0], n)
+                copy_island_blocks(x, p, &block[first], own, &place[0])
                 if over_bodies:
-                    copy_bodies(x, p, rows, &block[first], &number[0], &body[0])
+                    copy_island_bodies(x, p, rows, &block[first], &number[0], &body[0])
                 else:
-                    copy_matrix(x, p, &self.over.csr, &block[first], &place[0])
-                if are_identical(x, last):
+                    copy_island_matrix(x, p, &self.over.csr, &block[first], &place[0])
+                if are_islands_identical(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
                     x.s.split, x.s.at, x.s.prepared, x.s.relative_at_zero = size[i, 4], NULL, NULL, -1.0
@@ -585,7 +596,7 @@ cdef class Islands(Small):
                         for j in range(k):
                             at[j] = self.at.at[block[first + j]]
                         x.s.at, x.s.prepared = &at[0], self.at.prepared
-                    o.first = first_sweeps(&x.s.v.p, o.max_sweeps)
+                    o.first = count_first_sweeps(&x.s.v.p, o.max_sweeps)
                     swept, factored = o.swept, o.factored
                     good = solve_subproblem(&x.s, o, r, &work[0], &order[0])
                     if not good:

@@ -12,10 +12,10 @@ from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, option
 from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
-from lavender_ext.small.workspace cimport has_workspace_size
-from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_of
-from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.sweep.serial cimport form_velocity, sweep_context_t
+from lavender_ext.small.workspace cimport grow_workspace_to
+from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_residual_of_score
+from lavender_ext.judge.score cimport make_empty_score, score_t
+from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 
 
 cdef enum:
@@ -82,7 +82,7 @@ cdef inline int64_t subproblem_work_size(int64_t m, int64_t n_bodies) noexcept n
     return (7 + 2 * MIXING_MEMORY) * m + 18 * n_bodies + CONTROL + MAX_MEMORY * MAX_MEMORY + 1
 
 
-cdef inline void lay_turns(alternation_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
+cdef inline void bind_subproblem_arrays(alternation_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
     """Bind the arrays to work (`subproblem_work_size`) and order (k)."""
     cdef const view_t* v = &t.s.v
     cdef int64_t m = v.p.n_rows, n = v.r.n_bodies if v.r != NULL else 0
@@ -103,20 +103,20 @@ cdef inline void lay_turns(alternation_t* t, double* work, int32_t* order, uint6
     t.sweeps.exact, t.sweeps.start, t.sweeps.prepared = t.s.at != NULL, t.s.at, t.s.prepared
 
 
-cdef inline double cost_so_far(const alternation_t* t) noexcept nogil:
+cdef inline double estimate_cost_so_far(const alternation_t* t) noexcept nogil:
     """Return the estimated cost [ns] of this subproblem so far."""
     return t.c.iterations * t.sweep + t.info.factorisations * t.factor
 
 
-cdef inline double relative_residual_of(alternation_t* t, const double* lam) noexcept nogil:
+cdef inline double judge_subproblem_impulse(alternation_t* t, const double* lam) noexcept nogil:
     """Return the relative residual of lam."""
     cdef const view_t* v = &t.s.v
-    cdef score_t score = new_score()
+    cdef score_t score = make_empty_score()
     judge_view(v, lam, t.w, t.error, t.scratch, False, &score)
-    return relative_of(&score, t.w, v.p.n_rows, t.e0, t.v0)
+    return relative_residual_of_score(&score, t.w, v.p.n_rows, t.e0, t.v0)
 
 
-cdef inline bint converges_within(double before, double now, double tol, int32_t rounds) noexcept nogil:
+cdef inline bint predicts_convergence(double before, double now, double tol, int32_t rounds) noexcept nogil:
     """Return whether the last check's reduction, repeated `rounds` times, brings the residual to tol."""
     cdef double reduction = now / before
     cdef int32_t _
@@ -134,12 +134,12 @@ cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_swe
     """
     cdef double before, tol = t.o.tol
     cdef int32_t step = MIN_CHECK_INTERVAL
-    while now > tol and t.c.iterations < max_sweeps and cost_so_far(t) < t.o.remaining_cost:
+    while now > tol and t.c.iterations < max_sweeps and estimate_cost_so_far(t) < t.o.remaining_cost:
         before = now
         lav_anderson(&t.c, t.swept, t.c.iterations == 0, step)
-        now = relative_residual_of(t, t.swept)
+        now = judge_subproblem_impulse(t, t.swept)
         step = t.c.iterations // 2 if t.c.iterations // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
-        if extrapolate and not converges_within(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
+        if extrapolate and not predicts_convergence(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
             break
     return now
 
@@ -152,7 +152,7 @@ cdef inline bint start_newton(alternation_t* t) noexcept nogil:
         return False
     t.info.factorisations = 0
     while True:
-        if not has_workspace_size(r, t.workspace.n_index, t.workspace.n_real):
+        if not grow_workspace_to(r, t.workspace.n_index, t.workspace.n_real):
             return False
         t.workspace.index, t.workspace.real = r.index, r.real
         t.how = lav_start(&t.s.v, &t.options, &t.workspace, t.s.answer)
@@ -162,21 +162,21 @@ cdef inline bint start_newton(alternation_t* t) noexcept nogil:
 
 cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
     """Run up to `steps` factorisations and return the relative residual of `answer`."""
-    cdef double fit = (t.o.remaining_cost - cost_so_far(t)) / t.factor
+    cdef double fit = (t.o.remaining_cost - estimate_cost_so_far(t)) / t.factor
     cdef int32_t last = t.info.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
     while t.info.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
         t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.info.factorisations, t.s.answer, &t.info)
-    return relative_residual_of(t, t.s.answer)
+    return judge_subproblem_impulse(t, t.s.answer)
 
 
-cdef inline double alternate_methods(alternation_t* t) noexcept nogil:
+cdef inline double alternate_sweeps_and_newton(alternation_t* t) noexcept nogil:
     """Alternate after slow sweeps: Newton's method, sweeps again, Newton's method up to `MAX_SUBPROBLEM_FACTORISATIONS`."""
     cdef double now
     if not start_newton(t):
         return 1.0 / 0.0
     now = step_newton(t, FIRST_FACTORISATIONS)
-    if now > t.o.tol and cost_so_far(t) < t.o.remaining_cost:
-        now = continue_sweeps(t, relative_residual_of(t, t.swept), RESUMED_SWEEP_RATIO * t.o.max_sweeps, t.s.v.p.law == CONE)
+    if now > t.o.tol and estimate_cost_so_far(t) < t.o.remaining_cost:
+        now = continue_sweeps(t, judge_subproblem_impulse(t, t.swept), RESUMED_SWEEP_RATIO * t.o.max_sweeps, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, MAX_SUBPROBLEM_FACTORISATIONS)
         memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
@@ -185,14 +185,14 @@ cdef inline double alternate_methods(alternation_t* t) noexcept nogil:
 
 cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_t* r, double* work, int32_t* order) noexcept nogil:
     """Solve a subproblem from `lam` into `answer`; return whether its relative residual is at most `tol`."""
-    cdef score_t score_at_zero = new_score()
+    cdef score_t score_at_zero = make_empty_score()
     cdef alternation_t t
     cdef uint64_t rng
     cdef blocks_t* p = &s.v.p
     cdef double now = s.relative_at_zero
     cdef double zero_residual[3]
     t.s, t.o, t.r = s, o, r
-    lay_turns(&t, work, order, &rng)
+    bind_subproblem_arrays(&t, work, order, &rng)
     # reference: the residual of the zero impulse
     set_zero_impulse(p, s.answer, t.w)
     zero_residual[0], zero_residual[1], zero_residual[2] = s.e0, s.v0, now
@@ -204,10 +204,10 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     t.e0, t.v0 = zero_residual[0], zero_residual[1]
     # residual of the start
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
-    form_velocity(&t.sweeps, t.swept)
+    compute_sweep_velocities(&t.sweeps, t.swept)
     t.info.factorisations = 0
     if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
-        now = relative_residual_of(&t, t.swept)
+        now = judge_subproblem_impulse(&t, t.swept)
     else:
         now = zero_residual[2]
     # estimated costs
@@ -217,10 +217,10 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     now = continue_sweeps(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
-    if now > o.tol and cost_so_far(&t) < o.remaining_cost:
+    if now > o.tol and estimate_cost_so_far(&t) < o.remaining_cost:
         o.factorised += 1
         t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
-        now = alternate_methods(&t)
+        now = alternate_sweeps_and_newton(&t)
     # counters
     o.swept += t.c.iterations
     o.undone += <int64_t>t.c.control[UNDONE]
@@ -228,8 +228,9 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     o.factored += t.info.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
     if t.c.iterations + t.info.factorisations > o.longest:
         o.longest = t.c.iterations + t.info.factorisations
-    o.remaining_cost -= cost_so_far(&t)
+    o.remaining_cost -= estimate_cost_so_far(&t)
     # at the cost limit the better of both iterates is the result
-    if now > o.tol and not o.remaining_cost > 0.0 and not relative_residual_of(&t, s.answer) <= relative_residual_of(&t, t.swept):
+    if (now > o.tol and not o.remaining_cost > 0.0
+            and not judge_subproblem_impulse(&t, s.answer) <= judge_subproblem_impulse(&t, t.swept)):
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     return now <= o.tol

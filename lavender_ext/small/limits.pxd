@@ -8,7 +8,7 @@ calls this estimate, too (`estimate_velocity_cost` of `lavender/solvers/small.py
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_friction, has_independent_rows
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -29,27 +29,28 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double steps                # maximum steps of all islands together
 
 
-cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+cdef inline double estimate_newton_step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l,
+                                             double work) noexcept nogil:
     """Return the cost [ns] of one step with one factorisation of every island, `work` multiply-adds in total."""
     return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
 
 
-cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
+cdef inline bint has_only_free_rows(const blocks_t* p) noexcept nogil:
     """Return whether every row is free (unbounded)."""
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not is_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
+            if not has_independent_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
                 return False
     return True
 
 
-cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+cdef inline double estimate_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
     """Return the estimated cost [ns] of Newton's method, (1)."""
-    return (1.0 if is_linear(p) else l.count) * step_cost(p, g, l, work)
+    return (1.0 if has_only_free_rows(p) else l.count) * estimate_newton_step_cost(p, g, l, work)
 
 
-cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogil:
+cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept nogil:
     """Return whether no row couples more than `columns` velocities."""
     cdef int32_t b
     for b in range(g.n_panels):
@@ -58,19 +59,19 @@ cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogi
     return True
 
 
-cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
+cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
                            bint soft) noexcept nogil:
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
     cdef bint frictional = has_friction(p)
     cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
     cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
-    if frictional and islands * max_rows < p.n_rows < l.dense * g.n and are_short(g, l.columns):
+    if frictional and islands * max_rows < p.n_rows < l.dense * g.n and are_rows_short(g, l.columns):
         return 0.0
     return l.max_cost if soft else min(l.max_cost, l.start + l.sweeps * sweep)
 
 
-cdef inline double work_within(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
+cdef inline double max_factorisation_work(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
     """Return the maximum multiply-adds of factorising every island, for any number of islands."""
-    cdef double fixed = cost_of(p, g, l, 0.0)
-    return (allowed(p, g, l, p.n_rows, soft) - fixed) / (cost_of(p, g, l, 1.0) - fixed)
+    cdef double fixed = estimate_newton_cost(p, g, l, 0.0)
+    return (max_newton_cost(p, g, l, p.n_rows, soft) - fixed) / (estimate_newton_cost(p, g, l, 1.0) - fixed)

@@ -5,7 +5,7 @@ from libc.stdlib cimport free, malloc
 from lavender_ext.core.method cimport workspace_t
 
 
-cdef inline bint has_workspace_size(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+cdef inline bint grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
     """Grow the workspace to at least these sizes; return False if out of memory. Growing discards the content."""
     if n_index > r.n_index:
         free(r.index)

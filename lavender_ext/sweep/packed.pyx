@@ -23,10 +23,12 @@ from libc.stdint cimport int32_t, int64_t, uintptr_t
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.pair cimport LANES, load_pair, pair_t, store_pair
-from lavender_ext.core.view cimport bodies_of, rows_t
-from lavender_ext.sweep.records cimport (CODE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES,
-                                         WRITE_OFFSET, block_kind, kind_in, kind_rows, previous_size_in, record_code, record_size,
-                                         relax_record, size_in, write_record)
+from lavender_ext.core.view cimport get_block_bodies, rows_t
+from lavender_ext.sweep.records cimport (
+    CODE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES, WRITE_OFFSET, classify_record_kind,
+    decode_record_kind, count_record_rows, decode_previous_record_size, encode_record_header, record_size_in_pairs,
+    relax_record, decode_record_size, write_block_record,
+)
 
 
 cdef enum:                      # doubles of workspace: a record for every block, and four int32
@@ -44,7 +46,7 @@ cdef enum:
     MAX_SHORTENING_ROUNDS = 3   # number of times that levels are computed again to shorten T
 
 
-cdef struct plan_t:             # temporary arrays of `pack_order`
+cdef struct plan_t:             # temporary arrays of `pack_blocks_in_order`
     int32_t* next_level         # (n_bodies) lowest level for the next block of each body
     int32_t* first_level        # (n_bodies) level of its first block, -1 without blocks
     int32_t* start_level        # (n_bodies) level at which its blocks may begin
@@ -63,7 +65,7 @@ cdef struct span_t:             # records that are read in sequence, forwards or
     int32_t sweeps              # and of sweeps, if some lanes may not be due; else 0
 
 
-cdef inline span_t span_of(pair_t* first, pair_t* last, bint backwards) noexcept nogil:
+cdef inline span_t make_record_span(pair_t* first, pair_t* last, bint backwards) noexcept nogil:
     """Return the span of all records from `first` to `last`."""
     if backwards:
         return span_t(last, first, True, 0, 0)
@@ -72,18 +74,19 @@ cdef inline span_t span_of(pair_t* first, pair_t* last, bint backwards) noexcept
 
 cdef int64_t packed_workspace_size(int64_t joints, int64_t joint_rows, int64_t contacts, int64_t contact_rows,
                                    int64_t bodies) noexcept nogil:
-    """Return the number of doubles of workspace of `pack_order`."""
+    """Return the number of doubles of workspace of `pack_blocks_in_order`."""
     return (WORKSPACE_PER_JOINT * joints + WORKSPACE_PER_JOINT_ROW * joint_rows + WORKSPACE_PER_CONTACT * contacts
             + WORKSPACE_PER_CONTACT_ROW * contact_rows + WORKSPACE_PER_BODY * bodies + EXTRA_WORKSPACE)
 
 
-cdef int64_t packed_workspace_size_of(const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef int64_t packed_workspace_size_of_blocks(const blocks_t* p, const rows_t* r) noexcept nogil:
     """Return the number of doubles of workspace for these blocks."""
     cdef int32_t joint_rows = p.ptr[r.n_joints]
     return packed_workspace_size(r.n_joints, joint_rows, r.n_contacts, p.n_rows - joint_rows, r.n_bodies)
 
 
-cdef inline int32_t set_levels(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t second_part, plan_t* x,
+cdef inline int32_t compute_schedule_levels(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t second_part,
+                                            plan_t* x,
                                int32_t* n_levels) noexcept nogil:
     """Compute the levels of the blocks and their number, and return T of (1).
 
@@ -98,7 +101,7 @@ cdef inline int32_t set_levels(const blocks_t* p, const rows_t* r, const int32_t
     for i in range(p.n_blocks):
         if i == second_part:
             lowest = top
-        body = bodies_of(r, order[i])
+        body = get_block_bodies(r, order[i])
         level = lowest
         for side in range(2):
             if body[side] >= 0 and x.next_level[body[side]] > level:
@@ -119,7 +122,7 @@ cdef inline int32_t set_levels(const blocks_t* p, const rows_t* r, const int32_t
     return t
 
 
-cdef inline int32_t shorten_period(const blocks_t* p, const rows_t* r, const int32_t* order, plan_t* x, int32_t t,
+cdef inline int32_t delay_wide_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, plan_t* x, int32_t t,
                                    int32_t* n_levels) noexcept nogil:
     """Give a later start to bodies with blocks that span more levels than necessary; return the T of the new levels."""
     cdef int32_t i, shortest = p.n_blocks // BLOCKS_PER_SLOT, _round
@@ -132,11 +135,11 @@ cdef inline int32_t shorten_period(const blocks_t* p, const rows_t* r, const int
         for i in range(r.n_bodies):
             if x.first_level[i] >= 0 and x.next_level[i] - x.first_level[i] > shortest:
                 x.start_level[i] = x.next_level[i] - shortest
-        t = set_levels(p, r, order, p.n_blocks, x, n_levels)
+        t = compute_schedule_levels(p, r, order, p.n_blocks, x, n_levels)
     return t
 
 
-cdef inline bint sort_by_slot(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t t, plan_t* x) noexcept nogil:
+cdef inline bint sort_blocks_by_slot(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t t, plan_t* x) noexcept nogil:
     """Replace levels by slot and stage, and sort the blocks by slot and kind; return False if most blocks are UNPACKED."""
     cdef int32_t i, slot, count, start = 0, stage, kind, unpacked = 0, n = p.n_blocks
     cdef int32_t kinds = 0                              # bit set of the kinds that occur
@@ -147,7 +150,7 @@ cdef inline bint sort_by_slot(const blocks_t* p, const rows_t* r, const int32_t*
         slot = x.place[i] - stage * t
         x.slot_end[slot] += 1
         x.place[i] = SLOT_LIMIT * stage + slot
-        kind = block_kind(p, r, order[i])
+        kind = classify_record_kind(p, r, order[i])
         unpacked += kind == UNPACKED
         x.kind[i] = kind
         kinds |= 1 << kind
@@ -168,12 +171,12 @@ cdef inline bint sort_by_slot(const blocks_t* p, const rows_t* r, const int32_t*
     return True
 
 
-cdef inline bint shares_body(const int32_t* x, const int32_t* y) noexcept nogil:
+cdef inline bint have_common_moving_body(const int32_t* x, const int32_t* y) noexcept nogil:
     """Return whether two pairs of bodies have a moving body in common."""
     return (x[0] >= 0 and (x[0] == y[0] or x[0] == y[1])) or (x[1] >= 0 and (x[1] == y[0] or x[1] == y[1]))
 
 
-cdef inline int32_t find_partner(const rows_t* r, const int32_t* order, const plan_t* x, const int32_t* unpaired,
+cdef inline int32_t find_block_for_same_record(const rows_t* r, const int32_t* order, const plan_t* x, const int32_t* unpaired,
                                  int32_t n_unpaired, int32_t begin, int32_t end) noexcept nogil:
     """Return a block of the next slot, by_slot[begin:end], that may be paired with unpaired[0], or -1.
 
@@ -185,35 +188,37 @@ cdef inline int32_t find_partner(const rows_t* r, const int32_t* order, const pl
         if x.kind[candidate] != x.kind[unpaired[0]]:
             continue
         for k in range(n_unpaired):
-            if shares_body(bodies_of(r, order[candidate]), bodies_of(r, order[unpaired[k]])):
+            if have_common_moving_body(get_block_bodies(r, order[candidate]), get_block_bodies(r, order[unpaired[k]])):
                 break
         else:
             return candidate
     return -1
 
 
-cdef inline void append_record(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x, int32_t i,
+cdef inline void append_packed_record(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x,
+                                      int32_t i,
                                int32_t j, packed_t* out) noexcept nogil:
     """Append the record of blocks order[i] and order[j]; j = -1 for one block."""
     cdef pair_t* record = <pair_t*>out.end
     cdef int32_t kind = x.kind[i], k = i if j < 0 else j
     cdef int32_t lane = LANES * <int32_t>(record - out.first)
     if out.single:
-        write_record(p, r, kind, order[i], order[k], p.ptr[order[i]], p.ptr[order[k]], lam, record)
+        write_block_record(p, r, kind, order[i], order[k], p.ptr[order[i]], p.ptr[order[k]], lam, record)
     else:
-        write_record(p, r, kind, order[i], order[k], x.place[i] // SLOT_LIMIT, x.place[k] // SLOT_LIMIT, lam, record)
-    (<int64_t*>record)[CODE * LANES] = record_code(kind, record - out.last)
+        write_block_record(p, r, kind, order[i], order[k], x.place[i] // SLOT_LIMIT, x.place[k] // SLOT_LIMIT, lam, record)
+    (<int64_t*>record)[CODE * LANES] = encode_record_header(kind, record - out.last)
     if j >= 0:
         x.place[j] = lane + 1
         x.kind[j] = -1
     x.place[i] = lane
     x.kind[i] = -1
     out.last = record
-    out.end = <double*>(record + record_size(kind))
+    out.end = <double*>(record + record_size_in_pairs(kind))
     out.n_records += 1
 
 
-cdef inline void append_slot(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x, int32_t begin,
+cdef inline void append_records_of_slot(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x,
+                                        int32_t begin,
                              int32_t end, int32_t next_end, packed_t* out) noexcept nogil:
     """Append the records of one slot, by_slot[begin:end]; blocks without a partner in the slot come last."""
     cdef int32_t unpaired[N_KINDS]
@@ -223,9 +228,9 @@ cdef inline void append_slot(const blocks_t* p, const rows_t* r, const int32_t* 
         if x.kind[block] < 0:                           # is in a record of the slot before
             continue
         if x.kind[block] == UNPACKED or LANES == 1:
-            append_record(p, r, order, lam, x, block, -1, out)
+            append_packed_record(p, r, order, lam, x, block, -1, out)
         elif waiting >= 0 and x.kind[waiting] == x.kind[block]:
-            append_record(p, r, order, lam, x, waiting, block, out)
+            append_packed_record(p, r, order, lam, x, waiting, block, out)
             waiting = -1
         else:
             if waiting >= 0:
@@ -236,11 +241,11 @@ cdef inline void append_slot(const blocks_t* p, const rows_t* r, const int32_t* 
         unpaired[n_unpaired] = waiting
         n_unpaired += 1
     for i in range(n_unpaired):
-        partner = find_partner(r, order, x, unpaired + i, n_unpaired - i, end, next_end)
-        append_record(p, r, order, lam, x, unpaired[i], partner, out)
+        partner = find_block_for_same_record(r, order, x, unpaired + i, n_unpaired - i, end, next_end)
+        append_packed_record(p, r, order, lam, x, unpaired[i], partner, out)
 
 
-cdef int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order, bint single, double* workspace,
+cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int32_t* order, bint single, double* workspace,
                         const double* lam, packed_t* out) noexcept nogil:
     """Pack the blocks of an order (k) with their impulses lam (m) into records in `workspace` (`packed_workspace_size`).
 
@@ -266,15 +271,15 @@ cdef int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order
     # levels and T
     for i in range(r.n_bodies):
         x.start_level[i] = 0
-    t = set_levels(p, r, order, r.n_joints if single else n, &x, &n_levels)
+    t = compute_schedule_levels(p, r, order, r.n_joints if single else n, &x, &n_levels)
     if single:
         t = n_levels
     else:
         if t > n // BLOCKS_PER_SLOT:
-            t = shorten_period(p, r, order, &x, t, &n_levels)
+            t = delay_wide_bodies(p, r, order, &x, t, &n_levels)
         if t < n // BLOCKS_PER_SLOT:
             t = min(n // BLOCKS_PER_SLOT, n_levels)
-    if n < MIN_BLOCKS_PER_SLOT * t or not sort_by_slot(p, r, order, t, &x):
+    if n < MIN_BLOCKS_PER_SLOT * t or not sort_blocks_by_slot(p, r, order, t, &x):
         return 0
     # records, which begin at a multiple of 16 bytes
     out.first = <pair_t*>(workspace + ((<uintptr_t>workspace >> 3) & 1))
@@ -290,41 +295,41 @@ cdef int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order
             out.first_contact = <pair_t*>out.end
         end = x.slot_end[i]
         next_end = x.slot_end[i + 1] if i + 1 < t else end
-        append_slot(p, r, order, lam, &x, begin, end, next_end, out)
+        append_records_of_slot(p, r, order, lam, &x, begin, end, next_end, out)
         begin = end
     if r.n_contacts == 0:
         out.last_joint = out.last
     return 1
 
 
-cdef inline double* impulses_in(const packed_t* packed, int32_t lane, int32_t* n) noexcept nogil:
+cdef inline double* locate_packed_impulses(const packed_t* packed, int32_t lane, int32_t* n) noexcept nogil:
     """Return the first impulse of a block in its record, and their number; successive impulses are LANES doubles apart."""
     cdef double* record = <double*>(packed.first + lane // LANES)
-    n[0] = kind_rows(kind_in((<int64_t*>record)[CODE * LANES]))
+    n[0] = count_record_rows(decode_record_kind((<int64_t*>record)[CODE * LANES]))
     return record + LANES * HEADER_SIZE + lane % LANES
 
 
-cdef void load_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, const double* lam) noexcept nogil:
+cdef void load_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, const double* lam) noexcept nogil:
     """Copy the impulses lam (m) into the records."""
     cdef int32_t i, k, n
     cdef double* x
     for i in range(p.n_blocks):
-        x = impulses_in(packed, packed.lane[i], &n)
+        x = locate_packed_impulses(packed, packed.lane[i], &n)
         for k in range(n):
             x[LANES * k] = lam[p.ptr[order[i]] + k]
 
 
-cdef void store_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, double* lam) noexcept nogil:
+cdef void store_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, double* lam) noexcept nogil:
     """Copy the impulses in the records to lam (m)."""
     cdef int32_t i, k, n
     cdef double* x
     for i in range(p.n_blocks):
-        x = impulses_in(packed, packed.lane[i], &n)
+        x = locate_packed_impulses(packed, packed.lane[i], &n)
         for k in range(n):
             lam[p.ptr[order[i]] + k] = x[LANES * k]
 
 
-cdef inline int32_t lanes_due(const int64_t* header, int32_t pass_, int32_t sweeps) noexcept nogil:
+cdef inline int32_t find_active_lanes(const int64_t* header, int32_t pass_, int32_t sweeps) noexcept nogil:
     """Return the lanes that are due in this pass, 0 <= pass_ - stage < sweeps, as a bit set."""
     cdef int32_t lane, due = 0
     for lane in range(LANES):
@@ -332,7 +337,7 @@ cdef inline int32_t lanes_due(const int64_t* header, int32_t pass_, int32_t swee
     return due
 
 
-cdef inline void hold_lanes(const pair_t* record, int32_t n, int32_t due, int64_t unused, int64_t* write_offset,
+cdef inline void mask_inactive_lanes(const pair_t* record, int32_t n, int32_t due, int64_t unused, int64_t* write_offset,
                             double* saved) noexcept nogil:
     """Redirect the velocities of lanes that are not due to an unused place, and save the impulses of the record."""
     cdef const int64_t* header = <const int64_t*>record
@@ -343,7 +348,7 @@ cdef inline void hold_lanes(const pair_t* record, int32_t n, int32_t due, int64_
         saved[k] = (<const double*>(record + HEADER_SIZE))[k]
 
 
-cdef inline void restore_lanes(pair_t* record, int32_t n, int32_t due, const double* saved) noexcept nogil:
+cdef inline void restore_inactive_lanes(pair_t* record, int32_t n, int32_t due, const double* saved) noexcept nogil:
     """Restore the impulses of lanes that are not due."""
     cdef int32_t k
     for k in range(LANES * n):
@@ -351,7 +356,7 @@ cdef inline void restore_lanes(pair_t* record, int32_t n, int32_t due, const dou
             (<double*>(record + HEADER_SIZE))[k] = saved[k]
 
 
-cdef inline void load_outside(const pair_t* record, int32_t n, const double* lam, pair_t* impulses) noexcept nogil:
+cdef inline void load_record_impulses(const pair_t* record, int32_t n, const double* lam, pair_t* impulses) noexcept nogil:
     """Load the impulses of a record from lam (m)."""
     cdef const int64_t* header = <const int64_t*>record
     cdef int32_t k
@@ -359,7 +364,7 @@ cdef inline void load_outside(const pair_t* record, int32_t n, const double* lam
         impulses[k] = load_pair(lam + header[OWNER * LANES] + k, lam + header[OWNER * LANES + LANES - 1] + k)
 
 
-cdef inline void store_outside(const pair_t* record, int32_t n, const pair_t* impulses, double* lam) noexcept nogil:
+cdef inline void store_record_impulses(const pair_t* record, int32_t n, const pair_t* impulses, double* lam) noexcept nogil:
     """Store the impulses of a record to lam (m)."""
     cdef const int64_t* header = <const int64_t*>record
     cdef int32_t k
@@ -380,31 +385,31 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
     cdef pair_t* impulses
     while True:
         code = (<int64_t*>record)[CODE * LANES]
-        kind = kind_in(code)
-        n = kind_rows(kind)
+        kind = decode_record_kind(code)
+        n = count_record_rows(kind)
         # impulses, lanes that are due
         impulses = record + HEADER_SIZE
         write_offset = <int64_t*>record + WRITE_OFFSET * LANES
         due = all_lanes
         if packed.single:
-            load_outside(record, n, lam, outside)
+            load_record_impulses(record, n, lam, outside)
             impulses = outside
         elif span.sweeps > 0:
-            due = lanes_due(<int64_t*>record, span.pass_, span.sweeps)
+            due = find_active_lanes(<int64_t*>record, span.pass_, span.sweeps)
             if due != all_lanes:
-                hold_lanes(record, n, due, unused, held_offset, saved)
+                mask_inactive_lanes(record, n, due, unused, held_offset, saved)
                 write_offset = held_offset
         # update
         if due:
             relax_record(p, r, record, kind, impulses, v, write_offset, lam)
         if packed.single:
-            store_outside(record, n, outside, lam)
+            store_record_impulses(record, n, outside, lam)
         elif due != all_lanes:
-            restore_lanes(record, n, due, saved)
+            restore_inactive_lanes(record, n, due, saved)
         # next record
         if record == span.end:
             return
-        record += -previous_size_in(code) if span.backwards else size_in(code)
+        record += -decode_previous_record_size(code) if span.backwards else decode_record_size(code)
 
 
 cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* packed, int32_t sweeps, bint backwards,
@@ -417,14 +422,14 @@ cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* pack
     cdef span_t span[2]
     cdef int32_t k, i, n_spans = 0, n_passes = 1 if packed.single else sweeps + packed.n_stages - 1
     if not packed.single:
-        span[0] = span_of(packed.first, packed.last, False)
+        span[0] = make_record_span(packed.first, packed.last, False)
         n_spans = 1
     else:
         if r.n_joints > 0:
-            span[0] = span_of(packed.first, packed.last_joint, backwards)
+            span[0] = make_record_span(packed.first, packed.last_joint, backwards)
             n_spans = 1
         if r.n_contacts > 0:
-            span[n_spans] = span_of(packed.first_contact, packed.last, backwards)
+            span[n_spans] = make_record_span(packed.first_contact, packed.last, backwards)
             n_spans += 1
     for k in range(n_passes):
         for i in range(n_spans):
@@ -436,11 +441,11 @@ cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* pack
 
 cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps, double* workspace,
                           double* lam, double* v) noexcept nogil:
-    """Pack the blocks and run sweeps over them; v (n_bodies, 6). Return 0 without a sweep if `pack_order` packs nothing."""
+    """Pack the blocks and run sweeps over them; v (n_bodies, 6). Return 0 without a sweep if nothing can be packed."""
     cdef packed_t packed
     cdef double* body
     cdef int32_t i
-    if not pack_order(p, r, order, False, workspace, lam, &packed):
+    if not pack_blocks_in_order(p, r, order, False, workspace, lam, &packed):
         return 0
     body = packed.end
     for i in range(6 * r.n_bodies):
@@ -450,5 +455,5 @@ cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* ord
     sweep_records(p, r, &packed, sweeps, False, lam, body)
     for i in range(6 * r.n_bodies):
         v[i] = body[i]
-    store_impulses(p, order, &packed, lam)
+    store_packed_impulses(p, order, &packed, lam)
     return 1

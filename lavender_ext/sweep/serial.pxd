@@ -80,16 +80,16 @@ cdef struct sweep_run_t:
     forget_t forget             # clears the memory of an accelerated run, before a stalled run restarts; NULL: no restart
 
 
-cdef int32_t velocities_of(const view_t* v) noexcept nogil
-cdef void form_velocity(const sweep_context_t* c, const double* lam) noexcept nogil
-cdef double jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil
-cdef bint can_pack(const sweep_run_t* x, const view_t* v) noexcept nogil
+cdef int32_t count_sweep_velocities(const view_t* v) noexcept nogil
+cdef void compute_sweep_velocities(const sweep_context_t* c, const double* lam) noexcept nogil
+cdef double compute_jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil
+cdef bint can_pack_blocks(const sweep_run_t* x, const view_t* v) noexcept nogil
 cdef int64_t sweeps_workspace_size(sweep_run_t* x, const view_t* v, int32_t* start) noexcept nogil
 cdef void start_sweeps(sweep_run_t* x, const view_t* v, const int32_t* start, double* workspace) noexcept nogil
 cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, const view_t* confirm, double* lam, int32_t n,
                         double tol, int32_t* done) noexcept nogil
-cdef void sweep(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil
-cdef void sweep_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil
+cdef void run_sweep_chunk(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 
 
 cdef class Sweeps:

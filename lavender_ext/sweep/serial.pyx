@@ -15,19 +15,20 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.generalized cimport whitened_transpose_times
-from lavender_ext.core.order cimport GIVEN, SYMMETRIC, advance_order
+from lavender_ext.core.csr cimport csr_row_dot
+from lavender_ext.core.generalized cimport multiply_whitened_transpose
+from lavender_ext.core.order cimport GIVEN, SYMMETRIC, update_sweep_order
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport csr_t, view_t
-from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, begins_again, run_until_stop,
+from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, restart_if_stalled, run_until_stop,
                                                stopping_test_t)
-from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes, solve_blocks
-from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_impulses, pack_order, packed_workspace_size_of, store_impulses,
+from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers, sweep_exact_blocks
+from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_packed_impulses, pack_blocks_in_order,
+                                        packed_workspace_size_of_blocks, store_packed_impulses,
                                         sweep_records)
-from lavender_ext.sweep.pgs cimport (relax_bodies, relax_damped, relax_general, relax_matrix, relax_single_rows,
-                                     relax_stored_slack)
+from lavender_ext.sweep.pgs cimport (sweep_bodies, sweep_matrix_sor, sweep_generalized, sweep_matrix, sweep_bounded_rows,
+                                     sweep_jacobi)
 from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKED, NOT_WORTH_PACKING, PACKED, packing_t,
                                         sweep_context_t, sweep_run_t)
 
@@ -39,34 +40,35 @@ cdef enum:
     RESTART_SWEEPS = 64         # sweeps of a stalled run after its restart from the best iterate
 
 
-cdef bint pack_long_run(sweep_context_t* c, const double* lam, int64_t sweeps) noexcept nogil:
+cdef bint pack_blocks_of_long_run(sweep_context_t* c, const double* lam, int64_t sweeps) noexcept nogil:
     """Pack the blocks if a run of this length pays for it; return whether they are packed."""
     cdef packing_t* x = c.packing
     if not ALL_SWEEPS or x == NULL:
         return False
     if x.status == NOT_PACKED and x.workspace != NULL and sweeps >= x.min_sweeps:
         x.backwards = False
-        x.status = PACKED if pack_order(c.blocks, c.rows, c.order, x.single, x.workspace, lam, &x.packed) else NOT_WORTH_PACKING
+        x.status = PACKED if pack_blocks_in_order(c.blocks, c.rows, c.order, x.single, x.workspace, lam,
+                                                  &x.packed) else NOT_WORTH_PACKING
     return x.status == PACKED
 
 
-cdef void form_velocity(const sweep_context_t* c, const double* lam) noexcept nogil:
+cdef void compute_sweep_velocities(const sweep_context_t* c, const double* lam) noexcept nogil:
     """Compute the velocities v of lam (m); there are none over A."""
     if c.general != NULL:
-        whitened_transpose_times(c.general, lam, c.v)
+        multiply_whitened_transpose(c.general, lam, c.v)
     elif c.n_v > 0:
-        rows_velocity(c.blocks, c.rows, lam, c.v)
+        compute_velocity_change(c.blocks, c.rows, lam, c.v)
 
 
-cdef inline void set_next_order(sweep_context_t* c, bint first) noexcept nogil:
+cdef inline void update_order_for_sweep(sweep_context_t* c, bint first) noexcept nogil:
     """Reverse or shuffle the order for the next sweep; `first`: no sweep was before."""
-    advance_order(c.mode, first, c.order, 0, c.split, c.rng)
-    advance_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
+    update_sweep_order(c.mode, first, c.order, 0, c.split, c.rng)
+    update_sweep_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
     if c.packing != NULL and c.mode == SYMMETRIC and not first:
         c.packing.backwards = not c.packing.backwards
 
 
-cdef double jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil:
+cdef double compute_jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil:
     """Return min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)) with the steps s, a safe omega of Jacobi; scratch (m)."""
     cdef double largest_sum = 0.0, row_sum
     cdef int32_t i, q
@@ -82,7 +84,7 @@ cdef double jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) n
     return 1.6 / largest_sum if 1.6 < largest_sum else 1.0
 
 
-cdef bint can_pack(const sweep_run_t* x, const view_t* v) noexcept nogil:
+cdef bint can_pack_blocks(const sweep_run_t* x, const view_t* v) noexcept nogil:
     """Return whether blocks may be packed: over bodies, in an order that does not change, or is reversed between single sweeps."""
     cdef const sweep_context_t* c = &x.context
     cdef bint single = x.packing.single
@@ -93,7 +95,7 @@ cdef bint can_pack(const sweep_run_t* x, const view_t* v) noexcept nogil:
     return MIN_PACKED_BLOCKS <= v.p.n_blocks <= MAX_PACKED_BLOCKS
 
 
-cdef int32_t velocities_of(const view_t* v) noexcept nogil:
+cdef int32_t count_sweep_velocities(const view_t* v) noexcept nogil:
     """Return the number of velocities that sweeps over v keep."""
     return v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
 
@@ -104,8 +106,8 @@ cdef int64_t sweeps_workspace_size(sweep_run_t* x, const view_t* v, int32_t* sta
     start (k) receives the first index of each prepared block; NULL if no block is solved exactly.
     """
     cdef sweep_context_t* c = &x.context
-    cdef double n = prepared_sizes(&v.p, start) + 1 if ALL_SWEEPS and start != NULL else 0.0
-    c.blocks, c.csr, c.rows, c.general, c.n_v = &v.p, v.a, v.r, v.g, velocities_of(v)
+    cdef double n = index_prepared_numbers(&v.p, start) + 1 if ALL_SWEEPS and start != NULL else 0.0
+    c.blocks, c.csr, c.rows, c.general, c.n_v = &v.p, v.a, v.r, v.g, count_sweep_velocities(v)
     return c.n_v + 12 + <int64_t>n if n < 2147483647.0 else -1
 
 
@@ -115,7 +117,7 @@ cdef void start_sweeps(sweep_run_t* x, const view_t* v, const int32_t* start, do
     c.v = workspace
     if ALL_SWEEPS and start != NULL:
         c.start, c.prepared = start, workspace + c.n_v + 12
-        prepare_blocks(v, start, workspace + c.n_v + 12)
+        prepare_exact_blocks(v, start, workspace + c.n_v + 12)
     x.packing.min_sweeps = (MIN_SWEEPS_TO_PACK_MANY if x.packing.single or v.p.n_blocks >= MANY_BLOCKS
                             else MIN_SWEEPS_TO_PACK)
     if x.step_context == NULL:
@@ -128,62 +130,62 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
     cdef int32_t status, more
     x.context.w = test.e                                # The stopping test does not need its errors between checks.
     if test.total == 0:
-        form_velocity(&x.context, lam)
+        compute_sweep_velocities(&x.context, lam)
     if x.packing.single:
-        pack_long_run(&x.context, lam, <int64_t>test.total + n)
+        pack_blocks_of_long_run(&x.context, lam, <int64_t>test.total + n)
     status = run_until_stop(test, v, confirm, x.step, x.step_context, lam, n, tol, done)
-    while status == STALLED and x.forget != NULL and begins_again(test, RESTART_SWEEPS):
+    while status == STALLED and x.forget != NULL and restart_if_stalled(test, RESTART_SWEEPS):
         x.forget(x.step_context, lam)
         status = run_until_stop(test, v, confirm, x.step, x.step_context, lam, n - done[0], tol, &more)
         done[0] += more
     return status
 
 
-cdef void sweep(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
+cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
     """Run one sweep over blocks p, which are those of `c` or differ in their law; `first`: no sweep was before."""
     cdef int32_t i
     # all slacks before the sweep (3)
     if c.method == JACOBI:
         for i in range(p.n_rows):
-            c.w[i] = csr_dot(c.csr, i, lam) - p.b[i]
-        relax_stored_slack(p, c.w, c.omega, lam)
+            c.w[i] = csr_row_dot(c.csr, i, lam) - p.b[i]
+        sweep_jacobi(p, c.w, c.omega, lam)
         return
     # order
-    set_next_order(c, first)
+    update_order_for_sweep(c, first)
     # blocks
     if c.method == SOR:
-        relax_damped(p, c.csr, c.omega, c.order, lam)
+        sweep_matrix_sor(p, c.csr, c.omega, c.order, lam)
     elif ALL_SWEEPS and exact:
-        c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.prepared, c.order, lam, c.v)
+        c.fallbacks += sweep_exact_blocks(p, c.csr, c.rows, c.general, c.start, c.prepared, c.order, lam, c.v)
     elif ALL_SWEEPS and c.general != NULL:
-        relax_general(p, c.general, c.order, lam, c.v)
+        sweep_generalized(p, c.general, c.order, lam, c.v)
     elif c.csr != NULL and c.order == NULL:
-        relax_single_rows(p, c.csr, lam)
+        sweep_bounded_rows(p, c.csr, lam)
     elif c.csr != NULL:
-        relax_matrix(p, c.csr, c.order, lam)
+        sweep_matrix(p, c.csr, c.order, lam)
     elif ALL_SWEEPS and c.packing != NULL and c.packing.single and c.packing.status == PACKED:
         sweep_records(p, c.rows, &c.packing.packed, 1, c.packing.backwards, lam, c.v)
     else:
-        relax_bodies(p, c.rows, c.order, p.n_blocks, lam, c.v)
+        sweep_bodies(p, c.rows, c.order, p.n_blocks, lam, c.v)
 
 
-cdef void sweep_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+cdef void run_sweep_chunk(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """Run n sweeps; packed blocks give the same bits."""
     cdef sweep_context_t* c = <sweep_context_t*>context
     cdef int32_t s
-    if pack_long_run(c, lam, n) and n >= c.packing.packed.n_stages:
-        load_impulses(c.blocks, c.order, &c.packing.packed, lam)
+    if pack_blocks_of_long_run(c, lam, n) and n >= c.packing.packed.n_stages:
+        load_packed_impulses(c.blocks, c.order, &c.packing.packed, lam)
         sweep_records(c.blocks, c.rows, &c.packing.packed, n, False, lam, c.v)
-        store_impulses(c.blocks, c.order, &c.packing.packed, lam)
+        store_packed_impulses(c.blocks, c.order, &c.packing.packed, lam)
         return
     for s in range(n):
-        sweep(c, c.blocks, c.exact, lam, first_sweep and s == 0)
+        sweep_over_form(c, c.blocks, c.exact, lam, first_sweep and s == 0)
 
 
-def damping(Data p):
+def jacobi_damping_of_matrix(Data p):
     """Return the omega of Jacobi over the rows of A."""
     cdef double[::1] scratch = np.empty(p.blocks.n_rows + 1)
-    return jacobi_damping(&p.blocks, &p.csr, &scratch[0])
+    return compute_jacobi_damping(&p.blocks, &p.csr, &scratch[0])
 
 
 cdef class Sweeps:
@@ -206,7 +208,7 @@ cdef class Sweeps:
 
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int method=SWEEPS, double omega=1.0,
                  bint exact=False, Sweeps before=None):
-        self.x.step = sweep_step
+        self.x.step = run_sweep_chunk
         self.x.context.method, self.x.context.omega = method, omega
         self.allocate(p, order, split, mode, rng, exact, exact, 0)
         if before is not None:
@@ -233,7 +235,7 @@ cdef class Sweeps:
         self.workspace = workspace = np.zeros(n + extra)
         self.references = p, order, rng, start
         start_sweeps(&self.x, &self.view, first, &workspace[0])
-        if can_pack(&self.x, &self.view):
+        if can_pack_blocks(&self.x, &self.view):
             c.packing = &self.x.packing
         return &workspace[0] + n
 
@@ -254,8 +256,8 @@ cdef class Sweeps:
         if (x != NULL and x.status == NOT_PACKED and x.workspace == NULL
                 and n + (watch.state.total if x.single else 0) >= x.min_sweeps):
             if (self.packing_workspace is None
-                    or len(self.packing_workspace) < packed_workspace_size_of(&self.view.p, self.view.r)):
-                self.packing_workspace = np.empty(packed_workspace_size_of(&self.view.p, self.view.r))
+                    or len(self.packing_workspace) < packed_workspace_size_of_blocks(&self.view.p, self.view.r)):
+                self.packing_workspace = np.empty(packed_workspace_size_of_blocks(&self.view.p, self.view.r))
             workspace = self.packing_workspace
             x.workspace = &workspace[0]
         with nogil:
@@ -265,7 +267,7 @@ cdef class Sweeps:
     def start(self, const double[::1] lam):
         """Compute the velocities of an impulse (m,) that is not the result of the last sweep."""
         if lam.shape[0]:
-            form_velocity(&self.x.context, &lam[0])
+            compute_sweep_velocities(&self.x.context, &lam[0])
 
     def disable_packing(self):
         """Sweep over single blocks from now on, with the same bits."""

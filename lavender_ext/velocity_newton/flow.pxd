@@ -14,14 +14,14 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.block_projection cimport active_bound, project_contact
-from lavender_ext.core.block cimport block_error, row_error
-from lavender_ext.core.generalized cimport panel_times, panel_transpose_add
-from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_rows
+from lavender_ext.core.block_projection cimport classify_active_bound, project_contact
+from lavender_ext.core.block cimport compute_block_error, compute_row_error
+from lavender_ext.core.generalized cimport multiply_whitened_panel, add_panel_transpose_product
+from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, has_independent_rows
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.linear cimport linear_t
 from lavender_ext.factor.tiles cimport combine_rows
-from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t
+from lavender_ext.judge.tally cimport make_empty_tally, add_block_error, add_row_error, tally_t
 
 
 cdef struct descent_t:          # Newton steps under one law
@@ -186,20 +186,20 @@ cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, 
             z = (rho[k] * center[k] - s[k]) * soft[k]
             low = lower[k]
             high = upper[k]
-            v[k] = soft[k] if active_bound(z, low, high) == 0 else 0.0
+            v[k] = soft[k] if classify_active_bound(z, low, high) == 0 else 0.0
             lam[k] = low if z < low else (high if z > high else z)
         return
     for i in range(first, last):
         j = ptr[i]
         end = ptr[i + 1]
         at = vptr[i]
-        if is_rows(&f.p, i):
+        if has_independent_rows(&f.p, i):
             at -= j
             for k in range(j, end):
                 z = (rho[k] * center[k] - s[k]) * soft[k]
                 low = lower[k]
                 high = upper[k]
-                v[at + k] = soft[k] if active_bound(z, low, high) == 0 else 0.0
+                v[at + k] = soft[k] if classify_active_bound(z, low, high) == 0 else 0.0
                 lam[k] = low if z < low else (high if z > high else z)
             continue
         for k in range(j, end):
@@ -294,7 +294,7 @@ cdef inline bint apply_transpose(const flow_t* f, int32_t island, const double* 
                 break
         if moves:
             for b in range(f.run[2 * a], f.run[2 * a + 1]):
-                panel_transpose_add(f.g, b, lam, x)
+                add_panel_transpose_product(f.g, b, lam, x)
     return moves
 
 
@@ -304,7 +304,7 @@ cdef inline void apply_y(const flow_t* f, int32_t island, const double* x, doubl
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.run[2 * a + 1]
         for b in range(f.run[2 * a], end):
-            panel_times(f.g, b, x, out)
+            multiply_whitened_panel(f.g, b, x, out)
 
 
 cdef inline void copy_rows(const flow_t* f, int32_t island, const double* x, double* to) noexcept nogil:
@@ -355,7 +355,7 @@ cdef inline double measure_error(const flow_t* f, int32_t island, const double* 
     cdef const double* phi = f.phi
     cdef const double* compliance = f.g.compliance
     cdef double* w = f.w
-    cdef tally_t t = empty_tally()
+    cdef tally_t t = make_empty_tally()
     if not moves:
         clear_rows(f, island, w)
     elif f.is_over_rows:
@@ -367,16 +367,16 @@ cdef inline double measure_error(const flow_t* f, int32_t island, const double* 
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]
         if f.bounded_rows_only:
             for k in range(row_from(f, a), row_end(f, a)):
-                tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
+                add_row_error(&f.p, k, compute_row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
             continue
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
-            if is_rows(&f.p, i):
+            if has_independent_rows(&f.p, i):
                 end = ptr[i + 1]
                 for k in range(ptr[i], end):
-                    tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
+                    add_row_error(&f.p, k, compute_row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
             else:
-                block_error(&f.p, i, lam, w, f.e)
-                tally_block(&f.p, i, f.e, &t)
+                compute_block_error(&f.p, i, lam, w, f.e)
+                add_block_error(&f.p, i, f.e, &t)
     velocity[0] = sqrt(t.fast) if t.fast > 0.0 else 0.0
     return sqrt(t.energy)

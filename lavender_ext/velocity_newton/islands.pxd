@@ -5,12 +5,12 @@ the rows of another.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.order cimport sort_by_level
-from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction, is_rows
-from lavender_ext.core.roots cimport root_of
+from lavender_ext.core.order cimport sort_blocks_by_level
+from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction, has_independent_rows
+from lavender_ext.core.roots cimport find_root
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport flow_t, row_end, row_from
-from lavender_ext.velocity_newton.sparse cimport factor_work, find_pattern, pattern_marks
+from lavender_ext.velocity_newton.sparse cimport count_mass_factor_work, find_pattern, pattern_marks
 
 
 cdef enum:
@@ -45,11 +45,11 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
     for b in range(g.n_panels):
         end = g.pcol[b + 1]
         if end > g.pcol[b] and trees > 1:
-            r = root_of(up, cols[g.pcol[b]])
+            r = find_root(up, cols[g.pcol[b]])
             for q in range(g.pcol[b] + 1, end):
                 if parent[cols[q]] >= 0:                # The root of its tree is in the panel, too.
                     continue
-                k = root_of(up, cols[q])
+                k = find_root(up, cols[q])
                 if r < k:
                     up[k] = r
                 elif k < r:
@@ -78,7 +78,7 @@ cdef inline void measure_panels(flow_t* f, requirements_t* need) noexcept nogil:
     for i in range(f.p.n_blocks):
         vptr[i] = at
         size = ptr[i + 1] - ptr[i]
-        at += size if is_rows(&f.p, i) else size * size
+        at += size if has_independent_rows(&f.p, i) else size * size
     vptr[f.p.n_blocks] = at
 
 
@@ -105,7 +105,7 @@ cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requiremen
             label[b] = n
             n += 1
             continue
-        r = root_of(up, cols[g.pcol[b]])
+        r = find_root(up, cols[g.pcol[b]])
         if local[r] < 0:
             local[r] = n
             n += 1
@@ -134,7 +134,7 @@ cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requiremen
     for b in range(panels):
         for q in range(g.pcol[b], g.pcol[b + 1]):
             local[cols[q]] = label[b]
-    sort_by_level(g.n, local, n, cptr, icols)
+    sort_blocks_by_level(g.n, local, n, cptr, icols)
     need.island_columns = 0
     for b in range(n):
         need.island_columns = max(need.island_columns, cptr[b + 1] - cptr[b])
@@ -216,7 +216,7 @@ cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
-        if not is_rows(p, i):
+        if not has_independent_rows(p, i):
             f.bounded_rows_only = False
             break
     f.sparse = False
@@ -240,7 +240,7 @@ cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_
             values = <double>size * size
             need.work += values * size / 3.0
         elif size > 0:
-            need.work += factor_work(size, lptr, f.lidx)
+            need.work += count_mass_factor_work(size, lptr, f.lidx)
         need.values = max(need.values, values)
 
 

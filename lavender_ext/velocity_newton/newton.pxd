@@ -33,11 +33,13 @@ lambda changes there along the law that it has settled on, and so does V.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport length
+from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
-from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, is_rows, get_friction_components, friction_components_t
-from lavender_ext.core.start cimport is_zero_impulse, zero_impulse
+from lavender_ext.core.block_types cimport (
+    CONE, COULOMB, blocks_t, has_independent_rows, get_friction_components, friction_components_t,
+)
+from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport (UNFORMED, apply_transpose, block_end, block_from, clear_rows,
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_error,
@@ -211,7 +213,7 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
                 if not x >= low * d[k]:
                     x += softness * d[k]
                 theta[k] = x
-            if not is_rows(&f.p, i):
+            if not has_independent_rows(&f.p, i):
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
@@ -385,7 +387,7 @@ cdef inline double normal_shift(const flow_t* f, int32_t i) noexcept nogil:
     cdef friction_components_t q
     get_friction_components(&f.p, i, &q)
     for g in range(q.n):
-        out += q.friction_coefficient[g] * length(f.w + f.p.ptr[i] + q.first[g], q.size[g])
+        out += q.friction_coefficient[g] * euclidean_norm(f.w + f.p.ptr[i] + q.first[g], q.size[g])
     return out
 
 
@@ -396,7 +398,7 @@ cdef inline void lower_normals(const flow_t* f, int32_t island, const double* la
     measure_error(f, island, lam, apply_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
-            if not is_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
+            if not has_independent_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
                 f.phi[f.p.ptr[i]] = normal_shift(f, i)
 
 
@@ -524,7 +526,7 @@ cdef inline bint is_at_rest(flow_t* f, int32_t island, double* impulse) noexcept
         return False
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
-            impulse[k] = zero_impulse(&f.p, k)
+            impulse[k] = clip_zero_to_row_bounds(&f.p, k)
     return True
 
 

@@ -15,7 +15,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.block_types cimport is_rows
+from lavender_ext.core.block_types cimport has_independent_rows
 from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_dense, analyse_tree, linear_factor, linear_solve, linear_t
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.velocity_newton.flow cimport block_end, block_from, form_column, flow_t, apply_y
@@ -67,7 +67,7 @@ cdef inline int32_t weigh_block(const flow_t* f, int32_t i, int32_t row, int32_t
     cdef const double* v = f.v + f.vptr[i]
     cdef double* out
     cdef bint any_
-    if is_rows(&f.p, i):
+    if has_independent_rows(&f.p, i):
         for r in range(size):
             if v[r] != 0.0:
                 scale_row(f.weighted_y + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)
@@ -198,7 +198,7 @@ cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* 
     for a in range(f.iptr[f.island], f.iptr[f.island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
             v, end = f.factored_v + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
-            size = 1 if is_rows(&f.p, i) else end - place
+            size = 1 if has_independent_rows(&f.p, i) else end - place
             while place < end:
                 is_free = False
                 for k in range(size * size):

@@ -1,7 +1,7 @@
 """The compliance above which rows of J and M need no proximal term."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block_types cimport blocks_t, is_rows
+from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -10,7 +10,7 @@ cdef inline double min_softness(const blocks_t* p, int32_t i) noexcept nogil:
 
     With less, Newton's method without a proximal term takes more steps, since the kinks of lambda(s) are sharper.
     """
-    return 1e-6 if is_rows(p, i) else 1e-3
+    return 1e-6 if has_independent_rows(p, i) else 1e-3
 
 
 cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:

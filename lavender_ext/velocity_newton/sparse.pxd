@@ -1,7 +1,7 @@
 """The pattern of N = L^T D L of an island, which is factored from the last row to the first, as M (`core/tree.pxd`).
 
 A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of the same panel only, and
-eliminating row k couples the columns of its entries (`tree_pattern`). Without contacts between branches the pattern is
+eliminating row k couples the columns of its entries (`find_tree_factor_pattern`). Without contacts between branches the pattern is
 that of the factor of M (about 12 entries in a row for an insect). If all columns are coupled, L is a full triangle and
 takes the work of a dense factor.
 
@@ -9,7 +9,7 @@ takes the work of a dense factor.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.tree cimport tree_pattern
+from lavender_ext.core.tree cimport find_tree_factor_pattern
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -74,7 +74,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
                     midx[count] = base + local[cols[q]]
                     count += 1
                 mark[most] = count
-    count = tree_pattern(n, mptr, midx, workspace, lptr, lidx, parent, mark, sibling, child)
+    count = find_tree_factor_pattern(n, mptr, midx, workspace, lptr, lidx, parent, mark, sibling, child)
     if count < 0:
         return -1
     for i in range(1, n_islands):
@@ -83,7 +83,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
     return count
 
 
-cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
+cdef inline double count_mass_factor_work(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
     """Return the multiply-adds of one factor, plus COLUMN_SEARCH_WORK for each column that the search for places skips."""
     cdef int32_t k, q, first, end, theirs
     cdef double c, s = 0.0, skipped = 0.0

@@ -23,7 +23,7 @@ from random_problems import as_matrix, touching
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
-from lavender.contract.checks import problems_of_every_kind
+from lavender.contract.checks import make_problems_of_every_kind
 from lavender.contract.enumeration import random_bounds
 from lavender.contract.problems import change_numbers
 from lavender.judge.residuals import get_reference
@@ -41,7 +41,7 @@ RESUMABLE = lv.available(external=False, resumable=True)
 @functools.cache
 def examples():
     """Problems of every law and kind of block, each in every form."""
-    kinds = problems_of_every_kind().items()
+    kinds = make_problems_of_every_kind().items()
     return [p for (_, kind), (forms, _) in kinds if not kind.startswith("round") for p in forms]
 
 

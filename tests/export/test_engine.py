@@ -7,7 +7,7 @@ import pytest
 
 import lavender as lv
 from lavender.export import engine_image
-from lavender_ext.engine.arrays import views
+from lavender_ext.engine.arrays import make_array_views
 
 
 def opened(library, image):
@@ -28,7 +28,7 @@ def places(library, at):
 
 def of_package(simulation):
     s = simulation.snapshot()
-    found = views(s.size, s.real, s.index, s.keys)
+    found = make_array_views(s.size, s.real, s.index, s.keys)
     return np.concatenate([found["x"], found["q"]], axis=1)
 
 

@@ -83,7 +83,7 @@ CALLS = {
         motion.store_if_better, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
         accepts={"solver": ("an object", "an ellipsis", "bytes")},
     ),
-    "motion.follow_to_solution": Call(motion.follow_to_solution, {"problem": LCP, "impulse": B}),
+    "motion.converge_to_solution": Call(motion.converge_to_solution, {"problem": LCP, "impulse": B}),
     "motion.measure_motion_distance": Call(motion.measure_motion_distance, {"problem": LCP, "x": B, "y": B}),
     "motion.get_reference": Call(motion.get_reference, {"problem": LCP}),
     "explain_slip": Call(lv.explain_slip, {"problem": SLIDING, "impulse": np.zeros(3), "tol": 1e-9}),

@@ -262,7 +262,7 @@ def test_entries_of_a_are_counted_once(monkeypatch):
     twins = lv.Problem.from_jacobian(
         np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
     )
-    assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
+    assert twins.metric.entries_of_matrix == 40 * 40  # rows on two trees, too
     monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40)
     with pytest.raises(lv.InputError, match="J and M as they are"):
         lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -166,7 +166,7 @@ static int32_t check_options(const lav_options *o) {
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
   if (o->convex < 0 || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
-  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_validate_is_number(o->omega))) return LAV_ERROR_OPTION;
+  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_validate_is_valid_number(o->omega))) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
@@ -266,7 +266,7 @@ static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t r
 static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, const char *name, where_t *at) {
   int64_t i;
   if (!x) return is_needed && n > 0 ? refuse(at, LAV_ERROR_NULL, name, 0) : LAV_OK;
-  i = core_validate_first_invalid(x, n);
+  i = core_validate_find_invalid_number(x, n);
   return i < 0 ? LAV_OK : refuse(at, LAV_ERROR_NUMBER, name, i);
 }
 

@@ -10,11 +10,11 @@ static const general_t *general_of(const lav_solver *s) { return (void)s, (const
 /* Judge an impulse. The pass is refined if M is so ill-conditioned that its rounding may hide a residual of tol; with tol =
  * INFINITY it is never refined. Return the residual of the first pass, or NAN if it was not refined. */
 static double judge(lav_solver *s, const double *impulse, int32_t floor, double tol, lav_verdict *out) {
-  score_t t = judge_score_new_score();
+  score_t t = judge_score_make_empty_score();
   double first = NAN, found;
   if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, floor, &t);
 #ifndef LAV_SWEEPS_ONLY
-  found = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
+  found = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   if (floor && judge_measure_refine_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, s->start[0], s->start[1], tol,
                                         found, &t))
     first = found;
@@ -26,21 +26,21 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   out->unused = 0;
   out->energy = t.finite ? t.energy : INFINITY;
   out->velocity = t.finite ? t.velocity : INFINITY;
-  out->relative = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
-  out->floor = floor ? judge_measure_floor_of(&t, s->start[0], s->start[1]) : 0.0;
+  out->relative = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
+  out->floor = floor ? judge_measure_relative_floor_of_score(&t, s->start[0], s->start[1]) : 0.0;
   return first;
 }
 
 /* Return the relative residual of an impulse, and store it in `best` for the islands that it improves. A negative tol marks a
  * start. */
 static double see(lav_solver *s, struct judge_best_best_t *best, const double *impulse, double tol) {
-  score_t t = judge_score_new_score();
+  score_t t = judge_score_make_empty_score();
   double relative;
   t.by_island = best->now;
   judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
-  relative = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
-  judge_best_note_score(best, &s->p, &t, relative);
-  if (tol < 0.0) judge_best_store_start(best, &s->p, impulse);
+  relative = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
+  judge_best_copy_score_without_islands(best, &s->p, &t, relative);
+  if (tol < 0.0) judge_best_store_better_start(best, &s->p, impulse);
   else judge_best_store_better_islands(best, &s->p, impulse, tol);
   return relative;
 }
@@ -87,12 +87,12 @@ static void change_of(lav_solver *s, const double *x, double *v) {
   if (s->n_v == 0 || s->p.n_rows == 0) return;
 #ifndef LAV_SWEEPS_ONLY
   if (s->form == LAV_VELOCITIES) {
-    core_generalized_jac_transpose_times(&s->g, x, v);
-    core_generalized_tree_solve(&s->g, v);
+    core_generalized_multiply_jacobian_transpose(&s->g, x, v);
+    core_generalized_solve_mass_matrix(&s->g, v);
     return;
   }
 #endif
-  core_velocity_rows_velocity(&s->p, &s->r, x, v);
+  core_velocity_compute_velocity_change(&s->p, &s->r, x, v);
 }
 
 /* Return an energy from a sum that rounding may have made negative (0) or overflow NaN (INFINITY). */
@@ -103,11 +103,11 @@ static double energy_of(lav_solver *s, const double *x, double *v, double *out, 
   double whole = 0.0, moving = 0.0;
   int32_t i;
   change_of(s, x, v);
-  if (s->form == LAV_BODIES) core_rows_rows_times(&s->p, &s->r, v, out);
+  if (s->form == LAV_BODIES) core_rows_multiply_jacobian(&s->p, &s->r, v, out);
   for (i = 0; i < s->p.n_rows; i++) {
-    if (s->form == LAV_MATRIX) out[i] = core_csr_csr_dot(&s->a, i, x);
+    if (s->form == LAV_MATRIX) out[i] = core_csr_csr_row_dot(&s->a, i, x);
 #ifndef LAV_SWEEPS_ONLY
-    if (s->form == LAV_VELOCITIES) out[i] = core_generalized_jac_row(&s->g, i, v);
+    if (s->form == LAV_VELOCITIES) out[i] = core_generalized_multiply_jacobian_row(&s->g, i, v);
 #endif
     moving += 0.5 * x[i] * out[i];
     out[i] += s->form == LAV_MATRIX ? 0.0 : s->r.compliance[i] * x[i];

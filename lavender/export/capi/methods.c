@@ -12,7 +12,7 @@ static int32_t has_tangents(const blocks_t *p) {
 
 static int32_t restarts_of(const lav_solver *s) {
   if (s->options.method == LAV_ADMM) return s->factors;
-  return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_undone_of(&s->acceleration) : s->swept.context.fallbacks);
+  return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_count_undone_steps(&s->acceleration) : s->swept.context.fallbacks);
 }
 #endif
 
@@ -40,11 +40,11 @@ static int32_t start_sweeps(lav_solver *s) {
   x->context.split = s->split;
   x->context.mode = s->mode;
   x->context.rng = &s->rng;
-  x->context.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_jacobi_damping(&s->p, &s->a, s->stopping_test.e) : o->omega;
+  x->context.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_compute_jacobi_damping(&s->p, &s->a, s->stopping_test.e) : o->omega;
   x->context.method = o->method == LAV_JACOBI                                     ? sweep_serial_JACOBI
                       : o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL ? sweep_serial_SOR
                                                                               : sweep_serial_SWEEPS;
-  x->step = sweep_serial_sweep_step;
+  x->step = sweep_serial_run_sweep_chunk;
   numbers = sweep_serial_sweeps_workspace_size(x, &s->read, place);
   if (numbers < 0) return LAV_ERROR_COUNT;
   workspace = TAKE(s, double, numbers + more);
@@ -52,10 +52,10 @@ static int32_t start_sweeps(lav_solver *s) {
   memset(workspace, 0, (size_t)(numbers + more) * sizeof(double));
   sweep_serial_start_sweeps(x, &s->read, place, workspace);
 #ifndef LAV_SWEEPS_ONLY
-  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->acceleration, memory, convex, o->keeps, workspace + numbers);
-  if (sweep_serial_can_pack(x, &s->read)) {
+  if (x->packing.single) accelerate_accelerated_begin_accelerated_sweeps(x, &s->acceleration, memory, convex, o->keeps, workspace + numbers);
+  if (sweep_serial_can_pack_blocks(x, &s->read)) {
     x->context.packing = &x->packing;
-    x->packing.workspace = TAKE(s, double, sweep_packed_packed_workspace_size_of(&s->p, &s->r));
+    x->packing.workspace = TAKE(s, double, sweep_packed_packed_workspace_size_of_blocks(&s->p, &s->r));
   }
 #endif
   return s->is_short ? LAV_ERROR_WORKSPACE : LAV_OK;
@@ -106,7 +106,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (budget->tol > 0.0 && s->stopping_test.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
     if (see(s, &s->stopping_test.best, s->impulse, budget->tol) > budget->tol) {
       COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
-      sweep_serial_form_velocity(&s->swept.context, s->impulse);
+      sweep_serial_compute_sweep_velocities(&s->swept.context, s->impulse);
     }
   }
 }
@@ -125,7 +125,7 @@ static int32_t form_matrix(lav_solver *s) {
   start = TAKE(s, int32_t, s->r.n_bodies + 1);
   blocks = TAKE(s, int32_t, 2 * k + 1);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
-  k_body_blocks(&s->p, &s->r, start, blocks, &most);
+  k_list_blocks_of_bodies(&s->p, &s->r, start, blocks, &most);
   if (most >= 2147483647) return LAV_ERROR_COUNT;
   near = TAKE(s, int32_t, 4 * k + 2 + m);
   indptr = TAKE(s, int32_t, m + 1);
@@ -137,12 +137,12 @@ static int32_t form_matrix(lav_solver *s) {
   s->q.step = TAKE(s, double, m);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   k_expand_rows(&s->p, &s->r, jac, jac + 12 * m);
-  k_assemble(&s->p, &s->r, jac, jac + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2, indptr, index, data);
+  k_form_delassus_matrix(&s->p, &s->r, jac, jac + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2, indptr, index, data);
   s->a.indptr = indptr;
   s->a.indices = index;
   s->a.data = data;
-  k_csr_diagonal(&s->q, &s->a, (double *)(uintptr_t)s->q.d, (double *)(uintptr_t)s->q.step, near);
-  k_matrix_nu(&s->q, (double *)(uintptr_t)s->q.nu);
+  k_compute_csr_diagonal(&s->q, &s->a, (double *)(uintptr_t)s->q.d, (double *)(uintptr_t)s->q.step, near);
+  k_compute_csr_velocity_weights(&s->q, (double *)(uintptr_t)s->q.nu);
   return LAV_OK;
 }
 
@@ -255,7 +255,7 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
   struct accelerate_admm_admm_t *c = &s->splitting;
   int32_t i;
   if (first) { /* At a solution, the first iteration does not change it. */
-    for (i = 0; i < s->p.n_rows; i++) c->x[i] = core_csr_csr_dot(&s->a, i, lam) - s->p.b[i];
+    for (i = 0; i < s->p.n_rows; i++) c->x[i] = core_csr_csr_row_dot(&s->a, i, lam) - s->p.b[i];
     k_admm_start(c, lam, c->x);
   }
   while (n > 0 && !s->is_broken) {
@@ -272,13 +272,13 @@ static int32_t start_admm(lav_solver *s) {
   double *x;
   int32_t bands[2];
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0 && core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
+  if (m > 0 && s->a.indptr[m] > 0 && core_csr_measure_asymmetry_and_bandwidth(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
     return LAV_ERROR_UNSUPPORTED; /* A is not symmetric; the factorisation needs it. */
   s->table = TAKE(s, double, m * m + factor_dense_cholesky_workspace_size(s->p.n_rows));
   x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   memset(x, 0, (size_t)numbers * sizeof(double));
-  k_admm_lay(&s->splitting, &s->p, s->options.memory, FIRST_RHO, RELAXATION, x);
+  k_begin_admm(&s->splitting, &s->p, s->options.memory, FIRST_RHO, RELAXATION, x);
   memset(&s->factor, 0, sizeof s->factor);
   memset(&s->linear, 0, sizeof s->linear);
   factor_linear_analyse_dense(&s->linear, (int32_t)m);

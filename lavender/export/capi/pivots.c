@@ -11,7 +11,7 @@ static int32_t start_pivots(lav_solver *s) {
   int32_t bands[2] = {0, 0}, band, i, *index, *whole = NULL;
   double asymmetry = 0.0, *real;
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0) asymmetry = core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands);
+  if (m > 0 && s->a.indptr[m] > 0) asymmetry = core_csr_measure_asymmetry_and_bandwidth(&s->a, s->p.d, (int32_t)m, s->marks, bands);
   t->symmetric = asymmetry <= 1e-14;
   band = !t->symmetric ? (int32_t)m - 1 : bands[0] > bands[1] ? bands[0] : bands[1];
   t->linear = 1;
@@ -19,8 +19,8 @@ static int32_t start_pivots(lav_solver *s) {
     if (s->p.lower[i] != -INFINITY || s->p.upper[i] != INFINITY) t->linear = 0;
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) t->linear = 0;
-  real = TAKE(s, double, pivot_direct_direct_workspace_doubles(&s->read, band));
-  index = TAKE(s, int32_t, pivot_direct_direct_workspace_integers(&s->read));
+  real = TAKE(s, double, pivot_direct_count_direct_workspace_doubles(&s->read, band));
+  index = TAKE(s, int32_t, pivot_direct_count_direct_workspace_integers(&s->read));
   if (s->options.method == LAV_LEMKE) {
     s->table = TAKE(s, double, pivot_lemke_lemke_workspace_doubles(&s->p));
     whole = TAKE(s, int32_t, pivot_lemke_lemke_workspace_integers(&s->p));
@@ -50,7 +50,7 @@ static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
 static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
   int32_t code;
   do {
-    code = pivot_direct_step_direct(&s->direct, rounds_left(s, budget));
+    code = pivot_direct_step_direct_solve(&s->direct, rounds_left(s, budget));
     if (code == pivot_principal_SOLVED) return LAV_CONVERGED;
     if (code == pivot_principal_INDEFINITE) return LAV_FAILED; /* The package continues with LAPACK. */
     if (s->direct.is_over) return LAV_STALLED;
@@ -61,10 +61,10 @@ static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
 static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
   struct pivot_lemke_lemke_t *l = &s->lemke;
   int32_t code, left;
-  pivot_lemke_begin_paths(l);
+  pivot_lemke_begin_lemke_solve(l);
   do {
     left = budget->iterations - l->n_pivots;
-    code = pivot_lemke_follow_paths(l, is_timed(budget) && left > BATCH ? BATCH : left);
+    code = pivot_lemke_follow_lemke_paths(l, is_timed(budget) && left > BATCH ? BATCH : left);
     if (code == pivot_lemke_DONE) return LAV_STALLED;
   } while (l->n_pivots < budget->iterations && !is_late(s, budget));
   pivot_lemke_judge_unfinished_path(l);
@@ -73,11 +73,11 @@ static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
 
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct pivot_direct_direct_t *t = &s->direct;
-  pivot_direct_begin_direct(t, s->impulse);
+  pivot_direct_begin_direct_solve(t, s->impulse);
   out->outcome = s->options.method == LAV_LEMKE ? follow_paths(s, budget) : pivot_all(s, budget);
   if (t->relative < INFINITY) COPY(s->impulse, t->best, s->p.n_rows);
   if (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED)
-    out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_solved(t)) ? LAV_CONVERGED
+    out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_solved_to_rounding(t)) ? LAV_CONVERGED
                    : judge_score_is_at_floor(t->relative, t->floor)                            ? LAV_ROUNDOFF_LIMIT
                                                                                                 : LAV_STALLED;
   out->iterations = s->options.method == LAV_LEMKE ? s->lemke.n_pivots : t->s.n_rounds;

@@ -154,8 +154,8 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
       s->order[i] = q->order[i];
     }
   } else if (s->options.order == LAV_REVERSE) {
-    core_order_reverse(s->order, 0, s->split);
-    core_order_reverse(s->order, s->split, k);
+    core_order_reverse_blocks(s->order, 0, s->split);
+    core_order_reverse_blocks(s->order, s->split, k);
   }
   s->in_rows = single && !q->order && s->options.order == LAV_GIVEN && q->form == LAV_MATRIX;
   return LAV_OK;
@@ -217,10 +217,10 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
   copy_or(s->v_free, q->velocity, 6 * n, 0.0);
   copy_or(b, q->b, q->n_rows, 0.0);
   if (!q->b) {
-    core_rows_rows_times(&s->p, &s->r, s->v_free, s->stopping_test.w);
+    core_rows_multiply_jacobian(&s->p, &s->r, s->v_free, s->stopping_test.w);
     for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->stopping_test.w[i];
   }
-  k_rows_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
+  k_compute_body_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
                   s->empty, (double *)(uintptr_t)s->r.minv_jac, (double *)(uintptr_t)s->r.coupling,
                   (double *)(uintptr_t)s->r.inv_inertia_arm);
 }
@@ -240,7 +240,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
     s->used = from;
     columns = TAKE(s, int32_t, workspace);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
-    count = core_tree_tree_pattern(n, mptr, midx, (int32_t)workspace, (int32_t *)(uintptr_t)s->g.lptr, columns,
+    count = core_tree_find_tree_factor_pattern(n, mptr, midx, (int32_t)workspace, (int32_t *)(uintptr_t)s->g.lptr, columns,
                                           (int32_t *)(uintptr_t)s->g.parent, s->marks, s->marks + n, s->marks + 2 * n);
     if (count >= 0) break;
     if (workspace >= most) return LAV_ERROR_MASS;
@@ -271,7 +271,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   copy_or(s->g.compliance, q->compliance, m, 0.0);
   copy_or(s->v_free, q->velocity, n, 0.0);
   for (i = 0; i < m; i++)
-    b[i] = q->b ? q->b[i] : (q->target ? q->target[i] : 0.0) - core_generalized_jac_row(&s->g, i, s->v_free);
+    b[i] = q->b ? q->b[i] : (q->target ? q->target[i] : 0.0) - core_generalized_multiply_jacobian_row(&s->g, i, s->v_free);
   s->g.prow = TAKE(s, int32_t, k + 1);
   s->g.pcol = pcol = TAKE(s, int32_t, k + 1);
   s->g.pval = pval = TAKE(s, int32_t, k + 1);
@@ -280,7 +280,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
     s->used = from;
     s->g.cols = columns = TAKE(s, int32_t, workspace);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
-    s->g.n_panels = core_generalized_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
+    s->g.n_panels = core_generalized_find_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
                                                    columns, workspace < 2147483647 ? (int32_t)workspace : 2147483647, &n_columns,
                                                    &values);
     if (s->g.n_panels >= 0) break;
@@ -295,7 +295,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
     while (s->g.prow[j + 1] <= s->p.ptr[i]) j++;
     home[i] = j;
   }
-  k_general_diagonal(&s->p, &s->g, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu,
+  k_compute_generalized_diagonal(&s->p, &s->g, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu,
                      (double *)(uintptr_t)s->p.step, s->empty, s->marks, (double *)(uintptr_t)s->g.y);
   return LAV_OK;
 }
@@ -305,9 +305,9 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
 static int32_t check_derived(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows;
   const double top = core_validate_norm_inf(s->p.b, m);
-  int64_t i = core_validate_first_invalid(s->p.b, m);
+  int64_t i = core_validate_find_invalid_number(s->p.b, m);
   if (i >= 0) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
   if (!core_validate_is_valid_magnitude(top)) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", 0);
-  i = core_validate_first_invalid(s->p.d, m);
+  i = core_validate_find_invalid_number(s->p.d, m);
   return i < 0 ? LAV_OK : refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", i);
 }

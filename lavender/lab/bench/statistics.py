@@ -448,7 +448,7 @@ def find_other_work(records: Iterable[Record]) -> set[str]:
     return {r.solver for r in records if r.is_usable and math.isnan(count_matrix_passes(r))}
 
 
-def matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+def count_matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
 
     As for times, only runs to a tolerance count. Solvers with other work in their runs are left out
@@ -579,13 +579,13 @@ def compute_profiles(records: Records, measure: str = "time") -> list[Profile]:
     ----------
     records : Records
     measure : {"time", "work"}
-        "work": passes over A, of the solvers that do no other work (`matrix_passes_to`).
+        "work": passes over A, of the solvers that do no other work (`count_matrix_passes_to`).
     """
     check_choice("measure", measure, ("time", "work"))
     out = []
     for law, cases in _group_cases_by_law(records).items():
         for tolerance in get_tolerances(records):
-            times = (collect_times_to if measure == "time" else matrix_passes_to)(records, tolerance)
+            times = (collect_times_to if measure == "time" else count_matrix_passes_to)(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []

@@ -220,7 +220,7 @@ class Store:
             held.enter_context(lock_output(self.path))
             try:
                 self.records = read_records(self.path) if self.path.exists() else Records()
-                _cut_torn_line(self.path)
+                _remove_incomplete_last_line(self.path)
                 self.file = self.path.open("a", encoding="utf-8")
             except OSError as error:
                 raise InputError(
@@ -279,7 +279,7 @@ def open_store(store: Store | str | Path | None) -> Iterator[Store | None]:
         yield made
 
 
-def _cut_torn_line(path: Path) -> None:
+def _remove_incomplete_last_line(path: Path) -> None:
     """Remove a last line without a line end, which an interrupted run leaves."""
     if not path.exists():
         return

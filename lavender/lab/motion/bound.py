@@ -83,7 +83,7 @@ def compute_witness(problem: Problem, operator: Operator, impulse: FloatArray) -
     d = problem.d
     w, off = operator.compute_slack(impulse)
     e = np.empty(problem.m)
-    measure.score(problem.metric, impulse, w, e)
+    measure.score_slack_array(problem.metric, impulse, w, e)
     uncertainty = _bound_projection_rounding(problem, impulse, w)
     radius = operator.compute_energy_norm(e, uncertainty).upper_bound
     shift = d * e

@@ -190,9 +190,9 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
         own = operator.compute_energy_norm(reference.impulse, np.zeros(problem.m))
         values |= {"kinetic": size.kinetic, "energy": size.energy}
         values["relative"] = (
-            _divide(size.energy, own.energy)
+            _divide_or_inf(size.energy, own.energy)
             if size.kinetic is None or own.kinetic is None
-            else _divide(size.kinetic, own.kinetic)
+            else _divide_or_inf(size.kinetic, own.kinetic)
         )
     if reference.is_accepted:
         if velocity is not None:
@@ -227,7 +227,7 @@ def convert_to_ellipse_rows(problem: Problem, x: FloatArray, error: MotionError)
     return drop_non_finite(replace(error, row=row, rows=rows), ("rows",))
 
 
-def _divide(x: float, reference: float) -> float:
+def _divide_or_inf(x: float, reference: float) -> float:
     """Divide; 0 / 0 is 0 and x / 0 is inf."""
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 

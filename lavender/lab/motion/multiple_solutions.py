@@ -361,7 +361,7 @@ def get_solutions(problem: Problem, n: int = N_SEARCH_RUNS) -> SolutionSet:
     return get_motion_cache(problem).motions or find_solutions(problem, n)
 
 
-def follow_to_solution(problem: Problem, impulse: Any) -> Reference:
+def converge_to_solution(problem: Problem, impulse: Any) -> Reference:
     """Return the solution that an impulse (m,) [N s] leads to: by sweeps to the floor, then by `newton` if they stall.
 
     If Coulomb's law has several motions, this is the one that a solver stopped early would have reached. It is not
@@ -572,7 +572,7 @@ def measure_distance_to_nearest(problem: Problem, x: FloatArray, solutions: Solu
     references = [motion.reference for motion in solutions]
     spread, energy = solutions.spread, solutions.spread_energy
     if not solutions.unique:
-        own = follow_to_solution(problem, x)
+        own = converge_to_solution(problem, x)
         distances = [measure_motion_distance(problem, own.impulse, motion.impulse) for motion in solutions]
         if own.is_accepted and all(d.relative_distance > SAME_MOTION_FRACTION for d in distances):
             references.append(own)
@@ -580,14 +580,14 @@ def measure_distance_to_nearest(problem: Problem, x: FloatArray, solutions: Solu
             energy = None if energy is None else max([energy, *(d.energy for d in distances)])
     if not references:
         return measure_distance(problem, x, reference_of(problem))
-    best = min((measure_distance(problem, x, reference) for reference in references), key=_error_key)
+    best = min((measure_distance(problem, x, reference) for reference in references), key=_get_error_sort_key)
     nearest_error = replace(
         best, spread=energy, spread_speed=spread, count=len(references), unique=solutions.unique
     )
     return drop_non_finite(nearest_error, ("spread", "spread_speed"))
 
 
-def _error_key(error: MotionError) -> float:
+def _get_error_sort_key(error: MotionError) -> float:
     """Return the sort key of an error: its energy, else its row error, else inf."""
     known = error.energy if error.energy is not None else error.rows
     return math.inf if known is None else known

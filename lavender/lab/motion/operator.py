@@ -165,9 +165,9 @@ class _Factored(Operator):
         off = self.abs_minv @ (self.velocity_gamma * g + self.abs_jac_t @ (1.01 * uncertainty))
         if self.off is not None:
             off += 1.01 * (self.off @ g)
-        return self._reshape(self.minv @ (self.jac_t @ x)), self._reshape(off)
+        return self._reshape_velocities(self.minv @ (self.jac_t @ x)), self._reshape_velocities(off)
 
-    def _reshape(self, v: FloatArray) -> FloatArray:
+    def _reshape_velocities(self, v: FloatArray) -> FloatArray:
         """Return a vector of velocities in the shape of the public result."""
         return v
 
@@ -194,7 +194,7 @@ class _Bodies(_Factored):
     def explain_refusal(self) -> str | None:
         return "an inverse inertia has a negative eigenvalue" if self.indefinite else None
 
-    def _reshape(self, v: FloatArray) -> FloatArray:
+    def _reshape_velocities(self, v: FloatArray) -> FloatArray:
         return v.reshape(-1, 6)
 
     def compute_speeds(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:

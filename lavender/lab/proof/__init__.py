@@ -37,7 +37,7 @@ from lavender.judge import certificates
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution
 from lavender.lab.motion.reference import PROOF, get_motion_cache, get_reference, make_reference
-from lavender.lab.proof.numbers import ball_precision
+from lavender.lab.proof.numbers import set_ball_precision
 from lavender.lab.proof.search import Enclosure, Search
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
@@ -132,7 +132,7 @@ def _check_certificate(problem: Problem, certificate: FloatArray) -> Enclosure:
 def _prove_from(problem: Problem, start: FloatArray, answer: FloatArray) -> Enclosure:
     """Search an enclosure from the impulse `start` (m,) [N s] and measure its distance from `answer` (m,) [N s]."""
     for bits in BALL_PRECISIONS:
-        with ball_precision(bits) as flint:
+        with set_ball_precision(bits) as flint:
             search = Search(flint, problem, start, answer)
             enclosure = search.search_solution()
         if enclosure.proven or search.singular:
@@ -153,5 +153,5 @@ def enclose_reference(problem: Problem) -> Enclosure:
 
 def require_python_flint() -> None:
     """Raise SolverUnavailable if python-flint is not installed."""
-    with ball_precision(BALL_PRECISIONS[0]):
+    with set_ball_precision(BALL_PRECISIONS[0]):
         pass

@@ -29,7 +29,7 @@ if hasattr(os, "register_at_fork"):  # It does not exist on Windows.
 
 
 @contextmanager
-def ball_precision(bits: int) -> Iterator[Any]:
+def set_ball_precision(bits: int) -> Iterator[Any]:
     """Set the precision of python-flint to `bits` until the context ends; one thread at a time.
 
     Raises

@@ -140,6 +140,6 @@ def rank_engine(
     return Choice.from_case_values(" and ".join(solvers), times, solved, score)
 
 
-def ranks_before(one: Choice, other: Choice) -> bool:
+def is_ranked_before(one: Choice, other: Choice) -> bool:
     """Return whether one solver ranks before another: it solves more cases, or as many in less time."""
     return (-one.solved, one.score) < (-other.solved, other.score)

@@ -158,7 +158,7 @@ def _name_file(figure: Figure) -> str:
     return make_file_name(figure.name.replace(" ", "-")) + ".pdf"
 
 
-def _state_lost_cases(records: Records) -> str:
+def _describe_unloaded_cases(records: Records) -> str:
     """Return a sentence on problems that did not load; empty if all did."""
     lost = sum(map(len, records.left_out.values()))
     return f" Left out, for it did not load: {format_count(lost, 'problem')}." if lost else ""
@@ -183,7 +183,7 @@ def _include_figure(figure: Figure, report: Report) -> str:
     )
     sequences = figure.name.startswith("sequence ") or not any(r.step < 0 for r in records)
     times = _state_times(report, solvers, sequences) if is_time else ""
-    caption = f"{figure.title}.{times}{_state_lost_cases(records)}"
+    caption = f"{figure.title}.{times}{_describe_unloaded_cases(records)}"
     if any(c.steps for c in figure.curves):
         by_work = figure.name.startswith("work ")
         cost = "the fewest passes over A" if by_work else "the fastest solver's time"
@@ -215,8 +215,8 @@ def _write_tables(report: Report) -> str:
         )
     everyone = {r.solver for r in records}
     single = any(r.step < 0 for r in records)
-    caption += _state_times(report, everyone, not single) + _state_lost_cases(records)
-    advice, last = table_specs.tabulate_advice(report), 1 + len(report.tolerances)
+    caption += _state_times(report, everyone, not single) + _describe_unloaded_cases(records)
+    advice, last = table_specs.tabulate_recommended_solvers(report), 1 + len(report.tolerances)
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
@@ -236,8 +236,8 @@ def _write_tables(report: Report) -> str:
             f"{format_seconds(statistics.get_time_of_miss(records))}. Only runs to a tolerance count, to this or a "
             f"tighter one. Solvers that take every case{others}."
         )
-        caption += _state_times(report, solvers) + _state_lost_cases(records)
-        parts.append(format_latex(table_specs.tabulate_means(by_tolerance), caption, f"means-{law}"))
+        caption += _state_times(report, solvers) + _describe_unloaded_cases(records)
+        parts.append(format_latex(table_specs.tabulate_mean_times(by_tolerance), caption, f"means-{law}"))
     backends = table_specs.tabulate_backends(records)
     if backends.rows:
         separate = ", ".join(sorted({s for row in backends.rows if excludes_setup(s := str(row[0]))}))
@@ -248,12 +248,12 @@ def _write_tables(report: Report) -> str:
             "set-up outside of that function. Last: cases on which the own interface takes less time than the "
             "complete call of lavender's fastest solver."
         )
-        parts.append(format_latex(backends, caption + _state_lost_cases(records), "own-interface"))
+        parts.append(format_latex(backends, caption + _describe_unloaded_cases(records), "own-interface"))
     caption = (
         "Claims of solvers against the judge, which recomputes every residual from the problem's data. "
         f"{table_specs.explain_run_counts(records)}"
     )
-    caption += _state_lost_cases(records)
+    caption += _describe_unloaded_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
     return "% \\usepackage{booktabs}\n" + "\n".join(parts)
 

@@ -139,7 +139,7 @@ def _describe_cases(report: Report) -> dict[str, Any]:
     cases = [
         {
             "info": records.cases[name],
-            "reaches": table_specs.tabulate_reaches(rows, tolerances).without_columns("case"),
+            "reaches": table_specs.tabulate_times_to_tolerances(rows, tolerances).without_columns("case"),
         }
         for name, rows in by_case.items()
     ]

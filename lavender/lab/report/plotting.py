@@ -102,7 +102,7 @@ def _select_points(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
     return points
 
 
-def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, float]], Any, Any]]:
+def _draw_figure(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, float]], Any, Any]]:
     """Draw curves, tolerances, floor and axes of a figure without colours.
 
     Returns each curve that has a point with its points, its line and its band (None without one).
@@ -129,7 +129,9 @@ def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, floa
         x, y = map(list, zip(*points, strict=True))
         if c.steps:  # Extend the last step to the end of the axis.
             x, y = [*x, x_limits[1]], [*y, y[-1]]
-        (line,) = axes.plot(x, y, label=_shorten(c.label), drawstyle="steps-post" if c.steps else "default")
+        (line,) = axes.plot(
+            x, y, label=_shorten_label(c.label), drawstyle="steps-post" if c.steps else "default"
+        )
         band = axes.fill_between(c.x, c.low, c.high) if c.low else None
         artists.append((c, points, line, band))
     axes.set(xlim=x_limits, ylim=y_limits)
@@ -143,7 +145,7 @@ def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, floa
     return artists
 
 
-def _shorten(text: str, most: int = MAX_TITLE_LENGTH) -> str:
+def _shorten_label(text: str, most: int = MAX_TITLE_LENGTH) -> str:
     """Cut a text, and begin it with a thin space if matplotlib would hide it (a label that begins with _)."""
     text = text if len(text) <= most else text[: most - 1] + "…"
     return "\u2009" + text if text.startswith("_") else text
@@ -262,7 +264,7 @@ def plot_panels(figures: Sequence[Figure], styles: Mapping[str, CurveStyle]) -> 
 def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) -> None:
     """Draw a figure with the colours, dashes and marks of its solvers, and with its title."""
     has_bands = any(c.low for c in figure.curves)  # Points over all cases are not single runs.
-    for c, points, line, band in _draw(axes, figure):
+    for c, points, line, band in _draw_figure(axes, figure):
         style = styles[c.solver]
         line.set(
             color=style.color, linestyle="none" if c.points else style.dash, linewidth=0.8 if c.thin else 1.5
@@ -272,7 +274,7 @@ def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) ->
             line.set(marker=style.marker, markersize=4, markerfacecolor=face)
         if band is not None:
             band.set(color=style.color, alpha=0.15, linewidth=0.0)
-    axes.set_title(_shorten(figure.heading), fontsize=10, parse_math=False)
+    axes.set_title(_shorten_label(figure.heading), fontsize=10, parse_math=False)
 
 
 def _write_literally(legend: Any) -> Any:
@@ -339,8 +341,8 @@ def plot_for_page(
     )
     axes.grid(True)
     axes.tick_params(length=0, pad=10, labelsize=FONT_SIZE)
-    artists = _draw(axes, figure)
-    _tag_axes(axes, figure)
+    artists = _draw_figure(axes, figure)
+    _mark_elements_for_svg(axes, figure)
     to_units = axes.transData.transform
     places = {
         i: [(x, HEIGHT - y) for x, y in to_units([p for p in points if not math.isnan(p[1])])]
@@ -374,7 +376,7 @@ def plot_for_page(
     return "".join([head, *_rewrite_svg(canvas, [c for c, *_ in artists], number), "</svg>"])
 
 
-def _tag_axes(axes: Any, figure: Figure) -> None:
+def _mark_elements_for_svg(axes: Any, figure: Figure) -> None:
     """Mark grid, ticks, titles of axes and floor for `_rewrite_svg`; the title of the vertical axis is above it."""
     for tick in (*axes.xaxis.get_major_ticks(), *axes.yaxis.get_major_ticks()):
         tick.gridline.set_gid("@ g")
@@ -466,7 +468,7 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
                 if c.points or not (c.steps or c.low or len(c.x) > MAX_PAGE_DOTS):
                     dots = re.sub(r"[ML](\S+ \d+)", r"M\1h0", data)
                     yield f'<path class="d" d="{dots}"/>'
-            yield from _rewrite_texts(group, "", _shorten(c.label, MAX_NAME_LENGTH))
+            yield from _rewrite_texts(group, "", _shorten_label(c.label, MAX_NAME_LENGTH))
         yield "</g>"
 
 

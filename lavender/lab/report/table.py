@@ -61,7 +61,7 @@ class Cell:
         return f"{self.lead} {self.text}".strip() + self.after
 
 
-def _value_of(cell: Cell) -> float:
+def _get_cell_value(cell: Cell) -> float:
     return math.nan if cell.value is None else cell.value
 
 
@@ -88,14 +88,16 @@ class Table:
         heads, rows = list(self.heads), [list(row) for row in self.rows]
         cells = [(row, i, c) for row in rows for i, c in enumerate(row) if isinstance(c, Cell) and c.quantity]
         times = [entry for entry in cells if entry[2].quantity == "time"]
-        unit, texts = format_times([_value_of(cell) for _, _, cell in times])
+        unit, texts = format_times([_get_cell_value(cell) for _, _, cell in times])
         for (row, i, cell), text in zip(times, texts, strict=True):
             row[i] = replace(cell, text=text, quantity="")
         for i in {i for _, i, _ in times}:
             heads[i] = f"{heads[i]} [{unit}]"
         for column in {i for _, i, cell in cells if cell.quantity == "size"}:
             sizes = [(row, cell) for row, i, cell in cells if i == column]
-            for (row, cell), text in zip(sizes, format_sizes([_value_of(c) for _, c in sizes]), strict=True):
+            for (row, cell), text in zip(
+                sizes, format_sizes([_get_cell_value(c) for _, c in sizes]), strict=True
+            ):
                 row[column] = replace(cell, text=text, quantity="")
         object.__setattr__(self, "heads", heads)
         object.__setattr__(self, "rows", rows)

@@ -17,7 +17,7 @@ from lavender.lab.bench import recommendation, resampling, statistics
 from lavender.lab.bench.recommendation import Advice, Choice, FamilyAdvice
 from lavender.lab.bench.record import Record, Skip, escape_unprintable, format_tolerance, make_file_name
 from lavender.lab.bench.store import Records
-from lavender.lab.report.engine import INSIDE, list_cases_of, rank_engine, ranks_before
+from lavender.lab.report.engine import INSIDE, is_ranked_before, list_cases_of, rank_engine
 from lavender.lab.report.findings import Report
 from lavender.lab.report.motion_tables import format_speed, list_idle_cases
 from lavender.lab.report.table import WORDS, Cell, Table
@@ -74,8 +74,8 @@ def list_sections(report: Report) -> list[Section]:
     records, tolerances = report.ranked_records, report.tolerances
     moved = "largest velocity error of a body"
     if report.is_campaign:
-        shares = tabulate_robustness(statistics.compute_robustness(records), tolerances)
-        by_speed = tabulate_robustness(
+        shares = tabulate_solved_shares(statistics.compute_robustness(records), tolerances)
+        by_speed = tabulate_solved_shares(
             statistics.compute_robustness(report.records_by_motion_error), report.velocity_tolerances, " m/s"
         )
         note = "no times; share of cases brought to a tolerance, residual at each budget"
@@ -104,14 +104,14 @@ def list_sections(report: Report) -> list[Section]:
             "time of all steps, of a part if a limit ended the run; median residual by budget; carried from step to "
             "step, or cold if the solver takes no start"
         )
-        cases = tabulate_reaches(
+        cases = tabulate_times_to_tolerances(
             statistics.summarize_runs_by_case(records, tolerances), tolerances
         ).without_columns("form")
         sections = [
-            Section("By structure", by_structure, tabulate_advice(report)),
-            Section("By sweeps", by_sweeps, tabulate_sweeps(report.rankings)),
+            Section("By structure", by_structure, tabulate_recommended_solvers(report)),
+            Section("By sweeps", by_sweeps, tabulate_best_solver_by_sweeps(report.rankings)),
             Section("Inside the engine", inside, tabulate_engines(report)),
-            Section("By motion error", moved, tabulate_speeds(report)),
+            Section("By motion error", moved, tabulate_best_solver_by_motion_error(report)),
             Section("Motion error of each case", moved, tabulate_motion_errors(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
             Section(
@@ -123,7 +123,7 @@ def list_sections(report: Report) -> list[Section]:
             ),
         ]
     if report.earlier_run is not None:
-        changed = tabulate_changes(report.earlier_run, records)
+        changed = tabulate_changed_times(report.earlier_run, records)
         title = f"Against {escape_unprintable(report.earlier_run.source)}"
         empty = (
             "nothing beyond noise" if statistics.compare_times(report.earlier_run, records) else NOT_COMPARED
@@ -140,14 +140,16 @@ def build_short_table(report: Report) -> Table:
     """
     middle = len(report.tolerances) // 2
     if report.is_campaign:
-        table = tabulate_robustness(
+        table = tabulate_solved_shares(
             statistics.compute_robustness(report.ranked_records), report.tolerances[middle : middle + 1]
         )
         return table.without_columns(*(head for head in table.heads if "iterations" in head), "hardest")
     by_motion = any(run.plan.get("velocity_tolerances") for run in report.newest_run.runs.values())
     if len(report.rankings) == 1 and not by_motion:
         return _tabulate_solvers(report, report.tolerances[middle])
-    table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
+    table = (
+        tabulate_best_solver_by_motion_error(report) if by_motion else tabulate_recommended_solvers(report)
+    )
     column = 1 + (len(report.velocity_tolerances) // 2 if by_motion else middle)
     rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
     head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) and not by_motion else ALONE}"
@@ -186,7 +188,7 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
     engine = rank_engine(report.engines, report.ranked_records, report.rankings[0].cases, tolerance)
     if engine is not None and engine.solved:
         ranked = [*(choice for _, choice in raced.values()), *alone]
-        before = sum(not ranks_before(engine, choice) for choice in ranked)
+        before = sum(not is_ranked_before(engine, choice) for choice in ranked)
         time = Cell.time(engine.score, after=format_share(engine.solved, engine.cases))
         rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
     return Table(["solver", f"to {format_tolerance(tolerance)}", "target", "timed"], rows)
@@ -218,7 +220,7 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 
-def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> Table:
+def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None = None) -> Table:
     """Tabulate the first solver to each tolerance and within each time [s], for each structure and sequence.
 
     `links` are the parts of the page that a name leads to.
@@ -257,7 +259,7 @@ def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
     return Cell(text, engine.solver, f", to {format_tolerance(tolerance)}", title=INSIDE)
 
 
-def tabulate_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
+def tabulate_best_solver_by_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
     """Tabulate the first solver with each budget of sweeps; no rows if no budget was run."""
     budgets = sorted({n for line in lines for n in line.by_sweeps})
     heads = [format_count(int(n), "sweep") for n in budgets]
@@ -272,7 +274,7 @@ def tabulate_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
     return Table(["structure", *heads], rows, folds=True)
 
 
-def tabulate_speeds(report: Report) -> Table:
+def tabulate_best_solver_by_motion_error(report: Report) -> Table:
     """Tabulate the first solver to each motion error [m/s], for each structure."""
     heads = [f"to {format_speed(x)}" for x in report.velocity_tolerances]
     rows: Rows = [
@@ -308,7 +310,7 @@ def tabulate_cases(
     return table if stored else table.without_columns("stored answer")
 
 
-def tabulate_reaches(reaches: Sequence[statistics.Reach], tolerances: Sequence[float]) -> Table:
+def tabulate_times_to_tolerances(reaches: Sequence[statistics.Reach], tolerances: Sequence[float]) -> Table:
     """Tabulate time to each tolerance, smallest residual, status and claim of each case and solver."""
     rows: Rows = [
         [
@@ -369,7 +371,7 @@ def tabulate_motion_errors(report: Report) -> Table:
     return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
 
 
-def tabulate_idle_cases(records: Records) -> Table:
+def tabulate_cases_solved_at_zero(records: Records) -> Table:
     """Tabulate cases that the zero impulse solves, with the worst answer to each, in units."""
     rows: Rows = [
         [
@@ -403,12 +405,12 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     )
 
 
-def tabulate_skips(skips: Sequence[Skip]) -> Table:
+def tabulate_skipped_runs(skips: Sequence[Skip]) -> Table:
     """Tabulate pairs of case and solver that were not run, or not to the end."""
     return Table(["case", "solver", "reason"], [[s.case, s.solver, s.reason] for s in skips])
 
 
-def tabulate_changes(old: Records, new: Records) -> Table:
+def tabulate_changed_times(old: Records, new: Records) -> Table:
     """Tabulate times to a tolerance that differ from an earlier run beyond noise."""
     changes = [c for c in statistics.compare_times(old, new) if c.kind != "same"]
     rows: Rows = []
@@ -423,7 +425,7 @@ def tabulate_changes(old: Records, new: Records) -> Table:
 # -- over many cases ---------------------------------------------------------------------------------------
 
 
-def tabulate_robustness(
+def tabulate_solved_shares(
     rows: Sequence[statistics.Robustness], tolerances: Sequence[float], unit: str = ""
 ) -> Table:
     """Tabulate shares of cases brought to each tolerance, false claims, and residual (or motion error) by budget."""
@@ -499,7 +501,7 @@ def explain_run_counts(records: Records) -> str:
     return ". ".join(sentences) + "."
 
 
-def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
+def tabulate_mean_times(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
     """Tabulate the geometric mean time to each tolerance for one law, and the number of cases that reach it."""
     tolerances = list(by_tolerance)
     rows: Rows = [
@@ -534,7 +536,7 @@ def tabulate_backends(records: Records) -> Table:
     return Table(heads, rows)
 
 
-def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:
+def tabulate_residuals_by_order(spreads: Sequence[statistics.Spread]) -> Table:
     """Tabulate residuals after one budget in several orders of the blocks."""
     rows: Rows = [
         [
@@ -546,7 +548,7 @@ def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:
     return Table(["case", "solver", "budget", "spread", "residual by order"], rows)
 
 
-def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
+def tabulate_sequence_passes(passes: Sequence[statistics.Pass]) -> Table:
     """Tabulate residual and time of each solver over sequences, with carried impulses and cold."""
     starts = ("carried", "cold")
     rows: Rows = []

@@ -119,7 +119,7 @@ def list_diagnostics(records: Records) -> list[tuple[str, str]]:
     ]
 
 
-def _cause_of(skip: Skip) -> str:
+def _get_skip_reason(skip: Skip) -> str:
     """Return the reason of a skip without the name of its case, so that equal reasons can be grouped."""
     return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
 
@@ -128,7 +128,7 @@ def list_reasons(skips: Iterable[Skip]) -> list[str]:
     """Return each reason of some skips once, with the number of cases that it holds for if these are several."""
     same: dict[str, list[Skip]] = {}
     for skip in skips:
-        same.setdefault(_cause_of(skip), []).append(skip)
+        same.setdefault(_get_skip_reason(skip), []).append(skip)
     cases = {cause: len({skip.case for skip in some}) for cause, some in same.items()}
     return [
         some[0].reason if cases[cause] == 1 else f"{cause} ({cases[cause]} cases)"
@@ -140,7 +140,7 @@ def list_left_out(records: Records) -> list[tuple[str, str]]:
     """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
     same: dict[str, list[Skip]] = {}
     for skip in records.left_out.get("", ()):
-        same.setdefault(_cause_of(skip), []).append(skip)
+        same.setdefault(_get_skip_reason(skip), []).append(skip)
     single = [
         (some[0].case, some[0].reason)
         if len(some) == 1

@@ -31,7 +31,7 @@ from lavender.lab.bench.resampling import (
 )
 from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
-from lavender.lab.report.engine import INSIDE, EngineAnswers, rank_engine, ranks_before
+from lavender.lab.report.engine import INSIDE, EngineAnswers, is_ranked_before, rank_engine
 from lavender.lab.report.figures import is_plug_in
 from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_left_out, format_ratio, format_residual
@@ -109,7 +109,7 @@ def build_verdict(
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
     subjects = list_subjects(records, times)
-    parts = [_recommend(records, subject, times, sweeps, engines) for subject in subjects]
+    parts = [_recommend_solver(records, subject, times, sweeps, engines) for subject in subjects]
     statements = [statement for part in parts for statement in part.statements]
     if speeds and parts:
         best = list_subjects(convert_to_motion_errors(records))[0].best.best
@@ -122,7 +122,7 @@ def build_verdict(
     return Verdict(tuple(statements), tuple(leaders)[:3], parts[0].ranking if len(parts) == 1 else ())
 
 
-def _recommend(
+def _recommend_solver(
     records: Records,
     subject: Subject,
     times: Sequence[float],
@@ -144,12 +144,12 @@ def _recommend(
         text = f"No solver brings {cases} {reached}."
         return Verdict((Statement(_add_engine(records, text, None, engine, cases)),), near)
     call, first = resampled.ranking[0]
-    named_cases = "them" if engine is not None and ranks_before(engine, first) else cases
-    head = _state_choice(records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases)
+    named_cases = "them" if engine is not None and is_ranked_before(engine, first) else cases
+    head = _describe_choice(records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases)
     statements = [
         _add_code(records, call, _add_engine(records, head, first, engine, cases)),
         *_state_plug_ins(subject.best, first.solver),
-        *_state_certainty(resampled),
+        *_describe_resampled_ranking(resampled),
     ]
     leaders = [c.solver for _, c in resampled.ranking[:3] if c.solved]
     batches = [
@@ -169,10 +169,10 @@ def _recommend(
             (r for r in rankings if r is not None and r.ranking[0][1].solves_share(SERVED_QUANTILE)), None
         )
         if quick is None:
-            statements.append(Statement(_state_serving_time(single, t), requested=bool(times)))
+            statements.append(Statement(_describe_shortest_serving_time(single, t), requested=bool(times)))
             continue
         best, choice = quick.ranking[0]
-        text = _state_service(f"If you have only {format_seconds(t)}", choice, t)
+        text = _describe_budget_recommendation(f"If you have only {format_seconds(t)}", choice, t)
         statements.append(_add_code(records, best, text, bool(times)))
         leaders.insert(1, choice.solver)
     statements += _state_sweep_budgets(records, single, sweeps, n)
@@ -209,7 +209,7 @@ def _recommend_by_motion_error(records: Records) -> Verdict:
     )
     code = f'lv.solve(problem, "{first.solver}", {arguments})'
     start = STARTS["carried" if "carried" in first.how else "cold"]
-    text = _state_choice(records, first, f"{start}, {reached}", cases)
+    text = _describe_choice(records, first, f"{start}, {reached}", cases)
     return Verdict((Statement(text, (code,)), *ties), leaders)
 
 
@@ -258,7 +258,7 @@ def _describe_cases(records: Records, cases: Sequence[str]) -> str:
     return f"your {format_count(len(cases), shape, plural)}" if len(cases) > 1 else f"your {shape}"
 
 
-def _state_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
+def _describe_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
     """Return the first sentence: the solver, its mean time, the time of a miss, and the slowest case."""
     has_misses = first.solved < first.cases
     idle = first.cases - len(
@@ -284,7 +284,7 @@ def _add_engine(records: Records, head: str, first: Choice | None, engine: Choic
     time = format_seconds(engine.score) + (" on average" if engine.cases > 1 else "")
     if has_misses:
         time += f" (a miss counted as {format_seconds(statistics.get_time_of_miss(records))})"
-    if engine.solved and (first is None or ranks_before(engine, first)):
+    if engine.solved and (first is None or is_ranked_before(engine, first)):
         of = f"{engine.solved} of " if has_misses else ""
         here = head if first is None else f"Of the solvers here, u{head[1:]}"
         return f"First is the engine's own {engine.solver}: it solves {of}{cases} in {time}, {INSIDE}. {here}"
@@ -336,7 +336,7 @@ def _state_sweep_budgets(
         if served_by[0] is None:
             statements.append(Statement(f"{condition} no solver serves nine cases of ten.", requested=True))
             continue
-        text = _state_service(condition, choices[0], math.inf)
+        text = _describe_budget_recommendation(condition, choices[0], math.inf)
         if len(budgets) > 1:
             text = text.removesuffix(f"{format_residual(choices[0].score)}.")
             text += f"{_join_words([format_residual(choice.score) for choice in choices])}."
@@ -354,7 +354,7 @@ def _join_words(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _state_certainty(resampled: ResampledRanking) -> list[Statement]:
+def _describe_resampled_ranking(resampled: ResampledRanking) -> list[Statement]:
     """State how often each named solver is among the fastest, with its time; empty if there is only one call."""
     if len(resampled.ranking) < 2:
         return []
@@ -370,7 +370,7 @@ def _state_certainty(resampled: ResampledRanking) -> list[Statement]:
     return [Statement(text)]
 
 
-def _state_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
+def _describe_shortest_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
     """State that no call serves enough cases in a time, and the shortest time in which one does."""
     shortest = min(map(compute_serving_time, calls), default=math.inf)
     text = f"No solver leaves at most half of the start's residual on nine cases of ten in {format_seconds(limit)}"
@@ -379,7 +379,7 @@ def _state_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
     return f"{text}."
 
 
-def _state_service(condition: str, choice: Choice, limit: float) -> str:
+def _describe_budget_recommendation(condition: str, choice: Choice, limit: float) -> str:
     """State the recommended solver for a budget, and the residual that it reaches."""
     how = f", {choice.how}" if choice.how and math.isfinite(limit) else ""
     text = (

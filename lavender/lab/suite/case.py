@@ -148,7 +148,7 @@ def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft
             values = {
                 n: _convert_parameter(name, signature.parameters[n], v) for n, v in bound.arguments.items()
             }
-            text = _spell_name(name, values, explicit)
+            text = _format_case_name(name, values, explicit)
             try:
                 draft = function(**values)  # type: ignore[call-arg]
             except MemoryError as error:
@@ -188,7 +188,7 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
     return converted
 
 
-def _spell_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
+def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
     """Spell the canonical name of these parameters; it shows explicit values and values that are not the default."""
     best = name
     preset: Mapping[str, Any] = {}

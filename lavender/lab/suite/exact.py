@@ -224,13 +224,13 @@ def _solve_rows(problem: Problem, operator: ExtendedOperator, rows: np.ndarray, 
     if len(index) == 0:
         return start.copy(), np.zeros_like(start)
     for solve in _iterate_solvers(sp.csc_matrix(problem.csr[index][:, index])):
-        result = _refine(operator, index, start, solve)
+        result = _refine_to_last_bit(operator, index, start, solve)
         if result is not None:
             return result
     raise InputError("the refinement does not settle: the rows are singular to float64")
 
 
-def _refine(
+def _refine_to_last_bit(
     operator: ExtendedOperator,
     index: np.ndarray,
     start: FloatArray,

@@ -37,7 +37,7 @@ def check_sizes(own: State, size: np.ndarray) -> None:
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
-        raise _damaged("its sizes are not those of this scene")
+        raise _make_damaged_state_error("its sizes are not those of this scene")
 
 
 def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
@@ -55,15 +55,15 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     a, b = own.a, new.a
     for name in GIVEN:
         if a[name].tobytes() != b[name].tobytes():
-            raise _damaged(f"{name} is not that of this scene")
+            raise _make_damaged_state_error(f"{name} is not that of this scene")
     kj = int(own.size[SIZE["joints"]])
     if not np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1]):
-        raise _damaged("the rows of the joints are not those of this scene")
+        raise _make_damaged_state_error("the rows of the joints are not those of this scene")
     settings = np.ones(len(own.setting), bool)
     for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
     if own.setting[settings].tobytes() != new.setting[settings].tobytes():
-        raise _damaged("setting is not that of this scene")
+        raise _make_damaged_state_error("setting is not that of this scene")
     _check_head(own, new, sweeps, is_lost)
     _check_contacts(new)
     if not is_lost:
@@ -94,10 +94,10 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     }
     for name, (low, high) in ranges.items():
         if not low <= new.head[HEAD[name]] <= high:
-            raise _damaged(f"{name} is {new.head[HEAD[name]]}, not {low} to {high}")
+            raise _make_damaged_state_error(f"{name} is {new.head[HEAD[name]]}, not {low} to {high}")
     for name in FIXED_HEAD:
         if new.head[HEAD[name]] != own.head[HEAD[name]]:
-            raise _damaged(f"{name} is not that of this scene")
+            raise _make_damaged_state_error(f"{name} is not that of this scene")
 
 
 def _check_contacts(new: State) -> None:
@@ -108,7 +108,7 @@ def _check_contacts(new: State) -> None:
     per, n = int(size[SIZE["rows_per_contact"]]), int(size[SIZE["bodies"]])
     cached = b["cache_key"][: new.head[HEAD["cached"]]] >> np.uint64(16)
     if (cached[1:] < cached[:-1]).any() or (cached >> np.uint64(24) >= n).any():
-        raise _damaged("cache_key is not in order")
+        raise _make_damaged_state_error("cache_key is not in order")
     if not new.head[HEAD["solved"]]:
         return
     ptr = b["ptr"][kj : kj + c + 1].astype(np.int64)
@@ -120,15 +120,15 @@ def _check_contacts(new: State) -> None:
         ptr[0] != mj or ptr[-1] != mj + rows
         or (blocks < np.where(friction, 3, 1)).any() or (blocks > max_rows).any() or blocks.max(initial=1) > per
     ):  # fmt: skip
-        raise _damaged("the rows of its contacts do not add up")
+        raise _make_damaged_state_error("the rows of its contacts do not add up")
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])
     if c and (b["kind"][: kj + c] != get_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)).any():
-        raise _damaged("kind does not match the rows of a block")
+        raise _make_damaged_state_error("kind does not match the rows of a block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
-        raise _damaged("contact_pair names bodies that the scene does not have")
+        raise _make_damaged_state_error("contact_pair names bodies that the scene does not have")
 
 
 def _check_numbers(own: State, new: State) -> None:
@@ -136,22 +136,22 @@ def _check_numbers(own: State, new: State) -> None:
     b, cached = new.a, int(new.head[HEAD["cached"]])
     for name in ("x", "v", "joint_impulse", "inv_inertia"):
         if not np.isfinite(b[name]).all():
-            raise _damaged(f"{name} is not finite")
+            raise _make_damaged_state_error(f"{name} is not finite")
     for name in ("cache_impulse", "cache_local", "cache_roll"):
         if not np.isfinite(b[name][:cached]).all():
-            raise _damaged(f"{name} is not finite")
+            raise _make_damaged_state_error(f"{name} is not finite")
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE).all():
-            raise _damaged("q holds a quaternion that is not of length 1")
+            raise _make_damaged_state_error("q holds a quaternion that is not of length 1")
     static = b["dyn"] < 0
     if b["v"][static].any():
-        raise _damaged("v gives a static body a velocity")
+        raise _make_damaged_state_error("v gives a static body a velocity")
     even = ~b["uneven"][b["body_of"]].astype(bool)
     if b["inv_inertia"][even].tobytes() != own.a["inv_inertia"][even].tobytes():
-        raise _damaged("inv_inertia is not that of this scene")
+        raise _make_damaged_state_error("inv_inertia is not that of this scene")
 
 
-def _damaged(reason: str) -> InputError:
+def _make_damaged_state_error(reason: str) -> InputError:
     return InputError(f"the snapshot is damaged: {reason}")
 
 
@@ -160,13 +160,13 @@ def check_fields(snapshot: Any) -> None:
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)
         if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:
-            raise _damaged(f"{name} is {str(x)[:40]}, not a count")
+            raise _make_damaged_state_error(f"{name} is {str(x)[:40]}, not a count")
     for name in ("fingerprint", "lost"):
         if not isinstance(getattr(snapshot, name), str):
-            raise _damaged(f"{name} is a {type(getattr(snapshot, name)).__name__}, not text")
+            raise _make_damaged_state_error(f"{name} is a {type(getattr(snapshot, name)).__name__}, not text")
     for name, dtype in (("size", np.int32), ("real", np.float64), ("index", np.int32), ("keys", np.uint64)):
         x = getattr(snapshot, name)
         if not isinstance(x, np.ndarray) or x.dtype != dtype or x.ndim != 1:
-            raise _damaged(f"{name} is no vector of {np.dtype(dtype).name}")
+            raise _make_damaged_state_error(f"{name} is no vector of {np.dtype(dtype).name}")
     if len(snapshot.size) != N_SIZES:
-        raise _damaged(f"size has {len(snapshot.size)} entries, not {N_SIZES}")
+        raise _make_damaged_state_error(f"size has {len(snapshot.size)} entries, not {N_SIZES}")

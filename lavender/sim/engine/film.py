@@ -95,14 +95,14 @@ class Film:
     @property
     def positions(self) -> FloatArray:
         """Positions (f, n, 3) [m], rounded to float32."""
-        return self._poses()[:, :, :3]
+        return self._read_poses()[:, :, :3]
 
     @property
     def quaternions(self) -> FloatArray:
         """Quaternions (f, n, 4) w x y z, rounded to float32."""
-        return self._poses()[:, :, 3:]
+        return self._read_poses()[:, :, 3:]
 
-    def _poses(self) -> FloatArray:
+    def _read_poses(self) -> FloatArray:
         poses = self.frames()[:, LEAD:].astype(np.float64)
         return poses.reshape(len(poses), -1, 7)
 

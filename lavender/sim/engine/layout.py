@@ -3,7 +3,7 @@
 from lavender_ext.engine import arrays
 
 
-def _numbers(prefix: str) -> dict[str, int]:
+def _enum_members_with_prefix(prefix: str) -> dict[str, int]:
     return {
         name.removeprefix(prefix).lower(): number
         for name, number in vars(arrays).items()
@@ -11,7 +11,11 @@ def _numbers(prefix: str) -> dict[str, int]:
     }
 
 
-HEAD, SETTING, JOINT = _numbers("H_"), _numbers("S_"), _numbers("J_")
+HEAD, SETTING, JOINT = (
+    _enum_members_with_prefix("H_"),
+    _enum_members_with_prefix("S_"),
+    _enum_members_with_prefix("J_"),
+)
 SIZE = {
     "bodies": arrays.N_BODY,
     "dynamic": arrays.N_DYNAMIC,

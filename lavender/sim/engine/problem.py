@@ -128,7 +128,7 @@ def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Seque
     """
     error, distance = motion.measure_distance(problem, impulse, motion.get_reference(problem)), 0.0
     if problem.law == "coulomb":
-        branch_solution = motion.follow_to_solution(problem, impulse)
+        branch_solution = motion.converge_to_solution(problem, impulse)
         branch_error = motion.measure_distance(problem, impulse, branch_solution)
         if branch_solution.is_accepted and error.reference.is_accepted:
             distance = motion.measure_distance(problem, branch_solution.impulse, error.reference).speed or 0.0

@@ -23,11 +23,11 @@ from lavender.sim.engine.stepping import (
     INSIDE_STEP,
     SIMULATION_CLOSED,
     Stepping,
-    exclusive,
-    invalidate_pairs,
+    invalidate_pair_list,
+    run_exclusively,
 )
 from lavender.sim.scene import Scene
-from lavender_ext.engine.arrays import NEED_CAPACITY, lengths
+from lavender_ext.engine.arrays import NEED_CAPACITY, compute_buffer_lengths
 
 
 class Simulation(Stepping):
@@ -68,7 +68,7 @@ class Simulation(Stepping):
 
     # -- the problem ----------------------------------------------------------------------------
 
-    @exclusive
+    @run_exclusively
     def constraint_problem(self) -> Problem:
         """Return the velocity problem of the next substep, with its warm start as `guess`; the state is unchanged.
 
@@ -80,7 +80,7 @@ class Simulation(Stepping):
         """
         state = self.state.copy()
         if self._restored:
-            invalidate_pairs(state)
+            invalidate_pair_list(state)
         while state.kernel.prepare() == NEED_CAPACITY:
             state = state.with_larger_buffers()
         return self._build_problem(state)
@@ -90,7 +90,7 @@ class Simulation(Stepping):
         head = self.state.head
         return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
 
-    @exclusive
+    @run_exclusively
     def residual(self) -> dict[str, Any]:
         """Return the judge's residual of all rows of the last substep, for the impulses that it used.
 
@@ -105,9 +105,9 @@ class Simulation(Stepping):
         InputError
             No step has been done.
         """
-        return self._residual_summary()
+        return self._summarise_residual()
 
-    @exclusive
+    @run_exclusively
     def motion(self) -> dict[str, Any]:
         """Return the motion error of the last substep: the distance to its solution, see `lavender.motion_error`.
 
@@ -126,7 +126,7 @@ class Simulation(Stepping):
         InputError
             No step has been done.
         """
-        return self._motion_summary()
+        return self._summarise_motion_error()
 
     def record(self, folder: str | PathLike[str], steps: int, *, form: str = "npz") -> list[Path]:
         """Step `steps` times and write the problem of the first substep of each step, with its warm start.
@@ -203,7 +203,7 @@ class Simulation(Stepping):
             self.end_film(film)
         return film
 
-    @exclusive
+    @run_exclusively
     def start_film(self) -> Film:
         """Return a new film with the present poses; every step adds a frame until `end_film`."""
         film = Film(make_header(self.scene, self.state))
@@ -317,7 +317,7 @@ class Simulation(Stepping):
 
     # -- snapshots ------------------------------------------------------------------------------
 
-    @exclusive
+    @run_exclusively
     def snapshot(self) -> Snapshot:
         """Return the complete state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters.
 
@@ -340,7 +340,7 @@ class Simulation(Stepping):
             keys=mark_read_only(s.keys.copy()),
         )
 
-    @exclusive
+    @run_exclusively
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this scene, bit for bit.
 
@@ -360,7 +360,7 @@ class Simulation(Stepping):
         size = snapshot.size.copy()
         check_sizes(self.state, size)
         found_lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
-        used = lengths(size)
+        used = compute_buffer_lengths(size)
         if found_lengths != (used[0], used[1], max(used[2], 1)):
             raise InputError("the snapshot is damaged: its arrays do not fit its sizes")
         state = State(size)

@@ -18,7 +18,7 @@ import numpy as np
 from lavender.base.errors import InputError
 from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_atomically
 from lavender.sim.engine.check import check_fields
-from lavender_ext.engine.arrays import lengths
+from lavender_ext.engine.arrays import compute_buffer_lengths
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
@@ -65,7 +65,7 @@ class Snapshot:
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
         body = pack_header(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
         checksum = hashlib.sha256(body).digest()
-        write_atomically(path, lambda part: _write(part, body + checksum))
+        write_atomically(path, lambda part: _write_and_flush(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
@@ -108,13 +108,13 @@ class Snapshot:
             arrays[name] = x.astype(x.dtype.newbyteorder("="))
         snapshot = cls(**{name: header[name] for name in HEADER_FIELDS} | arrays)
         check_fields(snapshot)
-        used = lengths(snapshot.size)
+        used = compute_buffer_lengths(snapshot.size)
         if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")
         return snapshot
 
 
-def _write(part: Path, data: bytes) -> None:
+def _write_and_flush(part: Path, data: bytes) -> None:
     """Write bytes and flush them to the disk."""
     with open(part, "wb") as stream:
         stream.write(data)

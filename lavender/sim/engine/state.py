@@ -26,7 +26,7 @@ from lavender_ext.engine.arrays import (
     PAIR_COUNT_OVERFLOW,
     PLANE,
     SPHERE,
-    lengths,
+    compute_buffer_lengths,
 )
 from lavender_ext.engine.newton_substep import Substep
 from lavender_ext.host import memory
@@ -77,7 +77,7 @@ class State:
 
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
-        used = lengths(self.size)
+        used = compute_buffer_lengths(self.size)
         if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MAX_BUFFER_BYTES:
             raise InputError(
                 f"{self.size[SIZE['bodies']]} bodies with memory for {self.size[CAP_PAIR]} pairs and "
@@ -154,7 +154,7 @@ class State:
             )
         own = (self.size, self.real, self.index, self.keys)
         other = State(memory.grow_workspace(*own))
-        memory.move(*own, other.size, other.real, other.index, other.keys)
+        memory.move_engine_state(*own, other.size, other.real, other.index, other.keys)
         return other
 
     @classmethod

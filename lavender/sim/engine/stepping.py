@@ -62,7 +62,7 @@ class _PendingClaim:
     time: float
 
 
-def exclusive(
+def run_exclusively(
     method: Callable[Concatenate[S, P], R],
 ) -> Callable[Concatenate[S, P], R]:
     """Decorate a method to run exclusively: other threads wait; inside a step or after `close` it raises an error."""
@@ -102,9 +102,9 @@ class Stepping:
         self._lock, self._refusal = RLock(), ""  # Reason why calls are rejected, or empty.
         self.films: list[Film] = []  # Every step adds a frame to these films.
         self._viewers: dict[int, Any] = {}  # Open pages by the id of their film.
-        self._load(scene)
+        self._load_scene(scene)
 
-    def _load(self, scene: Scene) -> None:
+    def _load_scene(self, scene: Scene) -> None:
         """Set all attributes to the start of the scene."""
         p = self._parameters = scene.parameters
         self._names = tuple(b.name for b in scene.bodies)
@@ -152,7 +152,7 @@ class Stepping:
         return bool(self.state.head[HEAD["warm_start"]])
 
     @property
-    @exclusive
+    @run_exclusively
     def last_solution(self) -> Solution | None:
         """Solution of the registered solver for the last substep.
 
@@ -162,7 +162,7 @@ class Stepping:
             self._last = self._build_solution(self._last)
         return self._last
 
-    @exclusive
+    @run_exclusively
     def set_solver_iterations(self, n: int) -> None:
         """Set the iteration budget from the next step on.
 
@@ -174,12 +174,12 @@ class Stepping:
         """
         self.state.head[HEAD["iterations"]] = check_int("solver_iterations", n, *self._sweeps)
 
-    @exclusive
+    @run_exclusively
     def set_warm_start(self, flag: bool) -> None:
         """Switch warm starting on or off from the next step on; the contact cache is updated in both cases."""
         self.state.head[HEAD["warm_start"]] = check_flag("warm_start", flag)
 
-    @exclusive
+    @run_exclusively
     def set_velocity(self, body: int | str, velocity: Any = None, angular_velocity: Any = None) -> None:
         """Set the velocity with which a body enters the next step, for example to apply an impact.
 
@@ -227,7 +227,7 @@ class Stepping:
             raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
         return self._names.index(body)
 
-    @exclusive
+    @run_exclusively
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return to the start of the scene; with `seed`, of the scene built with that seed.
 
@@ -241,7 +241,7 @@ class Stepping:
         sweeps, warm = self.solver_iterations, self.warm_start
         if seed is not None:
             self.scene = self.scene.with_parameters(seed=check_int("seed", seed))
-        self._load(self.scene)
+        self._load_scene(self.scene)
         self.state.head[HEAD["iterations"]] = sweeps
         self.state.head[HEAD["warm_start"]] = warm
         return self._make_observation(), self._make_info()
@@ -290,7 +290,7 @@ class Stepping:
             self._check_can_step()
             self._refusal = INSIDE_STEP
             try:
-                self._advance()
+                self._advance_all_substeps()
                 lost = self._find_lost_body()
                 observation = self._make_observation()
                 if self.films:
@@ -304,7 +304,7 @@ class Stepping:
         if self._end_reason:
             raise LavenderError(f"{self._end_reason}; reset() or restore a snapshot")
 
-    def _advance(self) -> None:
+    def _advance_all_substeps(self) -> None:
         """Do all substeps of a step; restore the state before the step if one of them raises."""
         substeps, first = self._parameters.substeps, self.state
         first_substep, failed = first.head.item(HEAD["step"]), self._failed
@@ -312,7 +312,7 @@ class Stepping:
         # Until the first substep has ended, nothing has changed that the next step starts from.
         needs_copy = substeps > 1 and not self._own_sweeps
         if self._restored:
-            invalidate_pairs(first)
+            invalidate_pair_list(first)
             self._restored = False
         if needs_copy:
             if self._state_before_step is None or not np.array_equal(
@@ -477,9 +477,9 @@ class Stepping:
             info["lost_body"] = lost
         elif self.state.head.item(HEAD["solved"]):
             if self.report_residual:
-                info["residual"] = self._residual_summary()
+                info["residual"] = self._summarise_residual()
             if self.report_motion:
-                info["motion"] = self._motion_summary()
+                info["motion"] = self._summarise_motion_error()
         return info
 
     # -- the problem of the last substep ----------------------------------------------------------
@@ -491,10 +491,10 @@ class Stepping:
             state, self._names, self._joint_names, f"{self.scene.name or 'scene'}, step {step}"
         )
 
-    def _residual_summary(self) -> dict[str, Any]:
+    def _summarise_residual(self) -> dict[str, Any]:
         return summarise_residual(*self._rebuild_last_problem())
 
-    def _motion_summary(self) -> dict[str, Any]:
+    def _summarise_motion_error(self) -> dict[str, Any]:
         problem, impulse = self._rebuild_last_problem()
         return summarise_motion(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
 
@@ -516,7 +516,7 @@ def get_sweep_order(p: Parameters) -> str | None:
     return get_order_name(p.solver_options.get("order", p.order))
 
 
-def invalidate_pairs(state: State) -> None:
+def invalidate_pair_list(state: State) -> None:
     """Mark the list of pairs as invalid: the next substep builds it again.
 
     A restored list with a missing pair cannot be distinguished from a correct one.

@@ -177,7 +177,9 @@ def build(
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
         source = Path(folder, "module.c")
         try:
-            parts = EXTRACT_C["translate"](root, modules, source.parent, root / "build" / "cython")
+            parts = EXTRACT_C["translate_modules_to_c"](
+                root, modules, source.parent, root / "build" / "cython"
+            )
             source.write_text(EXTRACT_C["extract_c"](parts, roots=names), encoding="utf-8")
         except EXTRACT_C["ExtractionError"] as error:
             raise BuildFailed(str(error)) from None

@@ -1,6 +1,6 @@
 """Extract C without Python from the C that Cython writes: given functions and everything that they use.
 
-    translate(root, modules, work)            return the C of modules of lavender_ext
+    translate_modules_to_c(root, modules, work)            return the C of modules of lavender_ext
     extract_c(translations, front, roots)     return one C file with the declarations that `front` and `roots` use
 
 Cython writes the core of a module (`cdef ... noexcept nogil`) and its Python part into one file, and a declaration that
@@ -490,7 +490,7 @@ def hash_sources(root: Path, modules: Iterable[str | Path], more: Iterable[Path]
     return digest.hexdigest()
 
 
-def translate(
+def translate_modules_to_c(
     root: Path, modules: Iterable[str | Path], work: Path, cache: Path | None = None
 ) -> list[tuple[str, str]]:
     """Return (name, C) of modules, translated by Cython.

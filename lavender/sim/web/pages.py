@@ -86,7 +86,7 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     make_folder(check_writable(folder, folder=True))
     modules = {name: get_module(say, name) for name in wasm.PARTS}
     try:
-        shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
+        shutil.copytree(HERE / "page", folder, copy_function=_copy_file, dirs_exist_ok=True)
         for name, data in modules.items():
             write_bytes(folder / f"{name}.wasm", data)
         text = json.dumps(collect_page_data(), allow_nan=False, separators=(",", ":"))
@@ -124,7 +124,7 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
         return subprocess.run(command, env=env, check=False).returncode == 0
 
 
-def _copy(source: str, target: str) -> None:
+def _copy_file(source: str, target: str) -> None:
     write_bytes(target, Path(source).read_bytes())
 
 

@@ -10,7 +10,7 @@ from lavender.sim.engine import Simulation
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.scene import Scene
-from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
+from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, compute_array_offsets
 
 #: Scenes of the page, the whole gallery: name, title, description, and the quantity in the caption of each side:
 #: "displacement" (largest distance of a body from its initial position, sideways or downwards), "gap" (largest distance
@@ -282,7 +282,7 @@ def describe_layout() -> dict[str, Any]:
 def _encode_stepper(name: str) -> dict[str, dict[str, Any]]:
     """Return the entries of `head` and `setting` that a stepper sets."""
     state = Simulation(Scene("stack", stepper=name)).snapshot()
-    first = offsets(state.size)
+    first = compute_array_offsets(state.size)
     head, setting = state.index[first["head"] :], state.real[first["setting"] :]
     numbers = {slot: int(head[HEAD[slot]]) for slot in ("stepper", "relaxing", "position_iterations")}
     return {"head": numbers, "setting": {p: float(setting[SETTING[p]]) for p in ("hertz", "ratio", "push")}}
@@ -293,7 +293,7 @@ def describe_snapshot(start: Snapshot) -> dict[str, Any]:
 
     The numbers are exact in JSON, which uses the shortest text that reads back as the same double.
     """
-    first = offsets(start.size)
+    first = compute_array_offsets(start.size)
     arrays = {}
     for names, buffer in zip(map(tuple, SHAPES.values()), (start.real, start.index, start.keys), strict=True):
         ends = [*(first[name] for name in names[1:]), len(buffer)]

@@ -24,7 +24,7 @@ from lavender.external.as_qp import (
     choose_form,
     compute_backend_tolerance,
 )
-from lavender.external.running import Answer, capture_output
+from lavender.external.running import Answer, capture_backend_output
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
 
@@ -105,7 +105,7 @@ def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_sever
     def run(mine, first):
         if not first:
             gate.wait()
-        with capture_output(noisy=True) as said:
+        with capture_backend_output(noisy=True) as said:
             if first:
                 gate.wait()
             gate.wait()  # both are inside
@@ -133,12 +133,12 @@ def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_sever
 def test_a_process_forked_while_a_thread_runs_a_backend_is_not_silent():
     script = """if True:
         import os, sys, threading
-        from lavender.external.running import capture_output
+        from lavender.external.running import capture_backend_output
 
         inside, leave = threading.Event(), threading.Event()
 
         def run():
-            with capture_output(noisy=True):
+            with capture_backend_output(noisy=True):
                 inside.set()
                 leave.wait(600)
 
@@ -147,7 +147,7 @@ def test_a_process_forked_while_a_thread_runs_a_backend_is_not_silent():
         inside.wait(600)
         child = os.fork()
         if not child:
-            with capture_output(noisy=True):
+            with capture_backend_output(noisy=True):
                 print("not heard", flush=True)
             print("the child", flush=True)
             os._exit(0)

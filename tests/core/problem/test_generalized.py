@@ -15,7 +15,7 @@ import lavender as lv
 from lavender.problem import generalized as coordinates
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import general
-from lavender.solvers.sweeping import reads_whitened
+from lavender.solvers.sweeping import is_sweep_over_jacobian_cheaper
 
 # -- the operator ----------------------------------------------------------------------------------
 
@@ -251,7 +251,9 @@ def test_entries_of_a_that_vanish_are_left_out(jac):
 
 def test_nothing_of_the_judge_forms_a(monkeypatch):
     problem = random_general(6, "cone")
-    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
+    monkeypatch.setattr(
+        "lavender.problem.operators.assemble.form_gram_matrix", None
+    )  # which A = Y Y^T is formed by
     solution = lv.solve(problem, tol=1e-8)
     lv.residual(problem, solution.impulse)
     problem.velocity(solution.impulse)
@@ -397,7 +399,7 @@ def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     scale = 1.0 + np.abs(same.impulse).max()
     # Sums in another order: 1e-13 of their terms, and a factor of a few on each of a dozen sweeps.
     np.testing.assert_allclose(one.impulse, same.impulse, atol=1e-7 * scale)
-    assert ("whitened J" in one.solver.form) == reads_whitened(problem)
+    assert ("whitened J" in one.solver.form) == is_sweep_over_jacobian_cheaper(problem)
     found = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
     assert found.success or found.status is not lv.Status.CONVERGED
 

@@ -164,7 +164,7 @@ def test_an_error_of_one_thread_stops_the_others():
 def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
     """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
     monkeypatch.setattr(threads, "MAX_THREADS", 1)
-    threads.thread_pool.cache_clear()
+    threads.get_thread_pool.cache_clear()
     two, inner = threading.Barrier(2, timeout=10.0), []
 
     def work(stop):
@@ -172,5 +172,5 @@ def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
         inner.append(threads.run_on_threads(lambda stop: None, 3))
 
     threads.run_on_threads(work, 2)
-    threads.thread_pool.cache_clear()
+    threads.get_thread_pool.cache_clear()
     assert len(inner) == 2 and min(map(len, inner)) == 1

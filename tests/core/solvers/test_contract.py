@@ -11,7 +11,7 @@ from random_problems import random_contact_problem, seeds
 import lavender as lv
 from lavender import contract, registry
 from lavender.base.errors import TooLarge
-from lavender.contract.checks import UNSOLVABLE_MATRICES, well_posed_problems
+from lavender.contract.checks import UNSOLVABLE_MATRICES, make_well_posed_problems
 from lavender.contract.enumeration import enumerate_lcp, random_bounds
 from lavender.problem import operators
 from lavender.solvers import steps
@@ -92,7 +92,7 @@ BROKEN = [MemoryError("8 GB"), TooLarge("A would have 1e10 entries"), FloatingPo
 def test_what_breaks_down_or_is_stopped_after_the_start_is_a_result(name, error, monkeypatch):
     """With the best impulse so far, and never one that is worse than the start."""
     spec = registry.get(name)
-    *_, problem = well_posed_problems(spec)
+    *_, problem = make_well_posed_problems(spec)
     start = 0.9 * lv.solve(problem).impulse
     factory = spec.load()
     runs = factory.run

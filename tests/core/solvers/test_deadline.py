@@ -421,5 +421,7 @@ def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatc
         + estimate_result_cost(problem)
         + 0.5 * estimate_formation_cost(problem)
     )
-    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
+    monkeypatch.setattr(
+        "lavender.problem.operators.assemble.form_gram_matrix", None
+    )  # which A = Y Y^T is formed by
     assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

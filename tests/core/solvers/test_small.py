@@ -18,7 +18,7 @@ from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
 from lavender.solvers.costs import RATES, get_factorisation_count
 from lavender.solvers.small import AUTO, SmallCall, describe_call, make_limits, time_fraction
-from lavender_ext.batch.many import solve_first
+from lavender_ext.batch.many import solve_new_generalized_problem
 
 
 def draw(kind, seed):
@@ -147,7 +147,7 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
     assert cost == pytest.approx(step * get_factorisation_count(problem.law), rel=1e-12)
 
     def lets_in(of):
-        return solve_first(problem.metric, None, np.inf, of)[0] is not None
+        return solve_new_generalized_problem(problem.metric, None, np.inf, of)[0] is not None
 
     if (
         make_limits(np.inf).cost(problem.metric, 0.0, state.general.islands)[1] == 0.0
@@ -162,7 +162,9 @@ def test_velocities_that_all_meet_are_one_call_as_well():
     rng = np.random.default_rng(0)
     jac, velocity = rng.normal(size=(300, 240)), rng.normal(size=240)
     problem = lv.Problem.from_jacobian(jac, np.eye(240), velocity, cones=lv.Cones.free(300), compliance=300.0)
-    found, counts = solve_first(fresh(problem).metric, None, 1e-6, make_limits(np.inf, np.inf))
+    found, counts = solve_new_generalized_problem(
+        fresh(problem).metric, None, 1e-6, make_limits(np.inf, np.inf)
+    )
     assert found is not None and found.relative <= 1e-6 and counts[1] == 1
 
 
@@ -285,7 +287,7 @@ def test_one_call_has_steps_for_every_island_of_velocities():
         compliance=np.tile(part.compliance, many),
         friction=part.friction,
     )
-    found = solve_first(problem.metric, None, 1e-6, AUTO.limits)
+    found = solve_new_generalized_problem(problem.metric, None, 1e-6, AUTO.limits)
     assert found and found[1][0] > many
 
 

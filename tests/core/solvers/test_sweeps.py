@@ -100,7 +100,7 @@ def test_safe_damping_is_below_the_limit_of_convergence(seed):
     # omega < 2 / L, L the largest eigenvalue of D^-1 A, for symmetric positive semidefinite A.
     problem = random_lcp(seed, m=12)
     scaled = problem.dense() / np.sqrt(np.outer(problem.d, problem.d))
-    assert 0.0 < serial.damping(problem.csr_data) * np.linalg.eigvalsh(scaled).max() < 2.0
+    assert 0.0 < serial.jacobi_damping_of_matrix(problem.csr_data) * np.linalg.eigvalsh(scaled).max() < 2.0
 
 
 @given(seed=seeds)
@@ -108,7 +108,9 @@ def test_the_damping_is_the_same_in_every_unit(seed):
     problem, rng = random_lcp(seed, m=12), np.random.default_rng(seed)
     size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
-    assert serial.damping(other.csr_data) == pytest.approx(serial.damping(problem.csr_data), rel=1e-12)
+    assert serial.jacobi_damping_of_matrix(other.csr_data) == pytest.approx(
+        serial.jacobi_damping_of_matrix(problem.csr_data), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", lv.available(order=True))

@@ -23,7 +23,7 @@ from record import SCENES, STEPS  # noqa: E402
 import lavender as lv  # noqa: E402
 from lavender.export import engine_image, vectors  # noqa: E402
 from lavender.export.view import NotSupported  # noqa: E402
-from lavender_ext.engine.arrays import views  # noqa: E402
+from lavender_ext.engine.arrays import make_array_views  # noqa: E402
 
 ORDERS = ("symmetric", "random", "reverse")
 #: Tolerance, iterations and options of each solver.
@@ -60,7 +60,7 @@ def scene(name, parameters, changes, steps):
             parts.append((engine_image(simulation), []))
         values = simulation.step()[0]["solver"]
         s = simulation.snapshot()
-        found = views(s.size, s.real, s.index, s.keys)
+        found = make_array_views(s.size, s.real, s.index, s.keys)
         places = np.concatenate([found["x"], found["q"]], axis=1)
         parts[-1][1].append(values.tobytes() + places.tobytes())
     words = ", ".join(f"{key}={value}" for key, value in parameters.items())

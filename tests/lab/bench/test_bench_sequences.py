@@ -37,7 +37,7 @@ def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
     assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
     assert all("after 1 of 5 steps" in s.reason for s in records.skips)
-    (row,) = table_specs.tabulate_passes(
+    (row,) = table_specs.tabulate_sequence_passes(
         statistics.group_runs_by_pass(records)
     ).cell_texts  # beside solvers that took all five
     assert [cell.endswith(" (1/5)") for cell in row].count(True) == 2

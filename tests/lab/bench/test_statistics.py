@@ -76,7 +76,7 @@ def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, 
     found = records_of(record("a", "x", 1.0, 0.5, **claim))
     assert len(report.list_failures(found)) == (0 if check == "confirmed" else 1)
     assert [c.wrong for c in report.count_claims(found)] == [wrong]
-    table = table_specs.tabulate_reaches(report.summarize_runs_by_case(found), TOLERANCES)
+    table = table_specs.tabulate_times_to_tolerances(report.summarize_runs_by_case(found), TOLERANCES)
     assert str(table.rows[0][table.heads.index("claim")]) == mark
     assert table.marks == ["bad" if wrong else ""]
 

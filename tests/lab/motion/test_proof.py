@@ -14,7 +14,7 @@ import lavender as lv
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search
-from lavender.lab.proof.numbers import Balls, Rationals, ball_precision
+from lavender.lab.proof.numbers import Balls, Rationals, set_ball_precision
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
 from tests.kkt_truth import Exact
@@ -132,11 +132,11 @@ def test_proofs_in_threads_keep_their_precision_and_that_of_the_caller():
     before, seen = flint.ctx.prec, []
 
     def other():
-        with ball_precision(256):
+        with set_ball_precision(256):
             seen.append(flint.ctx.prec)
 
     thread = threading.Thread(target=other)
-    with ball_precision(128):
+    with set_ball_precision(128):
         thread.start()
         thread.join(0.2)  # s, for the other one to begin, if it could
         assert (seen, flint.ctx.prec) == ([], 128)

@@ -62,7 +62,11 @@ def test_without_motion_errors_there_is_nothing_to_show(tmp_path):
     )
     found = Report(plain)
     assert len(found.records_by_motion_error) == 0 and found.velocity_tolerances == ()
-    assert table_specs.tabulate_motion_errors(found).rows == table_specs.tabulate_speeds(found).rows == []
+    assert (
+        table_specs.tabulate_motion_errors(found).rows
+        == table_specs.tabulate_best_solver_by_motion_error(found).rows
+        == []
+    )
     assert build_figures(plain).moved is None
     page = write(plain, tmp_path, figures=False).read_text(encoding="utf-8")
     assert "by-motion" not in page.split("<body>")[1]

@@ -150,7 +150,7 @@ def test_a_sequence_is_a_row_of_each_solver(sequence):
     assert table.heads == ["solver", "to 1e-6 [ms]", "to 1e-9 [ms]", "8 iterations"]
     assert table.cell_texts[0] == ["anderson", "4.00", "36.0", "1.0e-7"]
     assert [row[0] for row in table.cell_texts][:3] == ["anderson", "jacobi", "newton"]  # as fast as recorded
-    assert len(table.rows) == 7 < len(table_specs.tabulate_passes(passes).rows)
+    assert len(table.rows) == 7 < len(table_specs.tabulate_sequence_passes(passes).rows)
 
 
 def test_a_figure_of_a_sequence_has_one_tolerance_and_few_solvers(sequence):

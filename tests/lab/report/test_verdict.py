@@ -192,7 +192,7 @@ def test_the_first_sentence_the_structures_and_the_engine_have_one_set_of_number
     else:
         assert "engine's own Newton solves none of them" in text
     assert "se auto: " in text and f"in {ours} on average" in text
-    (structure,) = table_specs.tabulate_advice(made).rows
+    (structure,) = table_specs.tabulate_recommended_solvers(made).rows
     assert structure[2].lead == "auto" and structure[2].text == ours
     assert (format_seconds(score) in str(structure[-1])) == (solved > 0)
     table = table_specs.tabulate_engines(made)
@@ -217,7 +217,7 @@ def test_an_engine_that_answered_only_some_cases_is_not_in_the_first_sentence(tm
     engines = read_engine_answers([str(tmp_path / "robot")], found)
     made = Report(found, engines=engines)
     assert "engine" not in made.verdict.statements[0].text
-    by_name = {str(row[0]): row[-1] for row in table_specs.tabulate_advice(made).rows}
+    by_name = {str(row[0]): row[-1] for row in table_specs.tabulate_recommended_solvers(made).rows}
     assert by_name["stack"].lead == "Newton" and by_name["pile"].text == "–"
     # Records that are shown again name the folders themselves.
     assert read_engine_answers(["records.jsonl"], found) == engines

@@ -206,7 +206,9 @@ def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
     """A was counted, and so nothing begun, for sweeps that never read it."""
     problem = PROBLEMS["J and M, dense"]()
     residuals.get_reference(problem)
-    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
+    monkeypatch.setattr(
+        "lavender.problem.operators.assemble.form_gram_matrix", None
+    )  # which A = Y Y^T is formed by
     assert (
         lv.solve(problem, name, time_limit=2e-9 * estimate_result_cost(problem), max_iter=3).iterations == 3
     )

@@ -17,7 +17,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.solvers.small import AUTO
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.batch.many import solve_first
+from lavender_ext.batch.many import solve_new_generalized_problem
 
 
 def test_under_a_limit_nothing_long_is_begun_in_setting_up():
@@ -210,7 +210,9 @@ def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(se
 @pytest.mark.parametrize("seed", [1224])  # of 48 rows, where newton is stuck
 def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
     problem = wild(seed=seed).problem
-    found, counts = solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.limits)
+    found, counts = solve_new_generalized_problem(
+        replace(problem, copy=False).metric, None, 1e-6, AUTO.limits
+    )
     assert found is None and counts[0] > 0
     fresh = replace(problem, copy=False)
     assert registry.get("auto").small.attempt(fresh, None, 1e-6)[0] is None

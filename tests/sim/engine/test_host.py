@@ -7,13 +7,13 @@ from worked import after
 import lavender as lv
 from lavender.sim.engine.layout import SETTING
 from lavender.sim.engine.state import State
-from lavender_ext.engine.arrays import SHAPES, offsets
+from lavender_ext.engine.arrays import SHAPES, compute_array_offsets
 
 
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
 def test_arrays_lie_where_the_engine_has_them(name):
     state = State.from_scene(lv.Scene(name))
-    first = offsets(state.size)
+    first = compute_array_offsets(state.size)
     total = {"real": state.real, "index": state.index, "keys": state.keys}
     for buffer, names in SHAPES.items():
         starts = [first[n] for n in names]

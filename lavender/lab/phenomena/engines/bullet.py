@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.external.running import capture_output
+from lavender.external.running import capture_backend_output
 from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import (
     compute_relative_pose,
@@ -17,7 +17,7 @@ from lavender.lab.phenomena.engines.tree import (
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import convert_to_rotation_matrix
 
-with capture_output(noisy=True):  # PyBullet prints a line at import.
+with capture_backend_output(noisy=True):  # PyBullet prints a line at import.
     import pybullet
 
 
