@@ -398,24 +398,24 @@ def _run_stages(
                 )
                 if left <= system.seconds:
                     late = True
-                    solve.stop()
+                    solve.request_stop()
             try:
                 end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
             except TooLate:  # The best iterate is returned.
                 late, end = True, OUTCOMES["spent"]
-                solve.stop()
+                solve.request_stop()
             if solve.done > before:
                 system.record_factor_time(watch.seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
                 proven = check_certificate(problem, certificate, tol, deadline) is None
                 if proven:
-                    solve.prove()
+                    solve.confirm_certificate()
             elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
                 break
     except KeyboardInterrupt:
         interrupted = True  # The best iterate is returned all the same.
-        solve.stop()
+        solve.request_stop()
         solve.step(1, impulse)
     if interrupted:
         return Status.INTERRUPTED, None

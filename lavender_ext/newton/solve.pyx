@@ -394,7 +394,7 @@ cdef class Solve(Method):
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (rows,), to a relative residual of tol, with `budget` factorisations."""
-        self.aim(tol, budget)
+        self.reset_target(tol, budget)
         self.raised = None
         with nogil:
             begin(self.n, &self.options, &impulse[0])
