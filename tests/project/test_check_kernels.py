@@ -30,7 +30,7 @@ def test_what_is_not_strict_c11_is_named(tmp_path):
         f"cdef extern from *:\n    '''\n{made}    '''\n{said}\n"
         f"cdef public double lav_x(double n) noexcept nogil:\n    return {used}\n"
     )
-    [(_, text)] = cut.translate(ROOT, [path], tmp_path)
+    [(_, text)] = cut.translate_modules_to_c(ROOT, [path], tmp_path)
     c_file = tmp_path / "text.c"
     c_file.write_text(text)
     found = check_kernels.read_dialect(c_file)
