@@ -545,7 +545,10 @@ class ProgramQP(QP):
         return np.clip(lam, c.lower, c.upper, out=lam)
 
     def _recover_row_multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
-        """Return multipliers over sigma (m,); 0 for variables, and for bounds with a multiplier of the wrong sign."""
+        """Return lambda / sigma (m,) from the multipliers zeta of general rows and xi of bounds of the program.
+
+        Rows that are variables of the program have 0, as have bounds with a multiplier of the wrong sign.
+        """
         lam, scale = np.zeros(self.problem.m), np.zeros(self.problem.m)
         scale[self.unknown_rows] = self.root
         lam[self.general] = scale[self.general] * self.signs * zeta

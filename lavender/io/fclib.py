@@ -297,7 +297,7 @@ class _Reader:
             raise InputError(f"{path} is one number in a chunk of {_get_chunk_length(data)}")
         value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
-            raise InputError(f"{path} is {value}, beyond 32 bits")
+            raise InputError(f"{path} is {value}; a signed 32-bit integer is needed")
         return value
 
     def read_vector(self, path: str, count: int) -> FloatArray:

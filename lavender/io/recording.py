@@ -187,7 +187,13 @@ def record(
 def _solve_step(
     mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
 ) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
-    """Solve a step with MuJoCo; return the problem, MuJoCo's impulse and their record, or None without constraints."""
+    """Solve the constraints of the present step with MuJoCo, without a step in time; None without constraints.
+
+    Returns
+    -------
+    (Problem, (m,) N s, dict) or None
+        The problem, MuJoCo's impulse, and the record of both.
+    """
     start = perf_counter()
     mj.mj_fwdConstraint(model, data)
     seconds = perf_counter() - start

@@ -450,7 +450,8 @@ def unpack_program(arguments: ProgramArrays) -> ProgramArrays:
     names = ("P", "q", "G", "h", "A", "b", "lb", "ub")
     if not all(hasattr(P, name) for name in names):
         raise InputError(
-            f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone"
+            f"P is a {type(P).__name__} and q is {'missing' if arguments[1] is None else 'given'}; "
+            "P and q are needed, or a qpsolvers.Problem alone"
         )
     if any(x is not None for x in arguments[1:]):
         raise InputError("a qpsolvers.Problem holds all arrays: give it alone")

@@ -432,7 +432,7 @@ def run_backends(
                 break
             solver, before, trial = spec.load()(), log.best, start.copy()
             state = solver.prepare(problem)
-            claim = solver.run(state, trial, min(log.left, spec.max_iter), tol, log.time_left)
+            claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
             log.offer(trial)
             log.note(spec.name, claim, before)
             for result in (trial, log.impulse if log.best <= tol else log.result):
@@ -506,7 +506,11 @@ def solve(log: SolveLog, tree: Tree) -> None:
             step.least = stage.least
             step.run(stage.iterations)
             tree.best = log.best
-    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.last_stage_failed):
+    if (
+        log.best > log.tol
+        and log.certificate is None
+        and (log.remaining_iterations > 0 or log.last_stage_failed)
+    ):
         certify_infeasibility(log)
 
 

@@ -253,16 +253,23 @@ class Newton(Solver):
         n: int,
         tol: float,
         time_limit: float | None = None,
-        left: int | None = None,
+        remaining: int | None = None,
     ) -> Claim:
-        """Run about n steps, at most `left`, continuing where the last call ended; the first starts at `impulse` (m,).
+        """Run about n steps, at most `remaining`, from where the last call ended; the first starts at `impulse` (m,).
 
         Over generalised velocities, the row form does not follow.
         """
         is_continued, state.begun = state.begun, True
         if state.general is None:
             return self._run_system(
-                state.problem, state.system, impulse, n, tol, time_limit, is_continued, left or SPEC.max_iter
+                state.problem,
+                state.system,
+                impulse,
+                n,
+                tol,
+                time_limit,
+                is_continued,
+                remaining or SPEC.max_iter,
             )
         claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, is_continued)
         if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
@@ -390,13 +397,15 @@ def _run_stages(
         while True:
             before = solve.done
             steps = INTERRUPT_CHECK_INTERVAL / max(system.seconds, 1e-6)
-            left, watch = deadline.remaining(), Stopwatch()
-            if left is not None:
+            time_left, watch = deadline.remaining(), Stopwatch()
+            if time_left is not None:
                 # The time of the first factorisation is only estimated, so only one is run.
                 steps = (
-                    min(steps, STAGE_TIME_FRACTION * left / max(system.seconds, 1e-9)) if solve.done else 1.0
+                    min(steps, STAGE_TIME_FRACTION * time_left / max(system.seconds, 1e-9))
+                    if solve.done
+                    else 1.0
                 )
-                if left <= system.seconds:
+                if time_left <= system.seconds:
                     late = True
                     solve.request_stop()
             try:
@@ -425,7 +434,7 @@ def _run_stages(
         return Status.MAX_ITERATIONS, None
     if end == OUTCOMES["spent"]:
         if max_total and not late:
-            return Status.STALLED, certificate  # No factorisation may follow.
+            return Status.STALLED, certificate  # All `max_total` factorisations were used.
         return (Status.TIME_LIMIT if late and solve.done < last else Status.MAX_ITERATIONS), None
     return _ENDS[end], certificate
 

@@ -71,7 +71,7 @@ class SmallCall(Protocol):
     ) -> tuple[Any, Any]:
         """Return (judged result or None, work counts), from `impulse` (m,) [N s] or from the zero impulse.
 
-        The result is None if the call did not converge; `max_cost` [ns] limits its estimated cost.
+        None is returned if the call did not converge; `max_cost` [ns] limits its estimated cost.
         """
 
     def claim(
@@ -137,9 +137,15 @@ class Solver:
         """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
 
     def advance(
-        self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None, left: int | None
+        self,
+        state: Any,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None,
+        remaining: int | None,
     ) -> Claim:
-        """Run about `n` iterations for `auto`, up to `left`, continuing where the last call ended."""
+        """Run about `n` iterations for `auto`, up to `remaining`, continuing where the last call ended."""
         return self.run(state, impulse, n, tol, time_limit)
 
     def fallback(self) -> Solver | None:

@@ -213,7 +213,7 @@ class SmallCall:
         Returns
         -------
         tuple
-            (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
+            (judged result, work counts). None is returned if the call did not converge; the counts are () if no call
             was made.
         """
         if not tol > 0.0 or not len(problem.b):

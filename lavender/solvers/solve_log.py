@@ -94,7 +94,7 @@ class SolveLog:
     # -- the end ---------------------------------------------------------------------------------
 
     @property
-    def left(self) -> int:
+    def remaining_iterations(self) -> int:
         """Remaining iterations of the budget."""
         return self.budget - self.iterations
 
@@ -134,7 +134,7 @@ class SolveLog:
             return Status.ROUNDOFF_LIMIT
         if self.timed_out or self.deadline.passed():
             return Status.TIME_LIMIT
-        if self.left <= 0:
+        if self.remaining_iterations <= 0:
             return Status.MAX_ITERATIONS
         return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
 

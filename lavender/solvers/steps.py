@@ -82,7 +82,7 @@ class Step:
         """Run at most n iterations and record the stage in the log."""
         log, before = self.log, self.log.best
         try:
-            claim = self.advance(int(min(max(n, 1.0), log.left, MAX_CALL_ITERATIONS)))
+            claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, MAX_CALL_ITERATIONS)))
         except BREAKDOWN as error:
             log.failure, self.over = format_error(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
@@ -134,7 +134,9 @@ class Newton(Step):
         if not self.state.begun:
             self.impulse = log.problem.start() if self.started_from_zero else log.impulse.copy()
             self.started_from_zero = not (self.impulse - log.problem.start()).any()
-        claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
+        claim = self.solver.advance(
+            self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
+        )
         self.has_stalled = claim.status is Status.STALLED
         self.offer(claim.judged)
         self.record(claim)

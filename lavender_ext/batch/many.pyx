@@ -131,7 +131,7 @@ cdef class Limits:
 def solve_new_generalized_problem(Data p, start, double tol, Limits limits, double max_cost=INFINITY):
     """Set up, solve and judge a problem of J and M with at least one row and without derived data, in one call.
 
-    Returns (judged result, counters). The result is None if it is above tol, if an empty row violates its target, or if the
+    Returns (judged result, counters). None is returned if it is above tol, if an empty row violates its target, or if the
     estimated cost exceeds the limits. The counters are zero if nothing was run. At an estimated cost of `max_cost` [ns] the current
     iterate is returned. d, Y and the residual of the zero impulse are stored in the data.
     """

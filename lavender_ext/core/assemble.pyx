@@ -292,7 +292,7 @@ def stack_csr_matrices(int32_t n, matrices):
     """Stack several matrices of n columns vertically; return (indptr, indices, data) without zero entries, or None.
 
     A matrix is (indptr, indices, data, whether it is stored by columns, a sign that it is multiplied with, its number of
-    rows). The result is None if a matrix does not have int32 indices and float64 data in canonical form, or has an entry
+    rows). None is returned if a matrix does not have int32 indices and float64 data in canonical form, or has an entry
     that core/validate.pxd (1) rejects. The caller then validates in detail and raises.
     """
     cdef const int32_t[::1] ptr, idx

@@ -22,7 +22,7 @@ MAX_MAGNITUDE, MIN_MAGNITUDE = max_magnitude(), min_magnitude()
 def as_plain_array(value, tuple shape, bint finite, bint copy):
     """Return `value`, or a copy of it, read-only; None if it needs conversion or detailed validation.
 
-    The result is None unless `value` is a contiguous float64 array of this shape, in which None stands for any length. With
+    None is returned unless `value` is a contiguous float64 array of this shape, in which None stands for any length. With
     `finite` it is also None if a number violates core/validate.pxd (1).
     """
     cdef ndarray array

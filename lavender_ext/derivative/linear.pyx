@@ -311,7 +311,7 @@ cdef class Linear:
     def adjoint(self, velocity, impulse, slack):
         """Return (q (m), s (m), f (n), c (m)) of (1), concatenated, from y (n,), c (m,) and x (m,), None meaning 0.
 
-        A factor is required; n is 0 for (2). The result is None if y, c or x is not such an array or not finite; the caller
+        A factor is required; n is 0 for (2). None is returned if y, c or x is not such an array or not finite; the caller
         then validates in detail.
         """
         cdef Py_buffer view

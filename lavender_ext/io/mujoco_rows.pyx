@@ -188,7 +188,7 @@ def scale_dense_rows(values, int32_t m, int32_t n, scale):
 def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
     """Return (indptr, indices, data) of J with scaled rows, from compressed rows of n columns that may have gaps between them.
 
-    The result is None if columns do not ascend, and the number of the first row with invalid indices if there is one.
+    None is returned if columns do not ascend, and the number of the first row with invalid indices if there is one.
     """
     cdef int32_t i, m = <int32_t>len(scale), is_invalid
     cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)

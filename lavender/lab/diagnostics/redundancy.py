@@ -151,7 +151,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     """
     check_problem(problem)
     if not check_float("tol", tol, low=0.0) < 1.0:
-        raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
+        raise InputError(f"tol is {tol}; a number from 0 to below 1 is needed")
     if problem.precision == "float32":
         tol = max(tol, MIN_NEW_FRACTION_FLOAT32)
     m = problem.m

@@ -248,8 +248,8 @@ def _describe_subject(records: Records, subject: Subject, n: int) -> str:
 
 def _describe_cases(records: Records, cases: Sequence[str]) -> str:
     """Return words for single cases: built-in problems, or the structure that all of them have."""
-    words = [set(records.cases[c].structure) for c in cases]
-    shape = next((s for s in STRUCTURE_ORDER if all(s in w for w in words)), "")
+    structures = [set(records.cases[c].structure) for c in cases]
+    shape = next((s for s in STRUCTURE_ORDER if all(s in w for w in structures)), "")
     if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
         return f"the {format_count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
     if shape in ("", "separate", "dense"):
@@ -332,14 +332,14 @@ def _state_sweep_budgets(
     statements = []
     for _, group in groupby(firsts, get_recommendation):
         budgets, served_by, choices = zip(*group, strict=True)
-        condition = f"With {_join_words([str(n) for n in budgets])} sweep{'s' * (budgets != (1,))}"
+        condition = f"With {_join_names([str(n) for n in budgets])} sweep{'s' * (budgets != (1,))}"
         if served_by[0] is None:
             statements.append(Statement(f"{condition} no solver serves nine cases of ten.", requested=True))
             continue
         text = _describe_budget_recommendation(condition, choices[0], math.inf)
         if len(budgets) > 1:
             text = text.removesuffix(f"{format_residual(choices[0].score)}.")
-            text += f"{_join_words([format_residual(choice.score) for choice in choices])}."
+            text += f"{_join_names([format_residual(choice.score) for choice in choices])}."
         statement = _add_code(records, served_by[0], text, True)
         others = ", ".join(map(str, budgets[1:]))
         code = tuple(
@@ -349,9 +349,9 @@ def _state_sweep_budgets(
     return statements
 
 
-def _join_words(words: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     """Join words with commas, and the last two with "and"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _describe_resampled_ranking(resampled: ResampledRanking) -> list[Statement]:

@@ -63,7 +63,9 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
     if own.setting[settings].tobytes() != new.setting[settings].tobytes():
-        raise _make_damaged_state_error("setting is not that of this scene")
+        differs = np.flatnonzero(settings & (own.setting != new.setting))
+        changed = [name for name, at in SETTING.items() if at in differs] or ["a NaN"]
+        raise _make_damaged_state_error(f"settings differ from the ones of this scene: {', '.join(changed)}")
     _check_head(own, new, sweeps, is_lost)
     _check_contacts(new)
     if not is_lost:

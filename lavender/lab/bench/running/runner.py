@@ -208,7 +208,10 @@ def run(
     spread = workers != 1 or backend != "loky"
     plan = plan or (CampaignPlan() if spread else Plan())
     if spread and not plan.campaign:
-        raise InputError("workers disturb each other's times: give a CampaignPlan, or workers=1")
+        raise InputError(
+            f"workers is {workers}, backend {backend!r}, and the plan measures times, which several workers disturb: "
+            "give a CampaignPlan, or workers=1 with backend 'loky'"
+        )
     items = resolve_sources(cases)
     if plan.campaign:
         items = [replace(item, sequence="", step=-1) for item in items]
