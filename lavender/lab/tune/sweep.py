@@ -96,6 +96,7 @@ def tune(
     worlds = check_int("worlds", worlds, 2, None)
     horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
     threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
+    check_float("spread", spread, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
         raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
     if engine == "kamino":

@@ -74,6 +74,7 @@ PARTS = {
         (
             "core.order",
             "engine.newton_substep",
+            "factor.linear",
             "judge.measure",
             "newton.solve",
             "newton.warm_start",

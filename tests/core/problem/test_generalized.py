@@ -394,8 +394,10 @@ def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     if lv.known(problem)[name]:
         assert name == "pgs" and problem.law == "cone"
         return
-    one = lv.solve(problem, name, tol=0.0, max_iter=12)
-    same = lv.solve(as_matrix(problem), name, tol=0.0, max_iter=12)
+    # Later mixtures of anderson combine residuals that are dependent to rounding, so their coefficients are arbitrary.
+    sweeps = 5 if name == "anderson" else 12
+    one = lv.solve(problem, name, tol=0.0, max_iter=sweeps)
+    same = lv.solve(as_matrix(problem), name, tol=0.0, max_iter=sweeps)
     scale = 1.0 + np.abs(same.impulse).max()
     # Sums in another order: 1e-13 of their terms, and a factor of a few on each of a dozen sweeps.
     np.testing.assert_allclose(one.impulse, same.impulse, atol=1e-7 * scale)
