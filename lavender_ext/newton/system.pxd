@@ -200,7 +200,8 @@ cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcep
     cdef int32_t j
     cdef linear_t* f = s.linear
     form_sparse_matrix(s, what, eps)
-    f.factored, f.d, f.by = NO_FACTOR, NULL, LU
+    f.factored, f.by = NO_FACTOR, LU
+    f.d = NULL          # C++ converts no NULL through a temporary.
     if not all_finite(f.rows.data, s.coupled.indptr[s.e.m]):
         return 0
     if s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER):

@@ -161,7 +161,8 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
     fill_band(p, r, s)
     s.factorisations = 1
     analyse_band(&band, p.n_rows, s.width)
-    band.matrix, band.d, band.tiny, band.shift, band.ahead = s.band, p.d, 1e-13, 0.0, NULL
+    band.matrix, band.d, band.tiny, band.shift = s.band, p.d, 1e-13, 0.0
+    band.ahead = NULL
     if linear_factor(&band) or band.pivots.negative:
         return UNDECIDED
     for j in range(p.n_rows):

@@ -312,7 +312,8 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     cdef linear_t* n = &f.linear
     f.factorisations += 1
-    n.wide, n.d, n.shift, n.tiny, n.matrix = f.wide, NULL, 0.0, 0.0, f.factor
+    n.wide, n.shift, n.tiny, n.matrix = f.wide, 0.0, 0.0, f.factor
+    n.d = NULL          # C++ converts no NULL through a temporary.
     if f.is_over_rows:
         analyse_dense(n, f.n_free)
         n.by, n.lower = CHOLESKY if f.bounded_rows_only else LU, f.normal
