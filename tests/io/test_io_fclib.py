@@ -366,7 +366,7 @@ GOOD = encoded(W, -2)
         ({"W": GOOD | {"x": np.array([b"1"] * 6)}}, "numbers are needed"),
         ({"W": GOOD | {"m": np.array([4], np.int32), "p": np.array([0, 2, 4, 6, 6])}}, "4 x 3"),
         ({"W": GOOD | {"m": np.array([-3], np.int32)}}, "m -3"),
-        ({"W": GOOD | {"m": np.array([2**40])}}, "32 bits"),
+        ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
         ({"W": GOOD | {"m": np.array([3, 3], np.int32)}}, "1 are needed"),
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz is -2, -1"),
         (
