@@ -169,7 +169,8 @@ def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
     assert any(text.startswith("timing: round 1 of 2, <option ") for text in texts)
     assert [event.done for event in events] == list(range(len(events)))
     assert events[0].remaining is None and all(event.remaining >= 0.0 for event in events[1:])
-    assert events[-1].total == len(events)  # all that was expected is done or not needed
+    # The last expected calls may turn out not to be needed, depending on times.
+    assert events[-1].total >= len(events)
     assert events[-1].remaining < max(event.remaining for event in events[1:])
 
 
