@@ -53,13 +53,15 @@ NORMAL_FIRST = np.array([2, 0, 1])
 # Entries of the lower triangle of a body's M that can differ from 0: mass three times, inertia.
 BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2, 3, 3, 4, 3, 4, 5])
 BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
+INERTIA_ENTRIES = np.tril_indices(3)
 # Compared with its tolerances by the engine; see its PADMMStatus and DVIStatus.
 RESIDUAL_NAMES = ("r_p", "r_d", "r_c", "r_b")
 DYNAMICS_SOLVERS = ("padmm", "dvi")
 KAMINO_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
 
 
-# For each solver: its layout, and the kinds of rows that have been compared with D.
+_LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # of each solver
+# For each solver: its numbers of bodies and rows, and the kinds of rows that have been compared with D.
 _VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
 
 
@@ -95,7 +97,10 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
         raise InputError(f"solver is a {type(solver).__name__}; a newton.solvers.SolverKamino is needed")
     try:
         _check_configuration(engine)
-        worlds = _Worlds(engine, solver._contacts_kamino)
+        layout = _LAYOUTS.get(solver)
+        if layout is None or layout.info is not engine._model.info:
+            layout = _LAYOUTS[solver] = _Layout(engine._model)
+        worlds = _Worlds(engine, layout, solver._contacts_kamino)
         step = worlds.convert()
         claims = _make_claims(solver.status.numpy())
         _verify_delassus_matrix(solver, engine, worlds, verify)
@@ -134,16 +139,55 @@ def _make_claims(status: Any) -> Claims:
     return Claims(status["converged"] != 0, status["iterations"].astype(np.int64), residuals)
 
 
+class _Layout:
+    """The bodies and joints of each world. A model fixes them, so they are read once for each solver."""
+
+    def __init__(self, model: Any) -> None:
+        info, joints = model.info, model.joints
+        self.info = info
+        self.bodies = _as_int(info.num_bodies)
+        self.n = n = len(self.bodies)
+        self.has_equal_bodies = bool((self.bodies == self.bodies[0]).all())
+        self.columns = COLUMNS_PER_BODY * self.bodies
+        # Indices and row pointers of M's lower triangle if all worlds have the bodies of the first one.
+        n_bodies = int(self.bodies[0])
+        offset = COLUMNS_PER_BODY * np.repeat(np.arange(n_bodies), len(BODY_COLUMN))
+        indptr = _cumulate_counts(np.tile(BODY_ROW_ENTRIES, n_bodies))
+        self.mass_pattern = np.tile(BODY_COLUMN, n_bodies) + offset, indptr
+        self.velocity_ptr = _cumulate_counts(self.columns)
+        self.velocity_world = np.repeat(np.arange(n), self.columns)
+        # Position of each velocity in the engine's array of all bodies.
+        self.first_body = _as_int(info.bodies_offset)[:n]
+        within = np.arange(self.velocity_ptr[-1]) - self.velocity_ptr[self.velocity_world]
+        self.velocity_position = COLUMNS_PER_BODY * self.first_body[self.velocity_world] + within
+        # World and index in its group of each dynamic and each effort row, with its position in the joints' arrays.
+        self.soft_rows = {kind: self._find_soft_rows(kind) for kind in ("dynamic", "effort")}
+        # First row in its world and number of rows of each joint that a joint's kinematic rows form together.
+        world, count = _as_int(joints.wid), _as_int(joints.num_kinematic_cts)
+        per_world: Any = np.bincount(world, count, minlength=n).astype(np.int64)
+        group = _as_int(info.joint_kinematic_cts_group_offset)[:n]
+        before = _cumulate_counts(count)
+        self.joint_rows = group + per_world
+        self.joint_world, self.joint_size = world[count > 0], count[count > 0]
+        self.joint_begin = (group[world] + before[:-1] - _cumulate_counts(per_world)[world])[count > 0]
+
+    def _find_soft_rows(self, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the world, the index in the world and the position in the joints' array of each row of a kind."""
+        names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
+        count, offset, group = (_as_int(getattr(self.info, name))[: self.n] for name in names)
+        world = np.repeat(np.arange(self.n), count)
+        k = np.arange(len(world)) - _cumulate_counts(count)[world]
+        return world, group[world] + k, offset[world] + k
+
+
 class _Worlds:
     """The engine's arrays of one step, with the positions of each world's rows and velocities in them."""
 
-    def __init__(self, engine: Any, stored_contacts: Any) -> None:
+    def __init__(self, engine: Any, layout: _Layout, stored_contacts: Any) -> None:
         self.stored_contacts = stored_contacts
-        self.engine, self.problem, self.info = engine, engine.problem_fd.data, engine._model.info
-        self.bodies = _as_int(self.info.num_bodies)
-        self.n = n = len(self.bodies)
-        self.columns = COLUMNS_PER_BODY * self.bodies
-        problem = self.problem
+        self.engine, self.problem, self.layout = engine, engine.problem_fd.data, layout
+        self.bodies, self.columns, self.n = layout.bodies, layout.columns, layout.n
+        problem, n = self.problem, layout.n
         self.joints, self.bounded, self.limits, self.contacts = (
             _as_int(x)[:n] for x in (problem.njc, problem.nbc, problem.nl, problem.nc)
         )
@@ -156,7 +200,7 @@ class _Worlds:
                 f"world {world} has {stored[world]} rows; its joints, bounded rows, limits and contacts have "
                 f"{self.rows[world]}. {KAMINO_ADVICE}"
             )
-        self.row_ptr, self.velocity_ptr = _cumulate_counts(self.rows), _cumulate_counts(self.columns)
+        self.row_ptr, self.velocity_ptr = _cumulate_counts(self.rows), layout.velocity_ptr
         self.world = np.repeat(np.arange(n), self.rows)  # world of each row
         self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]  # index within the world
         # Index of the same row in the engine's order: both tangents of a contact, then its normal.
@@ -167,7 +211,6 @@ class _Worlds:
         self.begins_contact = np.zeros(len(self.index), bool)
         self.begins_contact[self.is_contact_row] = rank == 0
         self.position = _as_int(problem.vio)[self.world] + self.source  # in vectors of all rows
-        self.velocity_world = np.repeat(np.arange(n), self.columns)
         self.jacobian_values, self.jacobian_start = self._read_jacobian()
 
     def _read_jacobian(self) -> tuple[np.ndarray, np.ndarray]:
@@ -188,12 +231,10 @@ class _Worlds:
     def convert(self) -> tuple[Batch, FloatArray]:
         """Build the batch and the impulses."""
         scale = _copy_as_float64(self.problem.P)[self.position]
-        first_body = _as_int(self.info.bodies_offset)[: self.n]
-        within = np.arange(self.velocity_ptr[-1]) - self.velocity_ptr[self.velocity_world]
-        of_velocity = COLUMNS_PER_BODY * first_body[self.velocity_world] + within
-        free = _copy_as_float64(self.problem.u_f).reshape(-1)[of_velocity]
+        velocity_position = self.layout.velocity_position
+        free = _copy_as_float64(self.problem.u_f).reshape(-1)[velocity_position]
         mass, is_fixed = self._form_mass_matrix()
-        moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[of_velocity]
+        moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[velocity_position]
         jac, products = self._form_jacobian(free, moves)
         target = products - _copy_as_float64(self.problem.v_f)[self.position] / scale
         self.compliance = self._compute_row_compliance()
@@ -204,12 +245,12 @@ class _Worlds:
         wrong |= self._find_worlds_of_rows(np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0))
         is_wrong_row = wrong[self.world]
         lower[is_wrong_row], upper[is_wrong_row], mu[is_wrong_row] = -np.inf, np.inf, 0.0
-        free[wrong[self.velocity_world]] = np.nan
+        free[wrong[self.layout.velocity_world]] = np.nan
         begins = self._mark_block_begins()
         first = np.flatnonzero(begins)
         cones = Cones(
-            ptr=np.append(first, len(begins)),
-            kind=np.where(self.begins_contact[first], CONTACT, ROW),
+            ptr=np.append(first, len(begins)).astype(np.int32),
+            kind=np.where(self.begins_contact[first], CONTACT, ROW).astype(np.int32),
             lower=lower,
             upper=upper,
             mu=mu[first],
@@ -229,16 +270,11 @@ class _Worlds:
         """Return the worlds (n,) bool that have one of the given rows (bool)."""
         return np.bincount(self.world[rows], minlength=self.n) > 0
 
-    @property
-    def has_equal_bodies(self) -> bool:
-        """Whether all worlds have the same number of bodies."""
-        return bool((self.bodies == self.bodies[0]).all())
-
     def _form_jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Return J and J v*: (rows, nv) if worlds have equal numbers of bodies, else one array of all entries."""
         values, start = self.jacobian_values, self.jacobian_start
         first = start[self.world] + self.source * self.columns[self.world]  # of each row
-        if self.has_equal_bodies:
+        if self.layout.has_equal_bodies:
             nv = int(self.columns[0])
             jac = values[first[:, None] + np.arange(nv)].astype(float)
             if not moves.all():
@@ -271,14 +307,11 @@ class _Worlds:
             )
         inertia = np.linalg.inv(inv_inertia)
         values = np.concatenate(
-            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *np.tril_indices(3))]],
+            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *INERTIA_ENTRIES)]],
             axis=1,
         )
-        if self.has_equal_bodies:
-            count = int(self.bodies[0])
-            offset = COLUMNS_PER_BODY * np.repeat(np.arange(count), len(BODY_COLUMN))
-            indptr = _cumulate_counts(np.tile(BODY_ROW_ENTRIES, count))
-            return (values.reshape(self.n, -1), np.tile(BODY_COLUMN, count) + offset, indptr), is_fixed
+        if self.layout.has_equal_bodies:
+            return (values.reshape(self.n, -1), *self.layout.mass_pattern), is_fixed
         ptr = _cumulate_counts(self.columns**2)
         mass = np.zeros(ptr[-1])
         world = np.repeat(np.arange(self.n), self.bodies)
@@ -291,7 +324,7 @@ class _Worlds:
 
     def _compute_row_compliance(self) -> FloatArray:
         """Return the compliance of each row [1/kg, 1/(kg m^2)]."""
-        problem, info, joints = self.problem, self.info, self.engine.data.joints
+        problem, joints = self.problem, self.engine.data.joints
         soft = (
             np.zeros(len(self.index))
             if problem.compliance is None
@@ -301,12 +334,9 @@ class _Worlds:
             ("dynamic", joints.inv_m_j),
             ("effort", joints.inv_m_a),
         ):
-            names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
-            count, offset, group = (_as_int(getattr(info, name))[: self.n] for name in names)
-            if count.any():
-                world = np.repeat(np.arange(self.n), count)
-                k = np.arange(len(world)) - _cumulate_counts(count)[world]
-                soft[self.row_ptr[world] + group[world] + k] += _copy_as_float64(values)[offset[world] + k]
+            world, row, position = self.layout.soft_rows[kind]
+            if len(world):
+                soft[self.row_ptr[world] + row] += _copy_as_float64(values)[position]
         return soft
 
     def _compute_row_bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -328,62 +358,52 @@ class _Worlds:
     def _mark_block_begins(self) -> np.ndarray:
         """Return the rows (bool) that begin a block: the rows that hold one joint together form one block."""
         begins = ~self.is_contact_row | self.begins_contact
-        joints = self.engine._model.joints
-        world, count = _as_int(joints.wid), _as_int(joints.num_kinematic_cts)
-        per_world = np.bincount(world, count, minlength=self.n).astype(np.int64)
-        group = _as_int(self.info.joint_kinematic_cts_group_offset)[: self.n]
-        if (group + per_world != self.joints).any():
+        layout = self.layout
+        if (layout.joint_rows != self.joints).any():
             raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {KAMINO_ADVICE}")
-        before = (
-            _cumulate_counts(count)[:-1] - _cumulate_counts(per_world)[world]
-        )  # rows of joints before this one in its world
-        start = self.row_ptr[world] + group[world] + before
-        begins[
-            np.repeat(start, count) + np.arange(count.sum()) - np.repeat(_cumulate_counts(count)[:-1], count)
-        ] = False
-        begins[start[count > 0]] = True
+        start, size = self.row_ptr[layout.joint_world] + layout.joint_begin, layout.joint_size
+        begins[np.repeat(start - _cumulate_counts(size)[:-1], size) + np.arange(size.sum())] = False
+        begins[start] = True
         return begins
 
     def _make_block_namer(self, first: np.ndarray) -> Callable[[int], list[str]]:
         """Return a function that returns the names of a world's blocks, given the first row of each block."""
         model = self.engine._model
-        labels, bodies = list(model.joints.label), list(model.bodies.label)
-        joints = {
-            "dynamics": (model.joints.num_dynamic_cts, False),
-            "": (model.joints.num_kinematic_cts, True),
-            "friction": (model.joints.num_friction_cts, False),
-            "effort": (model.joints.num_effort_cts, False),
-        }
-        world_of_joint = _as_int(model.joints.wid)
-        counts = {kind: (_as_int(count), joined) for kind, (count, joined) in joints.items()}
-        pairs = self._find_contact_bodies()
+        pairs = self._copy_contact_bodies()
 
         def names_of(i: int) -> list[str]:
-            own = np.flatnonzero(world_of_joint == i).tolist()
+            joints = model.joints
+            own = np.flatnonzero(_as_int(joints.wid) == i).tolist()
             names = []
-            for kind, (count, joined) in counts.items():
+            for kind, stored, is_joined in (
+                (", dynamics", joints.num_dynamic_cts, False),
+                ("", joints.num_kinematic_cts, True),
+                (", friction", joints.num_friction_cts, False),
+                (", effort", joints.num_effort_cts, False),
+            ):
+                count = _as_int(stored)
                 for joint in own:
-                    suffix = f", {kind}" if kind else ""
-                    repeats = min(int(count[joint]), 1) if joined else int(count[joint])
-                    names += [f"joint {labels[joint]}{suffix}"] * repeats
+                    repeats = min(int(count[joint]), 1) if is_joined else int(count[joint])
+                    names += [f"joint {joints.label[joint]}{kind}"] * repeats
             names += [f"limit {k}" for k in range(int(self.limits[i]))]
+            world, number, bodies = pairs
             for k in range(int(self.contacts[i])):
-                sides = [bodies[b] if b >= 0 else "ground" for b in pairs.get((i, k), ())]
+                pair = bodies[(world == i) & (number == k)].reshape(-1)[:2].tolist()
+                sides = [model.bodies.label[b] if b >= 0 else "ground" for b in pair]
                 names.append(f"contact {k}" + (f" ({', '.join(sides)})" if sides else ""))
             blocks = np.count_nonzero((first >= self.row_ptr[i]) & (first < self.row_ptr[i + 1]))
             return names if len(names) == blocks else [f"block {k}" for k in range(blocks)]
 
         return names_of
 
-    def _find_contact_bodies(self) -> dict[tuple[int, int], list[int]]:
-        """Return the two bodies of each contact by (world, number in the world); -1 is the world itself."""
-        contacts = self.stored_contacts
-        if contacts is None or not self.contacts.any():
-            return {}
-        data = contacts.data
+    def _copy_contact_bodies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return world (c,), number in it (c,) and bodies (c, 2) of each contact; -1 is the ground."""
+        if self.stored_contacts is None or not self.contacts.any():
+            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
+        data = self.stored_contacts.data
         count = int(data.model_active_contacts.numpy()[0])
-        world, number, pair = (x.numpy()[:count] for x in (data.wid, data.cid, data.bid_AB))
-        return {(w, k): p for w, k, p in zip(world.tolist(), number.tolist(), pair.tolist(), strict=True)}
+        world, number, pair = (x.numpy()[:count].copy() for x in (data.wid, data.cid, data.bid_AB))
+        return world, number, pair
 
     def count_rows_by_kind(self) -> dict[str, np.ndarray]:
         """Return the number of rows of each kind in each world (n,)."""
@@ -394,10 +414,8 @@ class _Worlds:
 
     def compare_delassus_matrix(self, i: int) -> float:
         """Return the largest difference of the engine's D of world i from J M^-1 J^T, relative to its largest entry."""
-        size, bodies = (
-            int(self.rows[i]),
-            slice(int(self.index_of_first_body(i)), int(self.index_of_first_body(i) + self.bodies[i])),
-        )
+        size, first_body = int(self.rows[i]), int(self.layout.first_body[i])
+        bodies = slice(first_body, first_body + int(self.bodies[i]))
         if size == 0:
             return 0.0
         start = int(_as_int(self.problem.mio)[i])
@@ -420,10 +438,6 @@ class _Worlds:
         matrix = (stored - sigma * np.eye(size)) / np.outer(scale, scale)
         largest = np.abs(product).max(initial=0.0)
         return float(np.abs(matrix - product).max(initial=0.0) / largest) if largest > 0.0 else 0.0
-
-    def index_of_first_body(self, i: int) -> int:
-        """Return the number of world i's first body."""
-        return int(_as_int(self.info.bodies_offset)[i])
 
 
 def _verify_delassus_matrix(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
