@@ -282,7 +282,7 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
     CapabilityError
         M a0 is not the smooth force: a0 and the problem were computed with a matrix other than M.
     """
-    if seen.n and not data.M[:1].any():  # The first diagonal entry of a computed M is positive.
+    if seen.n and not data.M[0]:  # The first diagonal entry of a computed M is positive.
         raise InputError("M of this MjData is 0: mj_forward(model, data) was not called")
     result = mujoco_rows.lower_triangle_of_mass(
         *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like

@@ -8,7 +8,7 @@ solved from a cold start by both solvers to the same judged residual:
                 structure; `solve_many`; and `from_mujoco` with `lavender.solve`
 
 Except in the last, building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of
-several repetitions that alternate.
+the same number of repetitions for both.
 
 `measure_model_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the
 impulses of the last step, matched by key. MuJoCo has its own tolerance.
@@ -41,7 +41,7 @@ from lavender.solving.solve import solve
 TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
 STRICT_RESIDUAL = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
 MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # loosest first
-N_REPEATS = 5
+N_REPEATS = 20
 BATCH_SIZE = 64  # Number of problems in one call of solve_many.
 
 
@@ -128,7 +128,7 @@ def time_engine(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
         accepted = tolerance, residual(problem, adapter.impulse(model, data)).relative
         if accepted[1] <= TARGET_RESIDUAL:
             break
-    seconds = measure_min_time(lambda: mj.mj_fwdConstraint(model, data), 4 * N_REPEATS)
+    seconds = measure_min_time(lambda: mj.mj_fwdConstraint(model, data), N_REPEATS)
     return accepted[0], seconds, accepted[1]
 
 
