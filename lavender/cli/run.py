@@ -39,6 +39,12 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
     "Default: the stepper's.",
 )
 @click.option("--solver", help="Solver of each step, by name. Default: sequential_impulses.")
+@click.option(
+    "--velocity-tol",
+    type=float,
+    metavar="M/S",
+    help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
+)
 @click.option("--stepper", help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
@@ -74,6 +80,7 @@ def run(
     replace: bool,
     view: bool,
     film: Path | None,
+    velocity_tol: float | None,
     **scene_options: Any,
 ) -> None:
     """Simulate a scene of the gallery.
@@ -112,9 +119,8 @@ def run(
         with ignore_closed_output() if writes else contextlib.nullcontext():
             click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
-    simulation = Simulation(
-        Scene(scene, **_collect_parameters(parameters, scene_options)), report_residual=residual
-    )
+    scene_parameters = _collect_parameters(parameters, scene_options, velocity_tol)
+    simulation = Simulation(Scene(scene, **scene_parameters), report_residual=residual)
     every = 1 if live else max(1, steps // 20)
     with simulation.view() if view else contextlib.nullcontext() as viewer:
         frames = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
@@ -157,7 +163,9 @@ def run(
         exit_stopped()
 
 
-def _collect_parameters(assignments: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
+def _collect_parameters(
+    assignments: tuple[str, ...], options: dict[str, Any], velocity_tol: float | None
+) -> dict[str, Any]:
     """Return the parameters of the scene from `--set` and from the options for single parameters."""
     values = parse_parameters(assignments)
     for name, value in options.items():
@@ -168,6 +176,15 @@ def _collect_parameters(assignments: tuple[str, ...], options: dict[str, Any]) -
                 f"--set {name}={values[name]} and an option ({value}) both set {name}: leave one out"
             )
         values[name] = value
-    if values.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in values:
-        values["solver_options"] = {"order": values.pop("order")}  # A solver without sweep orders rejects it.
-    return values
+    own_sweeps = values.get("solver", "sequential_impulses") == "sequential_impulses"
+    solver_options: dict[str, Any] = {}
+    if velocity_tol is not None:
+        if own_sweeps:
+            raise InputError(
+                "--velocity-tol is for solvers that stop at an error, and a scene's own sweeps run a fixed number: "
+                "name a solver, as --solver newton"
+            )
+        solver_options["velocity_tol"] = velocity_tol
+    if not own_sweeps and "order" in values:
+        solver_options["order"] = values.pop("order")  # A solver without sweep orders rejects it.
+    return values | ({"solver_options": solver_options} if solver_options else {})

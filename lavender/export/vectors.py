@@ -95,7 +95,7 @@ class Step:
             encode_options(self.solver, self.options)[1],
         )
         options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {integers}, 0, {omega!r}"
-        budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0"
+        budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0, 0.0"
         return f"{{{{{options}}}, {{{budget}}}}}"
 
 

@@ -35,6 +35,15 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
     assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == 12 * [8]
 
 
+def test_lavender_run_takes_a_velocity_error_for_a_named_solver(lavender):
+    words = ("run", "stack", "--set", "n=2", "--steps", "4", "--velocity-tol", "1e-9")
+    code, printed, _ = lavender(*words, "--solver", "newton", "--residual")
+    assert not code and "newton" in printed
+    code, _, said = lavender(*words)
+    assert code == 2 and "name a solver" in said
+    assert lavender(*words[:-1], "-1", "--solver", "newton")[0] == 2
+
+
 def test_lavender_run_writes_films_and_pictures(lavender, tmp_path):
     for name in ("a.film", "a.gif"):
         code, out, _ = lavender("run", "spinner", "--steps", "5", "--film", tmp_path / name)

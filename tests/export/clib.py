@@ -71,10 +71,10 @@ class Library:
             setattr(made, key, value)
         return made
 
-    def budget(self, iterations, tol):
+    def budget(self, iterations, tol, velocity_tol=0.0):
         made = Budget()
-        assert self.c.lav_default_budget(ct.byref(made)) == 0
-        made.iterations, made.tol = iterations, tol
+        assert self.c.lav_default_budget(ct.byref(made)) == 0 and made.velocity_tol == 0.0
+        made.iterations, made.tol, made.velocity_tol = iterations, tol, velocity_tol
         return made
 
     def problem(self, given, **more):
@@ -130,10 +130,10 @@ class Solver:
         self.m = problem.n_rows
         return code
 
-    def run(self, iterations, tol):
+    def run(self, iterations, tol, velocity_tol=0.0):
         out = Result()
         out.size = ct.sizeof(Result)
-        budget = self.library.budget(iterations, tol)
+        budget = self.library.budget(iterations, tol, velocity_tol)
         code = self.library.c.lav_run(self.at, ct.byref(budget), ct.byref(out))
         if code:
             raise Refused(self.library, code)

@@ -163,7 +163,10 @@ def test_null_and_memory_without_a_solver_have_different_errors(library):
     r.size = ct.sizeof(Result)
     budget.tol = np.nan
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
-    budget.tol, budget.seconds = 0.0, 1.0
+    for value in (np.nan, np.inf, -1e-5):
+        budget.tol, budget.velocity_tol = 0.0, value
+        assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
+    budget.velocity_tol, budget.seconds = 0.0, 1.0
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -1  # a limit without a clock
     out = np.full(35, 7.0)
     assert c.lav_impulse(solver.at, ct.c_void_p(out.ctypes.data), 35) == -3 and set(out) == {7.0}

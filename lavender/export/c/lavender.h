@@ -161,6 +161,7 @@ typedef struct lav_budget {
   double seconds;              /* at most; 0: no limit */
   double (*clock)(void *);     /* seconds, never falling; needed with a limit */
   void *clock_data;
+  double velocity_tol;         /* m/s, rad/s; above 0 in place of tol: converged if no row has a larger velocity error */
 } lav_budget;
 
 typedef struct lav_verdict { /* the judge's result for an impulse */
@@ -204,7 +205,7 @@ LAV_API int32_t lav_self_test(void);                /* LAV_OK if this build has 
 
 LAV_API int32_t lav_default_problem(int32_t form, lav_problem *out);
 LAV_API int32_t lav_default_options(int32_t method, lav_options *out);
-LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-6, no clock */
+LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-6, no clock, no velocity_tol */
 
 /* Whether a method supports a problem of this form, law and kinds of blocks; LAV_OK or LAV_ERROR_UNSUPPORTED. */
 LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options);

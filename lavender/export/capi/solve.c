@@ -289,12 +289,25 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
   return leave(solver, code);
 }
 
-static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
+/* Copy a budget, with the relative residual that guarantees velocity_tol as tol: relative <= velocity_tol / V0 => V <= velocity_tol.
+ * V0 is the velocity error of the zero impulse, whose relative residual is 1. */
+static lav_budget with_relative_tolerance(const lav_solver *s, const lav_budget *budget) {
+  const double reference = s->p.n_rows > 0 ? s->start[1] : 0.0;
+  lav_budget out = *budget;
+  if (out.velocity_tol > 0.0) out.tol = out.velocity_tol < reference ? out.velocity_tol / reference : 1.0;
+  return out;
+}
+
+static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) {
   const method_t *row = row_of(s->options.method);
+  lav_budget limits;
+  const lav_budget *budget = &limits;
   double first; /* Residual of the result before refinement. */
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
-  if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
+  if (requested->size != sizeof *requested || out->size != sizeof *out) return LAV_ERROR_VERSION;
+  limits = with_relative_tolerance(s, requested);
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
+  if (!(budget->velocity_tol >= 0.0 && budget->velocity_tol < INFINITY)) return LAV_ERROR_OPTION;
   if (!(budget->seconds >= 0.0 && budget->seconds < INFINITY)) return LAV_ERROR_OPTION;
   if (budget->seconds > 0.0 && !budget->clock) return LAV_ERROR_NULL;
   out->outcome = LAV_MAX_ITERATIONS;
@@ -317,6 +330,9 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
           : first <= budget->tol && (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED
                                      || out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT)))
     out->outcome = judge_score_is_at_floor(out->verdict.relative, out->verdict.floor) ? LAV_ROUNDOFF_LIMIT : LAV_STALLED;
+  if (out->verdict.velocity <= budget->velocity_tol && budget->velocity_tol > 0.0 /* `tol` was stricter than needed. */
+      && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
+    out->outcome = LAV_CONVERGED;
   return LAV_OK;
 }
 

@@ -80,7 +80,7 @@ class Parameters:
     solver : str
         "sequential_impulses", or the name of a registered solver.
     solver_options : mapping
-        Options of a registered solver.
+        Options of a registered solver, and `tol` or `velocity_tol` [m/s] of `lavender.solve`.
     solver_iterations : int, optional
         Default: 16 sweeps, or the default of the registered solver.
     warm_start : bool

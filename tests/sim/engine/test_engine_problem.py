@@ -259,6 +259,18 @@ def test_every_step_tells_the_order_of_its_sweeps(parameters, order):
         assert sim.last_solution.solver.order == (order or "")
 
 
+@pytest.mark.parametrize("solver", ["newton", "auto", "pgs"])
+def test_every_step_meets_the_velocity_error_that_the_scene_requires(solver):
+    sim = lv.Simulation(lv.Scene("pile", n=4, solver=solver, solver_options={"velocity_tol": 1e-6}))
+    judged = []
+    for _ in range(40):
+        sim.step()
+        if sim.last_solution is not None:
+            judged.append(sim.last_solution.residual.velocity)
+            assert sim.last_solution.velocity_tol == 1e-6 and sim.last_solution.success
+    assert len(judged) > 5 and max(judged) <= 1e-6
+
+
 def test_the_eight_values_print_with_their_names_and_units():
     sim = after(3, "stack", n=2, solver_iterations=9)
     values = sim.step()[0]["solver"]
