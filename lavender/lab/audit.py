@@ -51,6 +51,7 @@ from lavender.lab.simulated_worlds import (
     Runs,
     StepSizes,
     can_any_geoms_collide,
+    describe_exceedance,
     iterate_frames,
     simulate_world,
     split_state_vector,
@@ -402,12 +403,12 @@ class Audit:
     @property
     def summary_page(self) -> SummaryPage:
         """Page with the result in a sentence, figures and tables, as `lavender audit` writes it."""
+        n_worlds = int(np.count_nonzero(self.is_judged.any(axis=1)))
         return SummaryPage(
             "lavender audit", self.summary_text,
             [
-                PageSection(
-                    "Errors", [self.table_of_errors, self.table_of_verdicts], [self.figure], ERRORS_NOTE, short=4
-                ),
+                PageSection("Errors", [self.table_of_errors, self.table_of_verdicts], [self.figure], short=4,
+                     note=f"{ERRORS_NOTE} {describe_exceedance(n_worlds)}".strip()),
                 PageSection("Rows and contacts", [self.judged_sizes.size_table], short=2, note=SIZES_NOTE),
                 PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
                 PageSection("Worst rows", [self.table_of_rows], short=3,

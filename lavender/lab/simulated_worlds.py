@@ -27,7 +27,7 @@ from lavender.io.efc import from_efc
 from lavender.io.recording import Control, load_controls, load_model, make_controller
 from lavender.io.states import StartStates, read_states
 from lavender.lab.report.table import Table
-from lavender.lab.report.text import format_percent
+from lavender.lab.report.text import format_count, format_percent
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 # MJX and Warp start from these.
@@ -177,6 +177,20 @@ class StepSizes:
                 "share": float(np.mean(counts > 0)) if with_any else None,
             }
         return numbers
+
+
+def describe_exceedance(n_worlds: int) -> str:
+    """Return a sentence on the probability that a further world has a larger error than all worlds measured.
+
+    Each of n + 1 worlds that are drawn alike is the worst of them with the same probability, 1 / (n + 1), whatever the
+    distribution of the errors. This does not hold for steps: those of one world depend on each other.
+    """
+    if not n_worlds:
+        return ""
+    return (
+        f"The maximum is that of {format_count(n_worlds, 'world')} and not a bound: a further world that is drawn "
+        f"alike exceeds it with a probability of up to 1/{n_worlds + 1}."
+    )
 
 
 def can_any_geoms_collide(mj: Any, model: Any) -> bool:

@@ -158,6 +158,40 @@ def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
         assert all(("not on the worlds held back" in line) == refuted for line in lines)
 
 
+def test_the_largest_error_held_back_is_told_with_the_probability_of_a_larger_one(boxes, monkeypatch):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    held = [measured(10.0, 2e-3), measured(8.0, 2e-3, iterations=9)]
+    held[1].error[7] = 0.5
+    found = replace(chosen(now, quick, held=held), n_held_worlds=8)
+    assert found.lines[2].endswith("instead of 2.0e-3 (at most 0.5 in 100 steps)")
+    assert "8 worlds and not a bound" in found.summary_page.render_html()
+    assert "probability of up to 1/9" in found.summary_page.render_html()
+    assert "1/9" not in replace(found, held=[]).summary_page.render_html()
+    fewer(monkeypatch)
+    assert tune(boxes(EARLY), worlds=5, steps=10, repeats=1).n_held_worlds == 2
+
+
+@pytest.mark.parametrize("how", [{"stopped": True}, {"busy": "The machine was busy: load 9.0"}])
+def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    found = replace(chosen(now, quick), **how)
+    assert found.lines[0].startswith('<option iterations="9"/>  <!-- PROVISIONAL, the m')
+    page = found.summary_page.render_html()
+    assert "Provisional lines" in page and "Lines to copy" not in page and "measure again" in page
+    assert "PROVISIONAL" not in chosen(now, quick).lines[0]
+
+
+def test_a_line_after_the_model_s_own_option_wins_and_before_it_does_not():
+    model = BOXES.format(options='iterations="7"')
+    line = Setting((("iterations", 50),)).option_line
+    head, own, rest = model.partition("<option")
+    option, end, tail = (own + rest).partition("/>")
+    after, before = f"{head}{option}{end}{line}{tail}", f"{head}{line}{option}{end}{tail}"
+    assert mj.MjModel.from_xml_string(after).opt.iterations == 50
+    assert mj.MjModel.from_xml_string(before).opt.iterations == 7
+    assert "after the model's own <option>" in mujoco_settings.MERGE_NOTE
+
+
 def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
     fewer(monkeypatch)
     events = []

@@ -26,8 +26,8 @@ from lavender.lab.tune.measured import Measured, Setting, Stage, make_unmeasured
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
 MERGE_NOTE = (
-    "Add the line next to the model's own <option>: MuJoCo merges both. If it replaces the model's own <option>, "
-    "its integrator and time step are lost."
+    "Add the line after the model's own <option>: MuJoCo merges both, and a later attribute replaces an earlier one. "
+    "If the line replaces the model's own <option>, its integrator and time step are lost."
 )
 # Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
 ENUMS = {

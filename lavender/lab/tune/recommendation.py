@@ -14,7 +14,7 @@ from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_ratio, format_size
-from lavender.lab.simulated_worlds import StepSizes
+from lavender.lab.simulated_worlds import StepSizes, describe_exceedance
 from lavender.lab.tune.measured import Measured
 from lavender.problem.derived import cached_property
 
@@ -44,6 +44,8 @@ class Tuning:
         Rows and contacts of the steps of all worlds with the model's own setting.
     busy : str
         A warning if other processes used the processors during the timing; else empty.
+    n_held_worlds : int
+        Number of worlds held back.
     """
 
     model: str
@@ -54,6 +56,7 @@ class Tuning:
     stopped: bool = False
     sizes: StepSizes | None = None
     busy: str = ""
+    n_held_worlds: int = 0
 
     @property
     def present_result(self) -> Measured:
@@ -120,6 +123,13 @@ class Tuning:
         )
 
     @property
+    def reason_provisional(self) -> str:
+        """Reason why the lines are provisional; empty if the measurement is complete and its times are valid."""
+        if self.stopped:
+            return "the measurement was interrupted"
+        return "the machine was busy" if self.busy else ""
+
+    @property
     def lines(self) -> list[str]:
         """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
         if self.reason_without_line:
@@ -140,12 +150,35 @@ class Tuning:
             held = next((h for h in self.held[1:] if h.setting == m.setting), None)
             if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
                 description += ": not on the worlds held back"
+            if self.reason_provisional:
+                description = f"PROVISIONAL, {self.reason_provisional}: {description}"
             lines += [
                 f"{m.setting.option_line}  {m.setting.comment.format(description)}",
                 f"    chosen on: {_compare(m, self.present_result)}",
-                f"    held back: {'not measured' if held is None else _compare(held, self.held[0])}",
+                f"    held back: {'not measured' if held is None else self._compare_held_back(held)}",
             ]  # fmt: skip
         return lines
+
+    def _compare_held_back(self, held: Measured) -> str:
+        """Compare a setting with the present one on the worlds held back, with the largest error there."""
+        worst = f"at most {format_size(float(held.error.max()))} in {len(held.error)} steps"
+        return f"{_compare(held, self.held[0])} ({worst})"
+
+    @property
+    def _lines_note(self) -> str:
+        """Explanation below the lines: how they were chosen and tested, and where they belong."""
+        if self.reason_without_line:
+            return "None, for the reason above."
+        sentences = ["Chosen on the worlds with even numbers, tested on the others."]
+        if self.faster or self.closer:
+            if self.reason_provisional:
+                sentences.append(
+                    f"The lines are provisional, because {self.reason_provisional}: measure again."
+                )
+            if len(self.held) > 1 and self.n_held_worlds:
+                sentences.append(describe_exceedance(self.n_held_worlds))
+            sentences.append(self.present_result.setting.merge_note)
+        return " ".join(filter(None, sentences))
 
     def _table(self, settings: Iterable[Measured]) -> Table:
         """Build the table of some settings."""
@@ -204,8 +237,6 @@ class Tuning:
             head += f" In the same time the error can be {gain} less."
         if self.reason_without_line:
             head += f" {self.reason_without_line}"
-        note = now.setting.merge_note
-        merge_note = f" {note}" if note and (self.faster or self.closer) else ""
         other = [m for m in self.measured if m.setting.changes_problem]
         shown = [now, *(m for m in self.pareto_front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.mean_step_time)
@@ -214,9 +245,8 @@ class Tuning:
         return SummaryPage(
             "lavender tune", head,
             [
-                PageSection("Lines to copy", code=self.lines,
-                     note="None, for the reason above." if self.reason_without_line
-                     else "Chosen on the worlds with even numbers, tested on the others." + merge_note),
+                PageSection("Provisional lines" if self.reason_provisional else "Lines to copy", code=self.lines,
+                     note=self._lines_note),
                 PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
                 PageSection("The front of time and error", [self._table(shown)], figures, short=5),
                 PageSection("Other problems", [self._table(other)], short=2,

@@ -105,7 +105,7 @@ def tune(
         start = {"states": states, "spread": spread, "seed": seed}
         return measure_settings(
             lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
-            name, horizon, repeats, threshold, can_touch=True, watch=watch,
+            name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2, watch=watch,
         )  # fmt: skip
     runs = Runs(name, worlds, steps, control=control, seed=seed, spread=spread).with_start_states(states)
     mj, configured = runs.load_model()
@@ -118,8 +118,10 @@ def tune(
         even, odd = (stage_type.from_runs(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
         return cast("tuple[Stage, Stage]", (even, odd))
 
-    can_touch = can_any_geoms_collide(mj, configured)
-    return measure_settings(make_stages, name, horizon, repeats, threshold, can_touch=can_touch, watch=watch)
+    return measure_settings(
+        make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
+        n_held_worlds=worlds // 2, watch=watch,
+    )  # fmt: skip
 
 
 def measure_settings(
@@ -130,6 +132,7 @@ def measure_settings(
     threshold: float,
     *,
     can_touch: bool,
+    n_held_worlds: int,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
     """Measure settings on one stage, and those chosen on a second one.
@@ -144,6 +147,8 @@ def measure_settings(
         As for `tune`.
     can_touch : bool
         Whether bodies of the model can collide, see `StepSizes`.
+    n_held_worlds : int
+        Number of worlds held back.
     """
     schedule = Schedule(watch)
     measured: list[Measured] = []
@@ -155,8 +160,9 @@ def measure_settings(
         timed = [m for m in measured if np.isfinite(m.mean_step_time)]
         busy = machine.describe_busy(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
-            model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy
-        )
+            model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
+            n_held_worlds=n_held_worlds,
+        )  # fmt: skip
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         """Judge settings."""
