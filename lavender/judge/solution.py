@@ -22,21 +22,31 @@ if TYPE_CHECKING:
 
 
 class Status(str, Enum):
-    """The solver's claim about how a solve ended; the value describes it.
+    """The solver's claim about how a solve ended; `description` explains it.
 
-    Compare a status with a member, or its `name` with a text: `solution.status == "STALLED"` is always false.
+    A status is equal to its name: `solution.status == "STALLED"`.
     """
 
-    CONVERGED = "the solver's own test at tol was met"
-    ROUNDOFF_LIMIT = "above tol, but within twice the error of rounding to float64"
-    MAX_ITERATIONS = "the iteration budget was used up"
-    TIME_LIMIT = "the time limit was reached"
-    STALLED = "no further progress"
-    DIVERGED = "the iterate grew, or is not finite"
-    INFEASIBLE = "no solution exists; `certificate` proves it, unless `claim_check` says otherwise"
-    NUMERICAL_ERROR = "a factorisation or the backend failed"
-    INTERRUPTED = "stopped by Ctrl-C or by the callback"
-    INVALID_PROBLEM = "the data of one world of a batch are not a valid problem"
+    description: str
+
+    def __new__(cls, name: str, description: str) -> Status:
+        member = str.__new__(cls, name)
+        member._value_, member.description = name, description
+        return member
+
+    CONVERGED = "CONVERGED", "the solver's own test at tol was met"
+    ROUNDOFF_LIMIT = "ROUNDOFF_LIMIT", "above tol, but within twice the error of rounding to float64"
+    MAX_ITERATIONS = "MAX_ITERATIONS", "the iteration budget was used up"
+    TIME_LIMIT = "TIME_LIMIT", "the time limit was reached"
+    STALLED = "STALLED", "no further progress"
+    DIVERGED = "DIVERGED", "the iterate grew, or is not finite"
+    INFEASIBLE = (
+        "INFEASIBLE",
+        "no solution exists; `certificate` proves it, unless `claim_check` says otherwise",
+    )
+    NUMERICAL_ERROR = "NUMERICAL_ERROR", "a factorisation or the backend failed"
+    INTERRUPTED = "INTERRUPTED", "stopped by Ctrl-C or by the callback"
+    INVALID_PROBLEM = "INVALID_PROBLEM", "the data of one world of a batch are not a valid problem"
 
     def __str__(self) -> str:
         return self.name

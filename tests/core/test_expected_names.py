@@ -1,5 +1,9 @@
 """Names that users of similar packages try are answered by an error that suggests the name of this package."""
 
+import copy
+import json
+import pickle
+
 import numpy as np
 import pytest
 
@@ -164,3 +168,15 @@ def test_no_solver_suggests_auto():
 def test_other_names_of_results_suggest_ours(name, instead):
     with pytest.raises(AttributeError, match=f"use {instead}"):
         getattr(lv.solve(LCP), name)
+
+
+def test_a_status_is_equal_to_its_name_everywhere():
+    problem = lv.Problem.lcp([[2.0]], [1.0])
+    solution = lv.solve(problem)
+    assert solution.status == "CONVERGED" and solution.status != "STALLED"
+    assert (lv.solve_many([problem] * 2).status == "CONVERGED").all()
+    for status in lv.Status:
+        assert status == status.name == str(status) == f"{status}" and len(status.description) > 10
+        assert lv.Status(status.name) is lv.Status[status.name] is status
+        assert pickle.loads(pickle.dumps(status)) is copy.deepcopy(status) is status
+        assert json.loads(json.dumps(status)) == status.name and {status.name: 1}[status] == 1
