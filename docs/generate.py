@@ -300,8 +300,8 @@ def standing(records, solver):
         )
     head = ("case", *(f"to {format_tolerance(x)}" for x in TOLERANCES), "best residual")
     note = (
-        "Times are of the whole call of `lv.solve`; brackets: relative to the fastest *other* solver (`auto` excluded); "
-        "–: not reached."
+        "Times are of the whole call of `lv.solve`; brackets: relative to the fastest *other* solver (`auto` "
+        "excluded); –: not reached."
     )
     return f"{said}\n\n{table(head, rows)}\n\n{note}"
 
@@ -433,8 +433,9 @@ def measured_page(site, records, figures):
         (
             f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
             f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
-            f"Minimum of {PLAN.repeats} repeats of the whole call of `lv.solve`, at most {format_seconds(PLAN.time_limit)}\n"
-            "a solve. This is a small measurement, not a benchmark: `lavender report` on your own problems says more. "
+            f"Minimum of {PLAN.repeats} repeats of the whole call of `lv.solve`,\nat most "
+            f"{format_seconds(PLAN.time_limit)} a solve. This is a small measurement, not a benchmark: "
+            "`lavender report` on your own problems says more. "
             "Every run, mean and claim, with the cases, is in\n[the report](report.html) of these records."
         ),
         "## By structure",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from functools import wraps
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "check_name",
     "format_error",
     "reject_former_names",
+    "require_packages",
 ]
 
 
@@ -145,3 +147,16 @@ def format_error(error: BaseException) -> str:
 
 class SolveFailed(LavenderError):
     """The judge does not accept a result; raised only by `Solution.raise_for_status`."""
+
+
+def require_packages(user: str, *names: str) -> None:
+    """Raise InputError if a package that `user` needs is not installed; `user` is the subject of the message.
+
+    These packages are dependencies of lavender. They are missing only after an installation without dependencies.
+    """
+    missing = [name for name in names if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{user} needs {', '.join(missing)}: pip install {' '.join(missing)}; an installation of lavender without "
+            "--no-deps brings every package"
+        )

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, require_packages
 from lavender.problem import Problem
 
 HDF5 = (".hdf5", ".h5", ".hdf")
@@ -122,6 +122,7 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
     InputError
         Another command or another thread holds the lock, or the output cannot be written.
     """
+    require_packages("an output folder", "filelock")
     from filelock import FileLock, Timeout  # The import takes 30 ms; commands that write nothing skip it.
 
     path = check_writable(path, folder)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice, format_html_table, mark_read_only
-from lavender.base.errors import SolveFailed
+from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import lazy_module
 from lavender.base.renamed import build_attribute_error
 from lavender.judge.residuals import Residual, residual
@@ -30,6 +30,7 @@ class Status(str, Enum):
     description: str
 
     def __new__(cls, name: str, description: str) -> Status:
+        """Create the member whose text is its name."""
         member = str.__new__(cls, name)
         member._value_, member.description = name, description
         return member
@@ -158,6 +159,7 @@ class History:
             Horizontal axis.
         """
         check_choice("against", against, ("iterations", "time"))
+        require_packages("History.plot", "matplotlib")
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, require_packages
 from lavender.lab.report.text import format_count
 from lavender.lab.slip import CAUSES, SlipExplanation, average_slip
 
@@ -41,6 +41,7 @@ def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:
     InputError
         There are no explanations, or none has a contact.
     """
+    require_packages("a figure", "matplotlib")
     from matplotlib.figure import Figure
 
     averages = average_slip(explanations)

@@ -485,3 +485,21 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     assert code == cli.EXIT_BAD_INPUT and "no file has a solution" in err
     code, _, err = lavender("check", tmp_path / "done.npz", "--precision", "half")
     assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("import lavender.cli", "the command line needs click, rich: pip install click rich"),
+        ("lv.bench.run(['granularF(n=3)'], ['pgs'])", "a measurement needs joblib: pip install joblib"),
+        ("lv.solve(lcp, 'pgs', history=True).history.plot()", "History.plot needs matplotlib: pip install"),
+        ("lv.suite; print(lv.cross_check(lcp, ['pgs', 'direct']))", "agrees"),
+    ],
+)
+def test_without_packages_a_sentence_names_what_to_install(call, message):
+    names = ["click", "rich", "joblib", "matplotlib", "filelock"]
+    code = f"import sys\nfor name in {names}: sys.modules[name] = None\nimport lavender as lv\n"
+    code += f"lcp = lv.Problem.lcp([[2.0]], [1.0])\n{call}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert message in done.stdout + done.stderr
+    assert "ModuleNotFoundError" not in done.stderr

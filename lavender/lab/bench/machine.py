@@ -19,6 +19,7 @@ from statistics import fmean
 from typing import Any
 
 from lavender._version import __version__
+from lavender.base.errors import require_packages
 from lavender.lab.bench.record import Run
 from lavender_ext.sweep import serial
 
@@ -199,6 +200,7 @@ def describe_build() -> dict[str, str]:
     found |= read_compiler_versions(library.read_bytes())
     flags = sysconfig.get_config_var("CFLAGS")
     found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
+    require_packages("the description of the machine", "threadpoolctl")
     from threadpoolctl import threadpool_info
 
     blas = [f"{i['internal_api']} {i['version']}" for i in threadpool_info() if i.get("user_api") == "blas"]

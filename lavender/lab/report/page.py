@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lavender.base.deadline import format_seconds
+from lavender.base.errors import require_packages
 from lavender.lab.bench import recommendation, statistics
 from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
@@ -34,6 +35,7 @@ MAX_SPREADS = 100  # Spreads of sweep orders on a page: the widest ones.
 @functools.cache
 def create_environment() -> Any:
     """Compile the templates, once."""
+    require_packages("the page of a report", "jinja2")
     import jinja2
 
     environment = jinja2.Environment(

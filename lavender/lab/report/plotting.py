@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from lavender.base.errors import require_packages
 from lavender.io.stored import make_folder, write_figure
 from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.report.figures import Curve, Figure, is_plug_in
@@ -153,6 +154,7 @@ def _shorten_label(text: str, most: int = MAX_TITLE_LENGTH) -> str:
 
 def _create_canvas(size: tuple[float, float], **more: Any) -> Any:
     """Create an empty drawing, `size` in inches, without pyplot and its global state."""
+    require_packages("a figure", "matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 

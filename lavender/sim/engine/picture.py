@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_float, check_int
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, require_packages
 from lavender.io.stored import as_path, write_atomically, write_figure
 from lavender.sim.engine.film import Film
 from lavender.sim.scene.parts import convert_to_rotation_matrix
@@ -192,6 +192,7 @@ class FilmView:
 
 def _write_strip(views: list[FilmView], path: Path, count: int, size: float) -> None:
     """Write a strip of `count` frames per film."""
+    require_packages("a picture", "matplotlib")
     from matplotlib.figure import Figure
 
     height = size * sum(view.height for view in views) + 0.3 * len(views)
@@ -207,6 +208,7 @@ def _write_strip(views: list[FilmView], path: Path, count: int, size: float) -> 
 
 def _write_animation(views: list[FilmView], path: Path, size: float, rate: float) -> None:
     """Write an animation with `rate` [1/s] frames per second of simulated time."""
+    require_packages("a film", "matplotlib")
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
+from lavender.base.errors import require_packages
 from lavender.io.stored import open_step_folder, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import get_sweep_order
@@ -77,6 +78,7 @@ class Trace:
 
     def plot(self, path: str | PathLike[str]) -> None:
         """Write a figure of residuals, contacts with cache matches, and depth over time."""
+        require_packages("a figure of a run", "matplotlib")
         from matplotlib.figure import Figure
 
         canvas = Figure(figsize=(8, 7), layout="constrained")

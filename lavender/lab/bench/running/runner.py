@@ -19,7 +19,7 @@ from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray, check_sequence
-from lavender.base.errors import InputError, LavenderError, reject_former_names
+from lavender.base.errors import InputError, LavenderError, reject_former_names, require_packages
 from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import compute_states
 from lavender.lab import motion
@@ -204,6 +204,7 @@ def run(
         joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a plan
         that measures times, or workers were lost repeatedly.
     """
+    require_packages("a measurement", "joblib", "threadpoolctl")
     check_workers(workers)
     spread = workers != 1 or backend != "loky"
     plan = plan or (CampaignPlan() if spread else Plan())

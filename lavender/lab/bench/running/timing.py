@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.errors import require_packages
 from lavender.base.lazy_import import import_numerics
 from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Solution, Status, raise_if_interrupted
@@ -131,6 +132,7 @@ def _warm_up(solver: str) -> None:
 def _get_thread_pools(solver: str) -> Any:
     """Return the controller of the BLAS and OpenMP libraries that are loaded with a solver."""
     # The search takes some milliseconds: do it once per solver, after its own libraries and SciPy's are loaded.
+    require_packages("a timed measurement", "threadpoolctl")
     from threadpoolctl import ThreadpoolController
 
     import_numerics()

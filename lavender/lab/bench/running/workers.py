@@ -14,7 +14,7 @@ from functools import cache
 from multiprocessing import resource_tracker
 from typing import Any
 
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, require_packages
 
 MAX_WORKERS = 4096  # [processes] More than any machine has cores.
 CALLS_PER_ROUND = 256  # Calls submitted together to a backend that returns only complete lists.
@@ -39,6 +39,7 @@ def map_unordered(
     `backend` is a name that `connect_backend` returned. The iteration ends early, without an exception, if workers
     were lost.
     """
+    require_packages("a measurement by worker processes", "joblib")
     import joblib
 
     lost: tuple[type[BaseException], ...] = (BrokenPipeError, ConnectionError)
