@@ -41,7 +41,7 @@ def count_work(name: str, factor: float) -> dict[str, float]:
 
     from calls import over_velocities  # type: ignore[import-not-found]
     from random_families import drawn, wild  # type: ignore[import-not-found]
-    from random_problems import general, random_general, random_lcp, without_solution  # type: ignore[import-not-found]
+    from random_problems import general, random_generalized_problem, random_lcp, without_solution  # type: ignore[import-not-found]
 
     import lavender as lv
     from benchmarks.core_problems import forms, stacks
@@ -63,7 +63,7 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         "islands of 120 rows": lambda: forms(stacks(4, 10, 0.4, False))["bodies"],
         "band": lambda: Problem.lcp(lv.suite.stack(n=300).problem.csr, lv.suite.stack(n=300).problem.b),
         "stack": lambda: lv.suite.case("box_stackF(n=12, mass_ratio=50)").problem,
-        "soft velocities": lambda: random_general(1, "cone", n=150, compliance=True, contacts=60),
+        "soft velocities": lambda: random_generalized_problem(1, "cone", n=150, compliance=True, contacts=60),
         "many soft velocities": lambda: over_velocities(90, 150, compliance=300.0),
         "loose pile": lambda: pile(5),
         "velocities of a pile": lambda: general(pile(4)),

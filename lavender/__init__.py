@@ -212,4 +212,4 @@ def __dir__() -> list[str]:
 
 for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and the solvers that `auto` runs
     get(_name)  # imported with the package, because the first solve may have a time limit
-lavender.base.early_sigint.restore_handler()
+lavender.base.early_sigint.restore_keyboard_interrupt()

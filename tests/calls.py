@@ -7,7 +7,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from random_problems import random_tree, tree_mass
+from random_problems import random_tree_parents, tree_mass
 
 import lavender as lv
 from lavender import registry
@@ -114,7 +114,7 @@ def sweep_packed(problem, counts, name="sequential_impulses", **options):
 def robot(seed, m=12, n=10, soft=True, number=np.float64):
     """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
     rng = np.random.default_rng(seed)
-    mass = tree_mass(rng, random_tree(rng, n))
+    mass = tree_mass(rng, random_tree_parents(rng, n))
     jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
     jac[:, 0] += 0.3
     compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)

@@ -157,7 +157,7 @@ def shipped(name):
     from lavender.sim.web.compile import explain_missing_requirement
 
     try:
-        return pages.get_module(name=name)
+        return pages.get_or_build_module(name=name)
     except LavenderError as error:
         if not explain_missing_requirement():  # what it is made with is there: it must be made
             raise

@@ -9,19 +9,19 @@ from lavender.contract.problems import (  # noqa: F401 - tests import them from 
     CONTACTS,
     FORMS,
     as_matrix,
-    random_boxes,
+    random_bodies_and_contacts,
+    random_box_friction_contacts,
     random_contact_problem,
-    random_ellipses,
-    random_general,
+    random_ellipse_friction_contacts,
+    random_generalized_problem,
     random_lcp,
-    random_rows,
-    random_tree,
+    random_tree_parents,
 )
 from lavender.contract.problems import as_generalized as general  # noqa: F401
 from lavender.contract.problems import list_ancestors as ancestors  # noqa: F401
 from lavender.contract.problems import make_touching_bodies as touching  # noqa: F401
 from lavender.contract.problems import random_tree_mass as tree_mass  # noqa: F401
-from lavender.contract.problems import random_unit as unit  # noqa: F401
+from lavender.contract.problems import random_unit_vector as unit  # noqa: F401
 from lavender.contract.problems import rotation_matrix as rotation  # noqa: F401
 
 

@@ -176,7 +176,7 @@ def as_array(
         array = _round_to_float64(array)
     array = np.array(array, dtype, order="C") if copy else np.require(array, dtype, ["C", "A", "E"])
     if finite and array.dtype.kind == "f":
-        check_magnitudes(label, array, unit)
+        check_finite_and_in_range(label, array, unit)
     return mark_read_only(array)
 
 
@@ -342,7 +342,7 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         a = a if copy else a.copy()
         a.sum_duplicates()
     data = as_array(name, a.data, (None,), finite=False, copy=False)
-    check_magnitudes(name, data, unit, a)
+    check_finite_and_in_range(name, data, unit, a)
     fields = ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
     arrays = tuple(mark_read_only(np.ascontiguousarray(x, dtype)) for x, dtype in fields)
     return sp.csr_array(arrays, shape=a.shape)
@@ -387,7 +387,7 @@ def _format_index(index: np.ndarray, csr: Any) -> str:
     return ", ".join(map(str, index))
 
 
-def check_magnitudes(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
+def check_finite_and_in_range(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
     """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
     if checks.all_in_valid_range(array.reshape(-1)):
         return
@@ -405,7 +405,7 @@ def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -
     position = checks.find_invalid_magnitude_in_array(flat)
     if position < 0:
         return
-    check_magnitudes(name, array, unit)
+    check_finite_and_in_range(name, array, unit)
     check_not_negative(name, flat)
     index = ", ".join(map(str, np.unravel_index(position, array.shape)))
     raise InputError(

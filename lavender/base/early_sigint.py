@@ -14,7 +14,7 @@ from types import FrameType
 EXIT_INTERRUPTED = 130  # Shells report this status for a command that Ctrl-C ended.
 
 
-def _is_command() -> bool:
+def _is_lavender_command() -> bool:
     """Return whether this process runs the command `lavender`, by any of the ways to start it."""
     program = sys.argv[0] if sys.argv else ""
     if (
@@ -34,19 +34,19 @@ def _exit(number: int, frame: FrameType | None) -> None:
     os._exit(EXIT_INTERRUPTED)  # Nothing has started that would need a clean end.
 
 
-def install_handler() -> None:
+def exit_on_sigint() -> None:
     """Let Ctrl-C end the command at once."""
-    if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if _is_lavender_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         try:
             signal.signal(signal.SIGINT, _exit)
         except ValueError:  # not in the main thread
             return
 
 
-def restore_handler() -> None:
+def restore_keyboard_interrupt() -> None:
     """Let Ctrl-C raise KeyboardInterrupt again."""
     if signal.getsignal(signal.SIGINT) is _exit:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-install_handler()
+exit_on_sigint()

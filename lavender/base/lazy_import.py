@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 __all__ = [
     "import_lock",
     "import_locked",
+    "import_module_lazily",
     "import_numerics",
     "issparse",
     "lapack",
-    "lazy_module",
     "sparse",
     "spatial",
 ]
@@ -76,7 +76,7 @@ else:
     sparse, spatial, lapack = map(_LazyModule, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
 
 
-def lazy_module(name: str) -> Any:
+def import_module_lazily(name: str) -> Any:
     """Return a module of a higher layer, for a method that only calls a function there."""
     return _LazyModule(name)
 

@@ -351,7 +351,7 @@ class Batch(Sequence[Problem]):
             return [self[j] for j in i]
         if self._bodies is not None:
             return self._make_body_problem(i, *self._bodies)
-        jac, mass, free, target, compliance, mu = (self._array_of_world(i, which) for which in range(6))
+        jac, mass, free, target, compliance, mu = (self._get_array_of_world(i, which) for which in range(6))
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
         if mass is None:
             return Problem(target, cones, jac, friction=self.friction, precision=self.precision)
@@ -374,7 +374,7 @@ class Batch(Sequence[Problem]):
             )
         return problem
 
-    def _array_of_world(self, i: int, which: int) -> Any:
+    def _get_array_of_world(self, i: int, which: int) -> Any:
         """Return an array of world i (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
         offsets = self.at[i]
         m, nv, k = (int(offsets[PLACE[name]]) for name in ("rows", "velocities", "blocks"))

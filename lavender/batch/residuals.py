@@ -332,7 +332,7 @@ def residual_many(
         starts: Any = worlds.flatten_impulses("impulses", impulses)
         precisions = len(worlds) * [worlds.precision if precision is None else precision]
     else:
-        starts = check_impulses(worlds, impulses)
+        starts = convert_impulses_or_guesses(worlds, impulses)
         for i, start in enumerate(starts):
             if start is None:
                 raise InputError(
@@ -369,7 +369,7 @@ def check_problems(problems: Any, errors: str) -> Any:
     return problems
 
 
-def check_impulses(problems: Any, impulses: Any) -> list[Any]:
+def convert_impulses_or_guesses(problems: Any, impulses: Any) -> list[Any]:
     """Convert the impulses (m,) [N s] of each problem; its guess replaces None."""
     impulses = check_sequence("impulses", impulses, "(m,), one for each problem,")
     if len(impulses) != len(problems):

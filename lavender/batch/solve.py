@@ -16,7 +16,7 @@ from lavender.base.arrays import FloatArray, check_float, check_int, mark_read_o
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
-from lavender.batch.residuals import Many, check_impulses, check_problems, residual_many
+from lavender.batch.residuals import Many, check_problems, convert_impulses_or_guesses, residual_many
 from lavender.judge.residuals import judge_impulse, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
@@ -182,7 +182,7 @@ class Solutions(Many, Sequence[Solution]):
         self._impulse[self._get_rows(i)] = solution.impulse
         self._late_worlds.append(i)
 
-    def mark_as_late(self, i: int) -> None:
+    def store_late_start(self, i: int) -> None:
         """Store the start of a late world of a batch. Its problem is built when its numbers are read."""
         if self._cold:
             self._impulse[self._get_rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
@@ -368,10 +368,10 @@ def solve_many(
     threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), check_time_limit(time_limit)
     if velocity_tol is not None:
-        tol = _tolerance_for_velocity(worlds, velocity_tol)
+        tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
-    starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
+    starts, invalid_starts = _convert_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
@@ -401,7 +401,7 @@ def solve_many(
             isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
         )
         if is_further_world and deadline.passed():
-            solutions.mark_as_late(i)
+            solutions.store_late_start(i)
             return
         problem, start = worlds[i], solutions.get_start(i)
         has_failed = solutions._worlds.code[i] == CODE["tried"]
@@ -429,11 +429,11 @@ def solve_many(
     solutions.clear_invalid()
     solutions._time_per_world = (perf_counter() - begin) / max(1, len(worlds))
     if not isinstance(worlds, Batch):
-        solutions._worlds.remember(solutions._data)
+        solutions._worlds.store_zero_residuals(solutions._data)
     return solutions
 
 
-def _tolerance_for_velocity(worlds: Any, velocity_tol: float) -> float:
+def _compute_tolerance_for_velocity_error(worlds: Any, velocity_tol: float) -> float:
     """Return the relative residual that guarantees a velocity error [m/s] in every valid world."""
     velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if isinstance(worlds, Batch):
@@ -445,7 +445,7 @@ def _tolerance_for_velocity(worlds: Any, velocity_tol: float) -> float:
     return min(velocity_tol / largest, MAX_VELOCITY_TOLERANCE) if largest > 0.0 else MAX_VELOCITY_TOLERANCE
 
 
-def _check_starts(
+def _convert_starts(
     worlds: Any, impulse: Any, impulses: Any, errors: str
 ) -> tuple[Any, dict[int, LavenderError]]:
     """Convert the starts of all worlds.
@@ -486,5 +486,5 @@ def _check_starts(
         return flat, invalid
     if impulse is not None:
         raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
-    starts = [p.guess for p in worlds] if impulses is None else check_impulses(worlds, impulses)
+    starts = [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
     return [x if x is None or is_valid(i, x) else None for i, x in enumerate(starts)], invalid

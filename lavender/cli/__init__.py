@@ -7,7 +7,7 @@ import sys
 
 from lavender.base import early_sigint as _early_sigint
 
-_early_sigint.install_handler()  # `main` restores the handler.
+_early_sigint.exit_on_sigint()  # `main` restores the handler.
 
 from lavender.base.errors import InputError, require_packages  # noqa: E402
 

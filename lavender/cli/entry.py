@@ -91,7 +91,7 @@ def main(args: Sequence[str] | None = None) -> None:
     SIGTERM, which `timeout` and batch queues send, stops a command as Ctrl-C does and exits with 143; a second SIGTERM
     ends the process at once.
     """
-    _early_sigint.restore_handler()
+    _early_sigint.restore_keyboard_interrupt()
     with _record_signals() as received:
         try:
             code = _run_command(args)

@@ -13,8 +13,8 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    convert_to_bytes,
-    exit_stopped,
+    convert_gigabytes_to_bytes,
+    exit_after_interrupt,
     ignore_closed_output,
     is_option_set,
     limit_to_one_thread,
@@ -63,7 +63,7 @@ class Measured:
         return sum(not skip.solver for skip in self.records.skips)
 
 
-def check_named_problems(items: Sequence[Item]) -> None:
+def check_named_problems_load(items: Sequence[Item]) -> None:
     """Load each named problem and release its memory.
 
     Raises
@@ -134,7 +134,7 @@ def measure_files(
         items = bench.resolve_sources(names, options["sequence"])
         if is_option_set(context, "sequence_time_limit") and not any(item.sequence for item in items):
             raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
-        check_named_problems(items)
+        check_named_problems_load(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         measured: list[Records] = []
         with show_progress() as bar:
@@ -149,7 +149,7 @@ def measure_files(
                 common: dict[str, Any] = {
                     "watch": show_event,
                     "reuse": not options["no_reuse"],
-                    "memory": convert_to_bytes(options["memory"]),
+                    "memory": convert_gigabytes_to_bytes(options["memory"]),
                 }
                 bench.run(items, options["solvers"], plan, store, into=measured, **common, **more)
                 if not campaign:
@@ -192,7 +192,7 @@ def show_page(page: SummaryPage, folder: Path) -> None:
         page.print_short(make_console())
         print_escaped(f"\npage: {path}")
     if page.stopped:
-        exit_stopped()
+        exit_after_interrupt()
 
 
 @contextlib.contextmanager
@@ -220,7 +220,7 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
             task,
             completed=event.done,
             total=event.total or None,
-            remaining=format_remaining(event, time.monotonic() - began),
+            remaining=format_remaining_time(event, time.monotonic() - began),
             what=_format_event(event),
         )
 
@@ -235,14 +235,14 @@ def _print_progress_lines() -> Callable[[Event], None]:
         if now - printed >= PROGRESS_INTERVAL:
             printed = now
             count = f"{event.done} of {event.total}, " if event.total else ""
-            remaining = format_remaining(event, now - began)
+            remaining = format_remaining_time(event, now - began)
             remaining = f", {remaining}" if remaining else ""
             click.echo(f"{count}{now - began:.0f} s{remaining}: {_format_event(event)}", err=True)
 
     return show_event
 
 
-def format_remaining(event: Event, elapsed: float) -> str:
+def format_remaining_time(event: Event, elapsed: float) -> str:
     """Return a phrase such as "about 40 s remain" after `elapsed` seconds; empty if nothing is known yet."""
     remaining = event.remaining
     if remaining is None:

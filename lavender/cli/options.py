@@ -68,13 +68,13 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _is_order(word: str) -> bool:
+def _is_order_name(word: str) -> bool:
     from lavender.problem.ordering import SWEEP_ORDERS
 
     return word.partition(":")[0] in SWEEP_ORDERS
 
 
-def _is_solver(word: str) -> bool:
+def _is_solver_name(word: str) -> bool:
     from lavender.lab import suite
     from lavender.solvers import registry
 
@@ -93,8 +93,8 @@ class MultiValueCommand(click.Command):
         "--velocity-tolerances": _is_number,
         "--budgets": _is_number,
         "--time-budgets": _is_number,
-        "--solvers": _is_solver,
-        "--orders": _is_order,
+        "--solvers": _is_solver_name,
+        "--orders": _is_order_name,
     }
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -248,7 +248,7 @@ def reject_options_without_effect(context: click.Context, solvers: Sequence[str]
     UnknownName
         A solver does not exist.
     """
-    from lavender.lab.bench.running.runner import is_foreign
+    from lavender.lab.bench.running.runner import is_third_party_solver
     from lavender.solvers import registry
 
     if not solvers:
@@ -258,7 +258,7 @@ def reject_options_without_effect(context: click.Context, solvers: Sequence[str]
         reject_unused_options(context, ["budgets"], "on solvers that cannot stop after any iteration")
     if not any(s.order and not s.exact for s in specs):
         reject_unused_options(context, ["orders"], "on solvers that take no order")
-    if not any(map(is_foreign, specs)):
+    if not any(map(is_third_party_solver, specs)):
         reject_unused_options(context, ["memory"], "if no solver of another package runs")
 
 
@@ -314,7 +314,7 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 plan_options = add_options([((name,), more) for name, more in PLAN_OPTIONS])
 
 
-def convert_to_bytes(gigabytes: float | None) -> int | None:
+def convert_gigabytes_to_bytes(gigabytes: float | None) -> int | None:
     """Return the bytes of an option in GB.
 
     Raises
@@ -348,7 +348,7 @@ def print_escaped(text: str, err: bool = False, style: str = "") -> None:
         click.echo(escape_unprintable(text, lines=True), err=err)
 
 
-def exit_stopped() -> NoReturn:
+def exit_after_interrupt() -> NoReturn:
     """Exit a command after Ctrl-C, once the completed part is written."""
     print_escaped("Stopped: the results are those of the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)

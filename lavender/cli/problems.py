@@ -81,7 +81,7 @@ def problems(
     for line in missing if check or out is not None else ():
         click.echo(f"left out: {line}", err=True)
     if check:
-        wrong = list(collection.find_changes(here))
+        wrong = list(collection.find_changed_problems(here))
         for line in wrong:
             click.echo(line)
         click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")

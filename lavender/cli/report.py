@@ -101,7 +101,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
     from lavender.lab.report.engine import read_engine_answers
     from lavender.lab.report.findings import Report
     from lavender.lab.report.terminal import print_report
-    from lavender.lab.report.text import format_count, list_reasons
+    from lavender.lab.report.text import format_count, list_skip_reasons
     from lavender.lab.report.write import write
 
     for limit in options["time_budgets"]:
@@ -146,7 +146,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (records_files or measured.records.records):
         print_escaped(
-            f"nothing was measured: {'; '.join(list_reasons(measured.records.skips))}", style="yellow"
+            f"nothing was measured: {'; '.join(list_skip_reasons(measured.records.skips))}", style="yellow"
         )
         raise click.exceptions.Exit(EXIT_UNMET)
     if measured.n_cases_not_loaded and not records_files:

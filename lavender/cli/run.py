@@ -13,7 +13,7 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     PATH,
-    exit_stopped,
+    exit_after_interrupt,
     ignore_closed_output,
     parse_parameters,
     print_escaped,
@@ -160,7 +160,7 @@ def run(
         f"{result.scene}: {len(result)} steps, {result.time[-1]:.3f} s, {result.method}, {best:.3g} ms per step at best"
     )
     if result.stopped:
-        exit_stopped()
+        exit_after_interrupt()
 
 
 def _collect_parameters(

@@ -23,10 +23,10 @@ from lavender.contract.problems import (
     CONTACTS,
     FORMS,
     as_matrix,
-    change_numbers,
+    make_problem_with_other_numbers,
     make_touching_bodies,
     random_contact_problem,
-    random_general,
+    random_generalized_problem,
 )
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import residual
@@ -161,7 +161,7 @@ def make_well_posed_problems(spec: SolverSpec) -> Iterator[Problem]:
                 yield problem
 
 
-def _first_problem(spec: SolverSpec) -> Problem:
+def _make_first_well_posed_problem(spec: SolverSpec) -> Problem:
     """Return the first well-posed problem that a solver accepts."""
     for problem in make_well_posed_problems(spec):
         return problem
@@ -182,7 +182,7 @@ def make_problems_of_every_kind() -> dict[tuple[str, str], tuple[list[Problem], 
         soft = _add_compliance(base, 0.3)
         problems[law, kind] = [convert(soft) for convert in FORMS.values()]
     for tangents in (3, 4, 5):
-        base = random_general(tangents, "cone", n=12, contacts=4, tangents=tangents)
+        base = random_generalized_problem(tangents, "cone", n=12, contacts=4, tangents=tangents)
         problems["cone", f"round, {tangents} tangents"] = [base, as_matrix(base)]
     result = {}
     for key, forms in problems.items():
@@ -325,7 +325,7 @@ def require_forms_agree(spec: SolverSpec) -> None:
 @_register("all solvers")
 def require_unknown_options_are_rejected(spec: SolverSpec) -> None:
     """Require that an option that the solver does not have raises an error that names it."""
-    problem = _first_problem(spec)
+    problem = _make_first_well_posed_problem(spec)
     unavailable: list[tuple[dict[str, Any], type[LavenderError], str]] = [
         ({"no_such_option": 1}, UnknownName, "no_such_option")
     ]
@@ -438,7 +438,7 @@ def _run_in_parts(
 @_register("solvers with `resumable`", lambda spec: spec.resumable)
 def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     """Require that a time limit ends a long solve with TIME_LIMIT and at least one iteration."""
-    problem = _first_problem(spec)
+    problem = _make_first_well_posed_problem(spec)
     solve(problem, spec.name, max_iter=1)  # Its imports do not count.
     solution = solve(problem, spec.name, tol=0.0, max_iter=2**31 - 1, time_limit=0.05)
     _raise_unless(
@@ -451,7 +451,7 @@ def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
 @_register("solvers with `history`", lambda spec: spec.history and not spec.delegates)
 def require_history_at_fixed_counts(spec: SolverSpec) -> None:
     """Require that a history records the residual at fixed iteration counts and does not change the result."""
-    problem = _first_problem(spec)
+    problem = _make_first_well_posed_problem(spec)
     solution = solve(problem, spec.name, history=True, tol=0.0, max_iter=40)
     history = solution.history
     assert history is not None
@@ -478,7 +478,7 @@ def require_history_at_fixed_counts(spec: SolverSpec) -> None:
 @_register("solvers with `callback`", lambda spec: spec.callback)
 def require_callback_may_stop(spec: SolverSpec) -> None:
     """Require that a callback receives copies of the iterates and can stop the solve."""
-    problem, counts = _first_problem(spec), []
+    problem, counts = _make_first_well_posed_problem(spec), []
 
     def callback(n: int, impulse: FloatArray, _: Any) -> bool:
         counts.append(n)
@@ -553,7 +553,7 @@ def require_orders_change_the_sweep(spec: SolverSpec) -> None:
     """Require that each order sweeps differently and all orders lead to a solution."""
     problem = next((p for p in make_well_posed_problems(spec) if p.law != "coulomb"), None)
     if problem is None:
-        problem = _first_problem(spec)
+        problem = _make_first_well_posed_problem(spec)
     early: dict[bytes, str] = {}
     for order in ("given", "reverse", "random", "colored"):
         solution = solve(problem, spec.name, order=order, tol=1e-10, max_iter=MIN_BUDGET)
@@ -573,7 +573,7 @@ def require_orders_change_the_sweep(spec: SolverSpec) -> None:
 @_register("solvers with `seed`", lambda spec: spec.seed)
 def require_seeds_change_random_sweeps(spec: SolverSpec) -> None:
     """Require that equal seeds give equal bits and different seeds give different random sweeps."""
-    problem = _first_problem(spec)
+    problem = _make_first_well_posed_problem(spec)
     first, same, other = (
         solve(problem, spec.name, order="random", seed=seed, tol=0.0, max_iter=2).impulse.tobytes()
         for seed in (1, 1, 2)
@@ -618,7 +618,7 @@ def require_update_equals_prepare(spec: SolverSpec) -> None:
     """Require that `update` to new numbers gives the bits of a new `prepare`."""
     options = _make_short_options(spec)
     for problem in make_well_posed_problems(spec):
-        changed = change_numbers(problem)
+        changed = make_problem_with_other_numbers(problem)
         if spec.refuses(changed) is not None:
             continue
         prepared = prepare(changed, spec.name)

@@ -22,18 +22,18 @@ __all__ = [
     "FORMS",
     "as_generalized",
     "as_matrix",
-    "change_numbers",
     "list_ancestors",
+    "make_problem_with_other_numbers",
     "make_touching_bodies",
-    "random_boxes",
+    "random_bodies_and_contacts",
+    "random_box_friction_contacts",
     "random_contact_problem",
-    "random_ellipses",
-    "random_general",
+    "random_ellipse_friction_contacts",
+    "random_generalized_problem",
     "random_lcp",
-    "random_rows",
-    "random_tree",
     "random_tree_mass",
-    "random_unit",
+    "random_tree_parents",
+    "random_unit_vector",
     "rotation_matrix",
 ]
 
@@ -50,18 +50,20 @@ def rotation_matrix(q: FloatArray) -> FloatArray:
     )
 
 
-def random_unit(rng: np.random.Generator, n: int = 3) -> FloatArray:
+def random_unit_vector(rng: np.random.Generator, n: int = 3) -> FloatArray:
     """Draw a direction of n dimensions."""
     x = rng.normal(size=n)
     return x / np.linalg.norm(x)
 
 
-def random_rows(rng: np.random.Generator, bodies: int = 5, joints: int = 3, contacts: int = 8) -> Rows:
+def random_bodies_and_contacts(
+    rng: np.random.Generator, bodies: int = 5, joints: int = 3, contacts: int = 8
+) -> Rows:
     """Draw bodies of different masses, joints of 1 to 3 rows (some angular), and contacts; some touch the ground."""
     mass = rng.uniform(0.5, 3.0, bodies)
     inertia = [
         r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m
-        for m, r in zip(mass, (rotation_matrix(random_unit(rng, 4)) for _ in mass), strict=True)
+        for m, r in zip(mass, (rotation_matrix(random_unit_vector(rng, 4)) for _ in mass), strict=True)
     ]
 
     def draw_pair() -> tuple[int, int]:
@@ -75,8 +77,8 @@ def random_rows(rng: np.random.Generator, bodies: int = 5, joints: int = 3, cont
     if joints:
         jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0  # angular rows
     jac[np.repeat(joint_body[:, 0], sizes) < 0, :6] = 0.0
-    normal = np.array([random_unit(rng) for _ in range(contacts)]).reshape(-1, 3)
-    tangent = np.array([np.cross(n, random_unit(rng)) for n in normal]).reshape(-1, 3)
+    normal = np.array([random_unit_vector(rng) for _ in range(contacts)]).reshape(-1, 3)
+    tangent = np.array([np.cross(n, random_unit_vector(rng)) for n in normal]).reshape(-1, 3)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return Rows(
         inv_mass=1.0 / mass,
@@ -115,10 +117,10 @@ def random_contact_problem(
 ) -> Problem:
     """Draw a problem of bodies with free and bounded joint rows and contacts; without `tangents`, 0, 1 and 2 are mixed.
 
-    `sizes` are the numbers of `random_rows`.
+    `sizes` are the numbers of `random_bodies_and_contacts`.
     """
     rng = np.random.default_rng(seed)
-    rows = random_rows(rng, **sizes)
+    rows = random_bodies_and_contacts(rng, **sizes)
     count: Any = 2 if rolling else tangents
     c, mj = rows.n_contacts, len(rows.jac)
     if count is None:
@@ -163,7 +165,7 @@ def as_generalized(problem: Problem) -> Problem:
     )  # fmt: skip
 
 
-def random_boxes(seed: int, friction: str = "coulomb", **sizes: Any) -> Problem:
+def random_box_friction_contacts(seed: int, friction: str = "coulomb", **sizes: Any) -> Problem:
     """Draw joints, and contacts that bound each tangent separately; most have two coefficients."""
     base = random_contact_problem(seed, friction, tangents=2, spin=False, **sizes)
     c, rng = base.cones.shaped("box"), np.random.default_rng(seed + 7)
@@ -171,9 +173,9 @@ def random_boxes(seed: int, friction: str = "coulomb", **sizes: Any) -> Problem:
     return replace(base, cones=replace(c, patch_radius=radius))
 
 
-def random_ellipses(seed: int, friction: str = "coulomb", **sizes: Any) -> Problem:
-    """Draw the problem of `random_boxes` with an ellipse instead of each box."""
-    base = random_boxes(seed, friction, **sizes)
+def random_ellipse_friction_contacts(seed: int, friction: str = "coulomb", **sizes: Any) -> Problem:
+    """Draw the problem of `random_box_friction_contacts` with an ellipse instead of each box."""
+    base = random_box_friction_contacts(seed, friction, **sizes)
     c = base.cones
     return replace(base, cones=replace(c, kind=np.where(c.kind == CONTACT_BOX, CONTACT_ELLIPSE, c.kind)))
 
@@ -190,12 +192,12 @@ CONTACTS: dict[str, Callable[..., Problem]] = {
     "spin": random_contact_problem,
     "rolling": partial(random_contact_problem, spin=False, rolling=True),
     "rolling and spin": partial(random_contact_problem, rolling=True),
-    "boxes": random_boxes,
-    "ellipses": random_ellipses,
+    "boxes": random_box_friction_contacts,
+    "ellipses": random_ellipse_friction_contacts,
 }
 
 
-def change_numbers(problem: Problem) -> Problem:
+def make_problem_with_other_numbers(problem: Problem) -> Problem:
     """Return a problem of the same structure with other numbers, bounds and coefficients."""
     cones = problem.cones
     fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == ROW)
@@ -219,7 +221,7 @@ def random_lcp(seed: int, m: int = 12, rank: int | None = None, boxed: bool = Tr
 # -- generalized coordinates: kinematic trees, their mass matrices, rows on chains ------------------------
 
 
-def random_tree(rng: np.random.Generator, n: int) -> list[int]:
+def random_tree_parents(rng: np.random.Generator, n: int) -> list[int]:
     """Draw the parent of each of n velocities, -1 at a root; a parent precedes its children. About three trees."""
     return [-1 if i == 0 or rng.random() < 3.0 / n else int(rng.integers(0, i)) for i in range(n)]
 
@@ -245,7 +247,7 @@ def list_ancestors(parent: Sequence[int], i: int) -> list[int]:
     return chain
 
 
-def random_general(
+def random_generalized_problem(
     seed: int,
     friction: str = "cone",
     n: int = 14,
@@ -256,7 +258,7 @@ def random_general(
 ) -> Problem:
     """Draw J and M of a random forest with free and bounded rows and contacts, each row on one or two chains."""
     rng = np.random.default_rng(seed)
-    parent = random_tree(rng, n)
+    parent = random_tree_parents(rng, n)
     cones = Cones.free(2) + Cones.bounded(np.array([0.0, -0.3]), np.array([np.inf, 0.3]))
     radius: dict[str, Any] = {"patch_radius": rng.uniform(0.0, 0.4, contacts)} if spin else {}
     if contacts:

@@ -9,7 +9,7 @@ from pathlib import Path
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.export.amalgamate import ExtractionError, amalgamate, hash_sources
-from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes
+from lavender.io.stored import check_writable, load_or_make_file, make_folder, write_bytes
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
@@ -38,7 +38,9 @@ def source() -> str:
                 "install a wheel, or Cython"
             ) from None
 
-    return load_or_make(HERE / "c" / "lavender.c", lambda text: current_hash in text[:1000], make).decode()
+    return load_or_make_file(
+        HERE / "c" / "lavender.c", lambda text: current_hash in text[:1000], make
+    ).decode()
 
 
 def _collect_existing_files(folder: Path) -> Iterator[Path]:

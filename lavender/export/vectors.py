@@ -79,19 +79,19 @@ class Step:
     tol: float
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def option_integers(self) -> tuple[int, ...]:
+    def get_option_integers(self) -> tuple[int, ...]:
         """Return the integers of `lav_options` without the seed: method, order, memory, sweep, convex, keeps."""
         return (METHODS[self.solver], *encode_options(self.solver, self.options)[0])
 
     def to_bytes(self) -> bytes:
         """Return the step in the format of check.c."""
         omega = encode_options(self.solver, self.options)[1]
-        return struct.pack("<7qdqd", *self.option_integers(), 0, omega, self.iterations, self.tol)
+        return struct.pack("<7qdqd", *self.get_option_integers(), 0, omega, self.iterations, self.tol)
 
     def as_c_initialiser(self) -> str:
         """Return options and budget as a C initialiser."""
         integers, omega = (
-            ", ".join(map(str, self.option_integers()[1:])),
+            ", ".join(map(str, self.get_option_integers()[1:])),
             encode_options(self.solver, self.options)[1],
         )
         options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {integers}, 0, {omega!r}"
@@ -137,7 +137,7 @@ def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict
     InputError
         The records or the library do not have the solver, or none of the problems can be loaded.
     """
-    records = statistics.drop_idle_cases(
+    records = statistics.drop_cases_solved_at_zero(
         read_records(path).select_latest_run()
     )  # The records by which the report recommends.
     measured = _select_records(records, solver)
@@ -158,7 +158,7 @@ def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict
             continue
         packed.append(vector)
         for step in ran:
-            key = step.option_integers()
+            key = step.get_option_integers()
             count = step.iterations if record.solver == "auto" else min(step.iterations, longest)
             steps[key] = replace(step, iterations=max(count, steps[key].iterations if key in steps else 1))
     if not packed:

@@ -133,8 +133,8 @@ class _ScaledProblem:
     sigma: float
 
     @classmethod
-    def from_problem(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _ScaledProblem:
-        """Scale a problem; `assume` also removes rows that are far from leaving their bound."""
+    def from_problem(cls, problem: Problem, unit_diagonal: bool, fix_far_rows: bool) -> _ScaledProblem:
+        """Scale a problem; `fix_far_rows` also fixes rows that are far from leaving their bound."""
         c = problem.cones
         known = (c.lower == c.upper) & np.isfinite(c.lower)
         fixed = np.where(known, c.lower, 0.0)
@@ -148,8 +148,8 @@ class _ScaledProblem:
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
         known[c.friction_rows] = c.friction_coefficient[c.friction_rows] == 0.0
-        sigma, assumed = _compute_scale(problem), np.zeros(0, np.intp)
-        if assume:
+        sigma, assumed = _compute_energy_scale(problem), np.zeros(0, np.intp)
+        if fix_far_rows:
             threshold = MAX_SCALED_PROGRAM_RHS if problem.has_singular_program else MAX_SCALED_RHS
             assumed, bounds = _find_far_rows(problem, sigma, threshold)
             assumed, bounds = assumed[~known[assumed]], bounds[~known[assumed]]
@@ -339,7 +339,7 @@ class QP(_ScaledProblem):
         return x, zeta, xi
 
 
-def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
+def choose_program_form(problem: Problem, form: str, definite: bool = False) -> str:
     """Choose the form of the program, "impulse" or "velocity".
 
     Parameters
@@ -383,7 +383,7 @@ def compute_backend_tolerance(problem: Problem, tol: float) -> float:
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
     energy, velocity = get_reference(problem)
-    sigma = _compute_scale(problem)
+    sigma = _compute_energy_scale(problem)
     limits = [
         start / (size * sigma)
         for start, size in (
@@ -396,7 +396,7 @@ def compute_backend_tolerance(problem: Problem, tol: float) -> float:
 
 
 def build_impulse_form(
-    problem: Problem, *, unit_diagonal: bool = True, equality: bool = False, assume: bool = False
+    problem: Problem, *, unit_diagonal: bool = True, equality: bool = False, fix_far_rows: bool = False
 ) -> QP:
     """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
 
@@ -407,10 +407,10 @@ def build_impulse_form(
         Scale by D^-1/2; otherwise by one number, so that P is A in other units.
     equality : bool
         Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
-    assume : bool
+    fix_far_rows : bool
         Remove rows that are far from leaving their bound.
     """
-    scaled = _ScaledProblem.from_problem(problem, unit_diagonal, assume)
+    scaled = _ScaledProblem.from_problem(problem, unit_diagonal, fix_far_rows)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     a = problem.csr
     scale = sp.diags_array(root)
@@ -454,10 +454,13 @@ def build_impulse_form(
     )
 
 
-def build_velocity_form(problem: Problem, *, assume: bool = False) -> QP:
-    """Build the mass-scaled velocity form of a problem with rows; `assume` as for `build_impulse_form`."""
+def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
+    """Build the mass-scaled velocity form of a problem with rows.
+
+    The parameter `fix_far_rows` is described at `build_impulse_form`.
+    """
     form = problem.velocity_form()
-    scaled = _ScaledProblem.from_problem(problem, True, assume)
+    scaled = _ScaledProblem.from_problem(problem, True, fix_far_rows)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     k = len(unknown)
     # K~ = [K, theta^1/2]
@@ -587,9 +590,12 @@ class ProgramQP(QP):
         return scaled[self.unknown_rows[: self.n_x]], self.signs * scaled[self.general], xi
 
 
-def build_program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
-    """Write a quadratic program with a singular P in the units of its problem; `assume` as in `build_impulse_form`."""
-    scaled, qp = _ScaledProblem.from_problem(problem, True, assume), problem.qp
+def build_program_form(problem: Problem, *, fix_far_rows: bool = False) -> ProgramQP:
+    """Write a quadratic program with a singular P in the units of its problem.
+
+    The parameter `fix_far_rows` is described at `build_impulse_form`.
+    """
+    scaled, qp = _ScaledProblem.from_problem(problem, True, fix_far_rows), problem.qp
     unknown, n = scaled.unknown_rows, len(qp.q)
     n_x = int(np.searchsorted(unknown, n))
     # One unit for all variables and one for all rows, because backends balance rows and columns themselves. With rows
@@ -731,7 +737,7 @@ def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[In
     return rows, np.where(is_far_friction, 0.0, bound)[rows]
 
 
-def _compute_scale(problem: Problem) -> float:
+def _compute_energy_scale(problem: Problem) -> float:
     """Compute sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) [J^1/2]; 1 if it is 0 or not finite."""
     energy, velocity = get_reference(problem)
     if problem.has_singular_program:

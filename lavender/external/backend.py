@@ -20,8 +20,8 @@ from lavender.external.running import (
     Call,
     Limits,
     capture_backend_output,
-    check_iterate,
     clamp_tolerance,
+    keep_if_infeasibility_certificate,
 )
 from lavender.judge.solution import Status
 
@@ -150,7 +150,9 @@ def _call_through_qpsolvers(
     message = status_text or warning or _describe_result(solution.found, x)
     if backend.settings is None:
         message += ", at its own tolerance"
-    direction, contradiction = check_iterate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
+    direction, contradiction = (
+        keep_if_infeasibility_certificate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
+    )
     return Answer(
         status=status,
         message=message,

@@ -89,9 +89,9 @@ class Foreign(Solver):
         try:
             claim = self._call_method("run", state.state, iterate, max_iter, tol, time_limit)
         except KeyboardInterrupt:
-            _copy_back(iterate, impulse)
+            _copy_iterate_to_impulse(iterate, impulse)
             raise
-        is_valid = _copy_back(iterate, impulse)
+        is_valid = _copy_iterate_to_impulse(iterate, impulse)
         error = (
             ""
             if is_valid
@@ -173,7 +173,7 @@ class State:
         return float(value) if isinstance(value, (int, float, np.number)) and value > 0.0 else math.nan
 
 
-def _copy_back(iterate: FloatArray, impulse: FloatArray) -> bool:
+def _copy_iterate_to_impulse(iterate: FloatArray, impulse: FloatArray) -> bool:
     """Copy an iterate to `impulse` if it still has the same shape and dtype; return whether it has."""
     is_valid = iterate.shape == impulse.shape and iterate.dtype == impulse.dtype
     if is_valid:

@@ -20,10 +20,10 @@ from lavender.external.running import (
     Answer,
     Limits,
     capture_backend_output,
-    check_iterate,
     clamp_tolerance,
     copy_certificate,
-    set_options,
+    keep_if_infeasibility_certificate,
+    set_backend_options,
 )
 from lavender.judge.solution import Status
 
@@ -59,7 +59,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     settings.reduced_tol_gap_rel = limit.gap_relative
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
-    set_options(settings, extra, "clarabel")
+    set_backend_options(settings, extra, "clarabel")
     solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, stacked, rhs, cones, settings)
     result = solver.solve()
     name = str(result.status)
@@ -78,7 +78,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
     xi = merge_bound_multipliers(qp, z[first:])
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
-    if almost and any(part is not None for part in check_iterate(qp, x, zeta)):
+    if almost and any(part is not None for part in keep_if_infeasibility_certificate(qp, x, zeta)):
         status = Status.INFEASIBLE  # its own test is stricter than the certificate needs
     # One factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
@@ -133,7 +133,7 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     }
     multipliers = np.asarray(info["lam"])
     k = len(lb)
-    direction, contradiction = check_iterate(qp, np.asarray(x), multipliers[k:])
+    direction, contradiction = keep_if_infeasibility_certificate(qp, np.asarray(x), multipliers[k:])
     return Answer(
         status=status.get(int(flag), Status.NUMERICAL_ERROR),
         message=f"{message} (exit flag {flag})",
@@ -147,7 +147,7 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
 
 
 @cache
-def _print_banner() -> None:
+def _discard_highs_banner() -> None:
     """Create the first HiGHS object of a process, which always prints a banner to standard output, and discard it."""
     import highspy
 
@@ -178,7 +178,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
         lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
         lp.row_lower_, lp.row_upper_ = low, high
-    _print_banner()
+    _discard_highs_banner()
     solver: Any = highspy.Highs()  # type: ignore[no-untyped-call]
     settings: dict[str, Any] = {
         "output_flag": False,
@@ -217,7 +217,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
 
 
 @cache
-def _get_algebra() -> str:
+def _get_osqp_algebra() -> str:
     """Return the default algebra of OSQP.
 
     Without it, every `osqp.OSQP()` searches the modules of two other algebras. This takes 0.2 ms and import locks,
@@ -238,7 +238,7 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     import osqp
 
     rows, low, high = make_two_sided_rows(qp, True)
-    solver = osqp.OSQP(algebra=_get_algebra())
+    solver = osqp.OSQP(algebra=_get_osqp_algebra())
     settings = {
         "eps_abs": limit.eps,
         "eps_rel": 0.0,
@@ -315,7 +315,7 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     settings.max_iter = settings.inner_max_iter = max(limit.max_iter, 1)
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
-    set_options(settings, extra, "qpalm")
+    set_backend_options(settings, extra, "qpalm")
     solver = qpalm.Solver(data, settings)
     x, zeta, xi = qp.make_start(impulse)
     solver.warm_start(x, np.concatenate([zeta, xi])[: len(low)])

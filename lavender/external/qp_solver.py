@@ -17,11 +17,11 @@ from lavender.external.as_qp import (
     build_impulse_form,
     build_program_form,
     build_velocity_form,
-    choose_form,
+    choose_program_form,
 )
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
-from lavender.external.running import call_until_accepted
+from lavender.external.running import call_backend_until_accepted
 from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
@@ -64,14 +64,14 @@ class QPSolver(Solver):
     def prepare(self, problem: Problem) -> QP:
         return self._build_program(problem, True)
 
-    def _build_program(self, problem: Problem, assume: bool) -> QP:
+    def _build_program(self, problem: Problem, fix_far_rows: bool) -> QP:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
         b = self.backend
         qp: QP | None = None
         if problem.has_singular_program:
-            qp = build_program_form(problem, assume=assume)
-        elif choose_form(problem, self.form, b.definite) == "velocity":
-            qp = build_velocity_form(problem, assume=assume)
+            qp = build_program_form(problem, fix_far_rows=fix_far_rows)
+        elif choose_program_form(problem, self.form, b.definite) == "velocity":
+            qp = build_velocity_form(problem, fix_far_rows=fix_far_rows)
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
             qp = None
         if qp is None:
@@ -79,7 +79,7 @@ class QPSolver(Solver):
                 problem,
                 unit_diagonal=self.unit_diagonal,
                 equality=b.linear == "equality" and problem.cones.is_free,
-                assume=assume,
+                fix_far_rows=fix_far_rows,
             )
         if len(qp.unknown_rows) and qp.is_bounds_only and not b.linear:
             raise CapabilityError(
@@ -110,7 +110,7 @@ class QPSolver(Solver):
             return Claim(Status.NUMERICAL_ERROR, 0, no_work, message, qp.form)
         isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
         deadline, start = Deadline(time_limit), impulse.copy()
-        claim = call_until_accepted(
+        claim = call_backend_until_accepted(
             qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy
         )
         if (
@@ -122,7 +122,7 @@ class QPSolver(Solver):
             remaining = max(1, max_iter - first_claim.iterations)
             qp = self._build_program(qp.problem, False)
             call = isolated or b.run
-            claim = call_until_accepted(
+            claim = call_backend_until_accepted(
                 qp, impulse, call, remaining, tol, deadline.remaining(), self.settings, b.noisy
             )
             work = sum_work((first_claim.work, claim.work))

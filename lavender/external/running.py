@@ -97,7 +97,7 @@ def clamp_tolerance(tolerance: float, minimum: float) -> float:
     return min(max(tolerance, minimum), 1e-2)
 
 
-def check_iterate(
+def keep_if_infeasibility_certificate(
     qp: QP, x: FloatArray | None, zeta: FloatArray | None
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return (x, zeta) if the iterate is a certificate of infeasibility, else (None, None).
@@ -108,7 +108,7 @@ def check_iterate(
     return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
-def set_options(options: Any, settings: Mapping[str, Any], name: str) -> None:
+def set_backend_options(options: Any, settings: Mapping[str, Any], name: str) -> None:
     """Set attributes of the options object of the backend `name`; raise InputError for unknown ones."""
     for key, value in settings.items():
         if not hasattr(options, key):
@@ -131,7 +131,7 @@ class Failed(Exception):
     """A backend failed in another process; the message describes the failure."""
 
 
-def call_until_accepted(
+def call_backend_until_accepted(
     qp: QP,
     impulse: FloatArray,
     call: Call,
@@ -176,7 +176,7 @@ def call_until_accepted(
         return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
     limits = _make_limits(problem, tol, max_iter, time_limit)
     while limits:
-        last = _call_once(qp, impulse, call, limits.pop(0), settings, noisy)
+        last = _call_backend_once(qp, impulse, call, limits.pop(0), settings, noisy)
         work = sum_work((work, last.work))
         relative, above = compute_relative(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
@@ -238,7 +238,7 @@ def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float 
     return [Limits(*level, max_iter, time_limit) for level in (levels[-1:] if tol == 0.0 else levels)]
 
 
-def _call_once(
+def _call_backend_once(
     qp: QP, impulse: FloatArray, call: Call, limit: Limits, settings: Mapping[str, Any], noisy: bool
 ) -> Claim:
     """Run the backend once, write its iterate to `impulse` if it is valid, and convert its answer to a claim."""

@@ -115,7 +115,7 @@ class BodyChain:
         derivative, r, columns = self.derivative, self.rows, self.columns
         entries = np.zeros(columns.shape)
         if r.n_bodies:
-            for u, v in g._pairs("J"):
+            for u, v in g._list_outer_product_pairs("J"):
                 entries += u[:, None] * v[columns]
         entries[~self.is_moving] = 0.0
         lin_a, ang_a, lin_b, ang_b = np.split(entries[self.row], 4, axis=1)

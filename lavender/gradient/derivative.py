@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.lazy_import import issparse, lazy_module
+from lavender.base.lazy_import import import_module_lazily, issparse
 from lavender.gradient.chains import BodyChain, CoefficientRows
 from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
@@ -244,7 +244,11 @@ class Derivative:
         x, rows = r.copy(), self._system_rows
         # On the other rows G is the identity: move their contribution to the right-hand side.
         x[rows] = 0.0
-        fixed = self._linear.times(self._apply_a(x / self._root) / self._root) if x.any() else 0.0
+        fixed = (
+            self._linear.multiply_projection_derivative(self._apply_a(x / self._root) / self._root)
+            if x.any()
+            else 0.0
+        )
         rhs = (r - fixed)[rows]
         if check and self._system.singular and self._is_inconsistent(rhs):
             self._check_row_changes("no derivative along this change exists")
@@ -342,7 +346,7 @@ class Derivative:
         if p.matrix is not None or p.law == "coulomb" or c.any():
             self._check_unique(scaled)
         q[self._system_rows] = self._system.solve(scaled, True)
-        s = self._linear.times(q, True) / self._root
+        s = self._linear.multiply_projection_derivative(q, True) / self._root
         if x is not None:
             s -= x
         if p.matrix is not None:
@@ -421,7 +425,7 @@ class Derivative:
             free = data["v_free"].ravel()
             dw += self._apply_jacobian(free)
             dv = dv + free
-        dz = self._solve(r - linear.times(dw / self._root), True)
+        dz = self._solve(r - linear.multiply_projection_derivative(dw / self._root), True)
         impulse = dz / self._root
         slack = self._apply_a(impulse) + dw
         if dv is not None:
@@ -432,11 +436,15 @@ class Derivative:
         """Compute (dPi/de) de (m,) for changes de (m,) of the coefficients of rows; with ellipses also by D."""
         linear = self._linear
         if not self.problem.cones.has_ellipse:
-            return linear.times(de, False, True)
+            return linear.multiply_projection_derivative(de, False, True)
         rows, dz_de, dy_de = self._ellipse_terms
         dz, dy, others = np.zeros(len(de)), np.zeros(len(de)), de.copy()
         dz[rows], dy[rows], others[rows] = dz_de * de[rows], dy_de * de[rows], 0.0
-        return linear.times(others, False, True) + dz - linear.times(dy)
+        return (
+            linear.multiply_projection_derivative(others, False, True)
+            + dz
+            - linear.multiply_projection_derivative(dy)
+        )
 
     def _check_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Convert the changes of data to arrays; raise InputError for invalid ones."""
@@ -491,7 +499,10 @@ class Derivative:
         for q in self._system.draw_null_vectors(True):
             x = np.zeros(m)
             x[rows] = q
-            target &= np.abs(self._linear.times(x, True)) <= MAX_NULL_ENTRY * np.abs(x).max()
+            target &= (
+                np.abs(self._linear.multiply_projection_derivative(x, True))
+                <= MAX_NULL_ENTRY * np.abs(x).max()
+            )
         return Unique(impulse, slack, velocity, target, p)
 
     @cached_property
@@ -507,7 +518,7 @@ class Derivative:
             size = np.abs(self._apply_abs_a()) + np.abs(p.b)
             rounding = UNIT_ROUNDOFF * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
             error = np.zeros(p.m)
-            for r in (-linear.residual, linear.times(rounding)):
+            for r in (-linear.residual, linear.multiply_projection_derivative(rounding)):
                 dz = self._solve(r)
                 ds = self._apply_a(dz / self._root) / self._root
                 error += np.abs(dz - ds) / self._root
@@ -556,7 +567,7 @@ class Derivative:
         Under Coulomb's law there may be several. The derivative belongs to the given solution; it does not include a
         change of the solver's choice.
         """
-        return lazy_module("lavender.lab.motion").get_solutions(self.problem.disk)
+        return import_module_lazily("lavender.lab.motion").get_solutions(self.problem.disk)
 
     def __repr__(self) -> str:
         return f"<Derivative of {self.m} rows: {self}>"

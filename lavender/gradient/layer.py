@@ -159,13 +159,13 @@ def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver:
     bounds = tuple(np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu")
     step = Step(cones, bounds, friction, solver, tol)
     try:
-        return _reuse_equal(step)
+        return _reuse_equal_step(step)
     except TypeError:  # An invalid solver or tolerance may not be hashable; the solve raises the error.
         return step
 
 
 @lru_cache(maxsize=256)
-def _reuse_equal(step: Step) -> Step:
+def _reuse_equal_step(step: Step) -> Step:
     """Return an equal step of an earlier call, if there was one.
 
     JAX caches compiled callbacks by the identity of their object, so a new object would be compiled in every call.

@@ -168,10 +168,13 @@ class Gradient:
     def _by_row_coefficient(self) -> FloatArray:
         """Gradient (m,) by the friction coefficient e of each row."""
         derivative = self._derivative
-        e = derivative._linear.times(self._q, True, True)
+        e = derivative._linear.multiply_projection_derivative(self._q, True, True)
         if derivative.problem.cones.has_ellipse:
             rows, dz_de, dy_de = derivative._ellipse_terms
-            e[rows] = dz_de * self._q[rows] - dy_de * derivative._linear.times(self._q, True)[rows]
+            e[rows] = (
+                dz_de * self._q[rows]
+                - dy_de * derivative._linear.multiply_projection_derivative(self._q, True)[rows]
+            )
         return e
 
     def _by_mu(self) -> FloatArray:
@@ -203,7 +206,7 @@ class Gradient:
             return _sum_on_pattern(derivative.problem.matrix, (-self._s, derivative._impulse))
         return -np.outer(self._s, derivative._impulse)
 
-    def _pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
+    def _list_outer_product_pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
         """Return the gradient (5) by A, J or M as pairs (u, v) of the sum of u v^T."""
         derivative = self._derivative
         if name == "A":
@@ -214,12 +217,12 @@ class Gradient:
         return [(-0.5 * p, derivative._velocity_change), (-0.5 * derivative._velocity_change, p)]
 
     def _by_J(self) -> sp.csr_array:
-        return _sum_on_pattern(self._derivative.problem.jacobian, *self._pairs("J"))
+        return _sum_on_pattern(self._derivative.problem.jacobian, *self._list_outer_product_pairs("J"))
 
     def _by_M(self) -> sp.csr_array:
         general = self._derivative.problem.generalized
         assert general is not None
-        return _sum_on_pattern(general.mass, *self._pairs("M"))
+        return _sum_on_pattern(general.mass, *self._list_outer_product_pairs("M"))
 
     def full(self, name: str) -> FloatArray:
         """Compute the gradient by A, J or M as a dense array, with entries outside of the pattern.
@@ -234,7 +237,7 @@ class Gradient:
         if name not in MATRICES:
             raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern")
         getattr(self, name)  # raises CapabilityError
-        return np.asarray(sum(np.outer(u, v) for u, v in self._pairs(name)))
+        return np.asarray(sum(np.outer(u, v) for u, v in self._list_outer_product_pairs(name)))
 
 
 def _sum_on_pattern(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:

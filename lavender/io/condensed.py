@@ -27,7 +27,7 @@ def form_dense_a(
         M is singular, or the matrices may need more memory than the budget allows.
     """
     label = sp.csgraph.connected_components(mass, directed=False)[1]
-    budget.reserve_bytes(SPARSE_ENTRY_BYTES * max_condensed_entries(label, jt), "A = H^T M^-1 H")
+    budget.reserve_bytes(SPARSE_ENTRY_BYTES * bound_condensed_entries(label, jt), "A = H^T M^-1 H")
     solve = _make_mass_solver(mass, label, budget)
     m = jt.shape[1]
     step = max(1, DENSE_CHUNK_NUMBERS // max(1, *jt.shape))
@@ -41,7 +41,7 @@ def form_dense_a(
     return a, j @ solve(f)
 
 
-def max_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
+def bound_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
     """Return an upper bound of the number of entries of J M^-1 J^T; `label` (n,) holds the connected component of M.
 
     Two rows of J are coupled only if they touch the same component: a component that r rows touch contributes at

@@ -283,14 +283,14 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     row_arrays = rows["efc_type"], rows["efc_id"]
     contact_arrays = contacts["dim"], contacts["geom"]
 
-    def block_names(i: int) -> Any:
+    def name_blocks_of_world(i: int) -> Any:
         own_rows, own_contacts = slice(ptr[i], ptr[i + 1]), slice(contact_ptr[i], contact_ptr[i + 1])
         ints = np.concatenate(
             [*(x[own_rows] for x in row_arrays), *(x[own_contacts].ravel() for x in contact_arrays)]
         )
         return single._make_block_names(mj, model, ints, int(ptr[i + 1] - ptr[i]), 1)
 
-    imported.batch.names_of = block_names
+    imported.batch.names_of = name_blocks_of_world
     world = np.repeat(np.arange(n), np.diff(contact_ptr))
     imported.batch.contact_counts = np.bincount(world[contacts["efc_address"] >= 0], minlength=n)
     return imported

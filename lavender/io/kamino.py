@@ -371,7 +371,7 @@ class _Worlds:
         model = self.engine._model
         pairs = self._copy_contact_bodies()
 
-        def names_of(i: int) -> list[str]:
+        def name_blocks_of_world(i: int) -> list[str]:
             joints = model.joints
             own = np.flatnonzero(_as_int(joints.wid) == i).tolist()
             names = []
@@ -394,7 +394,7 @@ class _Worlds:
             blocks = np.count_nonzero((first >= self.row_ptr[i]) & (first < self.row_ptr[i + 1]))
             return names if len(names) == blocks else [f"block {k}" for k in range(blocks)]
 
-        return names_of
+        return name_blocks_of_world
 
     def _copy_contact_bodies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return world (c,), number in it (c,) and bodies (c, 2) of each contact; -1 is the ground."""

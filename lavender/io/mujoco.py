@@ -477,22 +477,23 @@ def _make_block_names(
         if row_type == kinds.mjCNSTR_EQUALITY:
             while i + size < len(types) and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
-            name = _get_name(mj, model, "EQUALITY", which, "equality")
+            name = _get_object_name(mj, model, "EQUALITY", which, "equality")
             names += [name] if size <= joined else [f"{name}, edge {edge}" for edge in range(size)]
         elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])
             is_rotational = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
             suffix = f", axis {axis}" if is_rotational else ""
-            names.append(f"friction of {_get_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
+            names.append(f"friction of {_get_object_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
         elif row_type == kinds.mjCNSTR_FRICTION_TENDON:
-            names.append(f"friction of {_get_name(mj, model, 'TENDON', which, 'tendon')}")
+            names.append(f"friction of {_get_object_name(mj, model, 'TENDON', which, 'tendon')}")
         elif row_type in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
             word = "joint" if row_type == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
-            names.append(f"limit of {_get_name(mj, model, word.upper(), which, word)}")
+            names.append(f"limit of {_get_object_name(mj, model, word.upper(), which, word)}")
         else:
             sides = [
-                _get_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex" for g in geom[which].tolist()
+                _get_object_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex"
+                for g in geom[which].tolist()
             ]
             name = f"contact {which} ({', '.join(side.removeprefix('geom ') for side in sides)})"
             if row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
@@ -505,6 +506,6 @@ def _make_block_names(
     return names
 
 
-def _get_name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
+def _get_object_name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
     own_name = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
     return f"{word} {own_name or which}"

@@ -194,11 +194,11 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     archive = Archive(path, max_bytes)
     try:
         if "lavender_format" in archive:
-            return _read_own(archive)
+            return _read_own_format(archive)
         if {"kind", "J_data", "minv"} <= set(archive):
-            return _read_generated(archive)
+            return _read_generated_format(archive)
         if {"b", "lo", "hi"} <= set(archive):
-            return _read_box(archive)
+            return _read_box_format(archive)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -267,7 +267,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
     write_arrays(path, arrays)
 
 
-def _read_own(archive: Archive) -> Stored:
+def _read_own_format(archive: Archive) -> Stored:
     """Read a problem in our own format."""
     version = archive.read_scalar("lavender_format")
     if version != FORMAT_VERSION or isinstance(version, bool):
@@ -325,10 +325,10 @@ def _read_meta(archive: Archive) -> dict[str, Any]:
         or set(meta) - {"dof_names", "precision", "program"} != {"operator", "friction", "name", "names"}
         or meta["operator"] not in ("dense", "csr", "rows", "generalized")
         or ("dof_names" in meta) != (meta["operator"] == "generalized")
-        or not _is_names(meta.get("dof_names"))
+        or not _is_name_list(meta.get("dof_names"))
         or not isinstance(meta["name"], str)
         or not isinstance(meta["friction"], str)
-        or not _is_names(meta["names"])
+        or not _is_name_list(meta["names"])
         or meta.get("precision", "float64") not in PRECISIONS
         or type(meta.get("program", 0)) is not int
         or ("program" in meta and meta["operator"] != "csr")
@@ -357,7 +357,7 @@ def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized
     return Generalized(jac, mass, v_free, names)
 
 
-def _is_names(value: Any) -> bool:
+def _is_name_list(value: Any) -> bool:
     return value is None or (isinstance(value, list) and all(isinstance(name, str) for name in value))
 
 
@@ -374,7 +374,7 @@ def _check_entries(archive: Archive, needed: Collection[str], optional: Collecti
 # -- plain box format and the benchmark generator's -----------------------------------------------
 
 
-def _read_box(archive: Archive) -> Stored:
+def _read_box_format(archive: Archive) -> Stored:
     """Read the box format: w = A l - b, lo <= l <= hi complementary to w; the rows of a friction cone are a contact."""
     b = archive["b"]
     if b.ndim != 1:
@@ -427,7 +427,7 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
     )
 
 
-def _read_generated(archive: Archive) -> Stored:
+def _read_generated_format(archive: Archive) -> Stored:
     """Read the layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
     kind = archive.read_scalar("kind")
     b = archive["b"]

@@ -29,7 +29,7 @@ from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io import npz
 from lavender.io.engine_step import Claims, EngineStep
-from lavender.io.stored import ENGINE, make_folder, open_step_folder, write_arrays, write_text
+from lavender.io.stored import ENGINE, lock_step_folder, make_folder, write_arrays, write_text
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
 
@@ -115,7 +115,7 @@ class Recorder:
             raise InputError("nothing would be recorded: give every=, keep_worst= or when=")
         self.when, self.solver, self.n_steps = when, solver, 0
         self._stack = contextlib.ExitStack()
-        self.folder = self._stack.enter_context(open_step_folder(folder, check_bool("replace", replace)))
+        self.folder = self._stack.enter_context(lock_step_folder(folder, check_bool("replace", replace)))
         self._lines: dict[str, dict[str, Any]] = {}
         self._worst: list[tuple[float, str]] = []  # heap of (velocity error, file), the smallest first
         self._unjudged: set[int] = set()  # worlds with a line for their first invalid step
@@ -273,12 +273,12 @@ class Recorder:
             write_arrays(make_folder(self.folder / STATES_FOLDER) / name, states(i))
         self._lines[name] = line
         if is_worst:
-            self._replace_worst(error, name)
+            self._add_to_worst_files(error, name)
         if is_selected:
             line["selected"] = True
         return True
 
-    def _replace_worst(self, error: float, name: str) -> None:
+    def _add_to_worst_files(self, error: float, name: str) -> None:
         """Add a file to the worst ones; remove the file that leaves them unless it was selected."""
         if len(self._worst) < self.keep_worst:
             heapq.heappush(self._worst, (error, name))

@@ -19,7 +19,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.states import read_states
-from lavender.io.stored import ENGINE, as_path, open_step_folder, read_first_bytes, write_text
+from lavender.io.stored import ENGINE, as_path, lock_step_folder, read_first_bytes, write_text
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
@@ -139,7 +139,7 @@ def record(
     left_out: list[dict[str, Any]] = []
     without = 0
     width = len(str(steps))
-    with open_step_folder(folder, replace) as folder:
+    with lock_step_folder(folder, replace) as folder:
         for step in range(steps):
             ctrl = control_at(data, step)
             if starts is not None and step in firsts:

@@ -80,7 +80,7 @@ class Stored:
 
 
 @contextlib.contextmanager
-def open_step_folder(
+def lock_step_folder(
     path: str | os.PathLike[str], replace: bool = False, continued: bool = False
 ) -> Iterator[Path]:
     """Lock a folder for recorded problems, create it if necessary, and return its path until the block ends.
@@ -274,12 +274,12 @@ def _remove_old_temporaries(folder: Path) -> None:
             if (
                 part
                 and time.time() - entry.stat().st_mtime > MAX_TEMPORARY_AGE
-                and not _is_running(int(part[1]))
+                and not _is_process_running(int(part[1]))
             ):
                 os.unlink(entry)
 
 
-def _is_running(process: int) -> bool:
+def _is_process_running(process: int) -> bool:
     """Return whether a process of this machine exists: a changed clock makes its temporary file look old.
 
     It is False on Windows, which does not remove open files.
@@ -305,7 +305,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def load_or_make(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
+def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
     """Return the content of a file if it is current, else make it, and write it to the file if that is possible."""
     if path.exists() and is_current(content := path.read_bytes()):
         return content

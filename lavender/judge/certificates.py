@@ -231,7 +231,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     violation = _explain_recession_violation(problem, y)
     if violation:
         return Proof(y, 0.0, violation)
-    low, high, size = _bound_z(problem, y, rows)
+    low, high, size = _bound_transposed_product(problem, y, rows)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Proof(y, 0.0, "A^T y overflows")
     rounding_factor = min((len(rows) + 2.0) * UNIT_ROUNDOFF, MAX_ROUNDING_SLACK * gain / gain_size)
@@ -255,7 +255,9 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     return Proof(unscaled, bound, reason)
 
 
-def _bound_z(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _bound_transposed_product(
+    problem: Problem, y: FloatArray, rows: Any
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return bounds of z (m,) from below and above, and the sizes (m,) of the terms in (3) or (4) that are rounded.
 
     The sums of z are exact. The sizes are 0 if R y is not exactly 0.

@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice, format_html_table, mark_read_only
 from lavender.base.errors import SolveFailed, require_packages
-from lavender.base.lazy_import import lazy_module
+from lavender.base.lazy_import import import_module_lazily
 from lavender.base.renamed import build_attribute_error
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
@@ -378,7 +378,7 @@ class Solution:
 
     def motion_error(self, reference: Any = None) -> Any:
         """Return the error of the motion in units, with a bound: see `lavender.motion_error`."""
-        return lazy_module("lavender.lab.motion").motion_error(
+        return import_module_lazily("lavender.lab.motion").motion_error(
             self.residual._problem, self.impulse, reference
         )
 

@@ -36,7 +36,7 @@ from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.states import VECTOR
-from lavender.io.stored import open_step_folder, write_arrays
+from lavender.io.stored import lock_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
@@ -267,12 +267,11 @@ class Audit:
             f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
             "Start from other states with --states."
         )  # fmt: skip
-        more = [self._divergence_sentence, warning]
+        more = [self._describe_divergences(), warning]
         return " ".join([f"{text}.", *filter(None, more)])
 
-    @property
-    def _divergence_sentence(self) -> str:
-        """Sentence about the steps that were not judged and the worlds that diverged; empty if there are none."""
+    def _describe_divergences(self) -> str:
+        """Return a sentence about steps that were not judged and worlds that diverged; empty if there are none."""
         lost = self.verdict == NOT_JUDGED
         unjudged = format_count(int(lost.sum()), "step")
         were = "was" if lost.sum() == 1 else "were"
@@ -372,7 +371,7 @@ class Audit:
         mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
-        with open_step_folder(folder / "worst", replace=True) as worst:
+        with lock_step_folder(folder / "worst", replace=True) as worst:
             for i, w in enumerate(self.worst, 1):
                 npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
         names = self.worst[0].state if self.worst else ()
@@ -487,7 +486,7 @@ def audit(
         one = Runs(os.fspath(model), 1, steps, control=control, seed=seed, spread=spread).with_start_states(
             states
         )
-        worlds = choose_worlds(one, judging, count_processes(workers) if engine == "mujoco" else 1)
+        worlds = choose_world_count(one, judging, count_processes(workers) if engine == "mujoco" else 1)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).with_start_states(
         states
     )
@@ -540,7 +539,7 @@ def audit(
             raise
     if not result.n_processed:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
-    busy = machine.describe_busy(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
+    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
     return replace(result, stopped=result.n_processed < worlds * steps, busy=busy)
 
 
@@ -549,7 +548,7 @@ def count_processes(workers: int) -> int:
     return workers if workers > 0 else max(1, (os.cpu_count() or 1) + 1 + workers)
 
 
-def choose_worlds(runs: Runs, judging: tuple[str, float], processes: int) -> int:
+def choose_world_count(runs: Runs, judging: tuple[str, float], processes: int) -> int:
     """Return the number of worlds that take about `DEFAULT_DURATION` in so many processes.
 
     `runs` are of one world, which is simulated and judged with MuJoCo; its second run is timed, because the first one

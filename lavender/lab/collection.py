@@ -185,7 +185,7 @@ def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
     return buildable, sorted({message for message in missing.values() if message})
 
 
-def find_changes(entries: Iterable[Entry]) -> Iterator[str]:
+def find_changed_problems(entries: Iterable[Entry]) -> Iterator[str]:
     """Build every problem again from its name; yield a line for each that has other numbers."""
     for entry in entries:
         problem = suite.case(entry.name).problem

@@ -121,7 +121,7 @@ def start_scene(
     running = GenesisScene(build, worlds) if engine == "genesis" else NewtonScene(build, engine, worlds, dt)
     first_noisy = 1
     if starts is not None:
-        running.set_state(_repeat(starts, running.n))
+        running.set_state(_repeat_states(starts, running.n))
         first_noisy = len(next(iter(starts.values())))
     if spread and running.n > first_noisy:
         running.add_noise(first_noisy, spread, seed)
@@ -163,7 +163,7 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     return arrays
 
 
-def _repeat(states: EngineState, n: int) -> EngineState:
+def _repeat_states(states: EngineState, n: int) -> EngineState:
     """Return states of n worlds: state i modulo the number of states."""
     return {name: x[np.arange(n) % len(x)] for name, x in states.items()}
 

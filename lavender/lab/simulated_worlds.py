@@ -512,7 +512,7 @@ def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, co
         """Return the name of a geom, or its index without one."""
         return mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g))
 
-    def names_of(i: int) -> list[str]:
+    def name_blocks_of_world(i: int) -> list[str]:
         """Return the names of the blocks of world i."""
         types = np.broadcast_to(row_types, (len(batch), row_types.shape[-1]))[i]
         first = {int(address[k]): k for k in np.flatnonzero((world_of == i) & (address >= 0))}
@@ -524,4 +524,4 @@ def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, co
             names.append(BLOCK_KINDS.get(int(types[row]), name + edge))
         return names
 
-    return names_of
+    return name_blocks_of_world

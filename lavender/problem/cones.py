@@ -31,8 +31,8 @@ from lavender.base.arrays import (
     IntArray,
     are_equal,
     as_array,
+    check_finite_and_in_range,
     check_int,
-    check_magnitudes,
     check_nonnegative_magnitudes,
     check_not_nan,
     get_shape,
@@ -605,7 +605,7 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
         )
     if fault in ("lower", "upper"):
         bound = lower if fault == "lower" else upper
-        check_magnitudes(
+        check_finite_and_in_range(
             fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(fields[0])), 0.0, bound), "N s"
         )
     check_nonnegative_magnitudes("mu", mu, "-")

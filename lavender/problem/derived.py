@@ -1,4 +1,4 @@
-"""Values computed once per problem and shared between threads: `Derived`, `cached_property`, `once`."""
+"""Values computed once per problem and shared between threads: `Derived`, `cached_property`, `computed_once`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Derived:
     Attributes
     ----------
     lock : RLock
-        Held while a `once` property is computed in the process `process`.
+        Held while a `computed_once` property is computed in the process `process`.
     view : Data or None
         Arrays that kernels read in generalised coordinates, set with the problem.
     start : (m,) or None, N s
@@ -81,7 +81,7 @@ class cached_property(Generic[T]):
         return value
 
 
-class once(cached_property[T]):
+class computed_once(cached_property[T]):
     """A `cached_property` of an object with `derived`, which one thread computes while others wait."""
 
     def _compute(self, instance: Any) -> T:

@@ -440,7 +440,7 @@ def convert_to_compressed_rows(name: str, matrix: Any, sign: float = 1.0) -> Com
 # -- orders with little fill-in ------------------------------------------------------------------------
 
 
-def _compress(rows: Any, cols: Any, data: FloatArray, n: int) -> Compressed:
+def _compress_entries(rows: Any, cols: Any, data: FloatArray, n: int) -> Compressed:
     """Convert entries in any order to n compressed rows with sorted columns."""
     order = np.lexsort((cols, rows))
     indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int32)
@@ -452,14 +452,14 @@ def _permute_lower(mass: Compressed, order: IntArray) -> Compressed:
     indptr, indices, data = mass
     position = np.argsort(order)
     rows, cols = position[np.repeat(np.arange(len(order)), np.diff(indptr))], position[indices]
-    return _compress(np.maximum(rows, cols), np.minimum(rows, cols), data, len(order))
+    return _compress_entries(np.maximum(rows, cols), np.minimum(rows, cols), data, len(order))
 
 
 def _permute_columns(jac: Compressed, order: IntArray) -> Compressed:
     """Permute the columns of compressed rows."""
     indptr, indices, data = jac
     rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-    return _compress(rows, np.argsort(order)[indices], data, len(indptr) - 1)
+    return _compress_entries(rows, np.argsort(order)[indices], data, len(indptr) - 1)
 
 
 def _order_velocities(mass: Compressed, n: int) -> IntArray:

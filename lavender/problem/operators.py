@@ -11,7 +11,7 @@ from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.data import ProblemData
-from lavender.problem.derived import Derived, cached_property, once
+from lavender.problem.derived import Derived, cached_property, computed_once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.checks import MAX_MAGNITUDE, max_abs_of_array
@@ -101,7 +101,7 @@ class Operators(ProblemData):
             scale = sp.diags_array(1.0 / np.sqrt(self.d))
             return has_shifted_cholesky(scale @ self.csr @ scale)
 
-    @once
+    @computed_once
     def data(self) -> Data:
         """Arrays for sweep kernels: pointers, d, nu, steps, and the rows of bodies, or A if there are no rows."""
         if self.rows is None:
@@ -124,7 +124,7 @@ class Operators(ProblemData):
         self._check_diagonal(data)
         return data
 
-    @once
+    @computed_once
     def csr_data(self) -> Data:
         """Arrays for sweep kernels over A in compressed rows; A is formed if J and M are given."""
         data = self._make_data(csr=self._compressed)
@@ -134,7 +134,7 @@ class Operators(ProblemData):
             data.share_reference(self.metric)
         return data
 
-    @once
+    @computed_once
     def metric(self) -> Data:
         """Arrays for the judge: `data`, or in generalised coordinates J, M, d and Y = J L^-1 D^-1/2."""
         view = self.derived.view
@@ -159,7 +159,7 @@ class Operators(ProblemData):
     def _make_data(self, **operator: Any) -> Data:
         return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)
 
-    @once
+    @computed_once
     def csr(self) -> sp.csr_array:
         """A (m, m) in compressed rows with int32 indices, read-only."""
         if issparse(self.matrix):
@@ -167,7 +167,7 @@ class Operators(ProblemData):
         indptr, indices, data = self._compressed
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
-    @once
+    @computed_once
     def _n_couplings(self) -> float:
         """Number of pairs of rows that share a body; pairs that share both bodies count twice.
 
@@ -183,7 +183,7 @@ class Operators(ProblemData):
         bound = self._n_couplings if self.rows is not None else self.metric.entries_of_matrix
         return min(float(bound), float(self.m) ** 2)
 
-    @once
+    @computed_once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Arrays (indptr, indices, data) of A for kernels and the judge.
 
@@ -217,7 +217,7 @@ class Operators(ProblemData):
         indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
-    @once
+    @computed_once
     def whitened(self) -> sp.csr_array:
         """Y (m, nv) with J M^-1 J^T = Y Y^T, read-only; only in generalised coordinates.
 
@@ -231,9 +231,11 @@ class Operators(ProblemData):
                 f"this problem was given as {self.operator}; Y is known in generalised coordinates "
                 "(Problem.from_jacobian)"
             )
-        return _read_only(sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv)))
+        return _mark_matrix_read_only(
+            sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv))
+        )
 
-    @once
+    @computed_once
     def jacobian(self) -> sp.csr_array:
         """J as a read-only CSR matrix: (m, 6 n) with rows, (m, nv) in generalised coordinates.
 
@@ -249,14 +251,14 @@ class Operators(ProblemData):
                 "this problem was given as a matrix; its Jacobian is not known (make it with "
                 "Problem.from_rows or Problem.from_jacobian)"
             )
-        return _read_only(self.rows.jacobian(self.cones))
+        return _mark_matrix_read_only(self.rows.jacobian(self.cones))
 
     @property
     def d(self) -> FloatArray:
         """Metric of the judge (m,) [1/kg]: the diagonal of A, with replacements for entries that are not positive."""
         return self.metric.d
 
-    @once
+    @computed_once
     def vanished_rows(self) -> IntArray:
         """Rows with A_ii = 0 by underflow only: J_i M^-1 J_i^T has products of nonzero entries."""
         empty: IntArray = self.metric.empty
@@ -322,7 +324,7 @@ class Operators(ProblemData):
         return derived.start
 
 
-def _read_only(matrix: sp.csr_array) -> sp.csr_array:
+def _mark_matrix_read_only(matrix: sp.csr_array) -> sp.csr_array:
     """Mark the arrays of a matrix read-only, and return it."""
     for array in (matrix.data, matrix.indices, matrix.indptr):
         mark_read_only(array)
@@ -344,11 +346,11 @@ def has_shifted_cholesky(a: Any) -> bool:
         except np.linalg.LinAlgError:
             return False
         return True
-    system, values = analyse_symmetric(a)
+    system, values = analyse_symmetric_matrix(a)
     return bool(system.factor(values, None, SEMIDEFINITE_SHIFT) == 0)
 
 
-def analyse_symmetric(a: Any) -> tuple[LinearSystem, FloatArray]:
+def analyse_symmetric_matrix(a: Any) -> tuple[LinearSystem, FloatArray]:
     """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
 
     Returns

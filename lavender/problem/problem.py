@@ -10,11 +10,11 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender.base.errors import InputError
-from lavender.base.lazy_import import lazy_module
+from lavender.base.lazy_import import import_module_lazily
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
-from lavender.problem.derived import once
+from lavender.problem.derived import computed_once
 from lavender_ext.core.checks import MIN_MAGNITUDE
 
 
@@ -200,7 +200,7 @@ class Problem(Builders):
         with np.errstate(over="ignore"):  # An impulse may have any size.
             return impulse / self.cones.stretch
 
-    @once
+    @computed_once
     def _disk(self) -> Problem:
         """Problem in stretched tangents: A' = S A S, b' = S b, lambda = S lambda', w' = S w with S = diag(stretch)."""
         s, cones = self.cones.stretch, self.cones.disks
@@ -289,4 +289,4 @@ class Problem(Builders):
 
     def save(self, path: str | PathLike[str], **more: Any) -> None:
         """Write the problem to a file by `lavender.io.save`; `more` are its options."""
-        lazy_module("lavender.io").save(self, path, **more)
+        import_module_lazily("lavender.io").save(self, path, **more)

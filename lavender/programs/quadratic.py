@@ -102,12 +102,12 @@ def solve_qp(
     else:
         answer = _solve_to_error(problem, solver, tol, end, start, options)
     if qp.is_singular:
-        answer = _find_ray(problem, answer, end)
-    _complete(answer, perf_counter() - begun)
+        answer = _add_ray_if_unbounded(problem, answer, end)
+    _set_time_and_status(answer, perf_counter() - begun)
     return answer
 
 
-def _complete(answer: QPSolution, seconds: float) -> None:
+def _set_time_and_status(answer: QPSolution, seconds: float) -> None:
     """Set the time of the whole call, and CONVERGED if the program's error is within `tol`, in the answer's solution.
 
     Residuals of the constraint problem are relative to the zero impulse's; the program's error decides.
@@ -134,9 +134,9 @@ def _solve_to_error(
         left = None if end == math.inf else max(end - perf_counter(), 1e-6)
         solution = solve(problem, solver, impulse=impulse, tol=inner, time_limit=left, **options)
         answer = problem.qp.solution(solution, tol)
-        if best is None or answer.error < best.error or _is_refuted(answer):
+        if best is None or answer.error < best.error or _is_proved_infeasible(answer):
             best = answer
-        if answer.error <= tol or not _is_continued(answer, end):
+        if answer.error <= tol or not _should_continue(answer, end):
             break
         smaller = max(TOL_RATIO * inner * tol / answer.error, MIN_TOL)
         if not smaller < inner:
@@ -146,13 +146,13 @@ def _solve_to_error(
     return best
 
 
-def _is_refuted(answer: QPSolution) -> bool:
+def _is_proved_infeasible(answer: QPSolution) -> bool:
     """Whether a certificate that the judge has checked shows that no solution exists."""
     solution = answer.solution
     return bool(solution.status is Status.INFEASIBLE and solution.claim_check == CONFIRMED)
 
 
-def _is_continued(answer: QPSolution, end: float) -> bool:
+def _should_continue(answer: QPSolution, end: float) -> bool:
     """Whether another solve may lower the error, and has time."""
     return answer.solution.status in CONTINUED and perf_counter() < end
 
@@ -168,13 +168,13 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     if is_lossy:
         first, second = second, first
     answer = first(problem, tol, end, impulse)
-    if answer.error <= tol or _is_refuted(answer) or answer.solution.status is Status.INTERRUPTED:
+    if answer.error <= tol or _is_proved_infeasible(answer) or answer.solution.status is Status.INTERRUPTED:
         return answer
     if not perf_counter() < end:
         return answer
     other = second(problem, tol, end, answer.impulse)
     ran = [answer.solution, other.solution]
-    if other.error < answer.error or _is_refuted(other):
+    if other.error < answer.error or _is_proved_infeasible(other):
         answer = other
     stages = tuple(stage for solution in ran for stage in solution.stages)
     work = MappingProxyType(sum_work(solution.work for solution in ran))
@@ -198,7 +198,7 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
         start = start if np.isfinite(start).all() else None
     answer = _solve_to_error(program, "auto", tol, end, start, {})
     solution: Solution = answer.solution
-    certificate = solution.certificate if _is_refuted(answer) else None
+    certificate = solution.certificate if _is_proved_infeasible(answer) else None
     claim = Claim(
         solution.status if certificate is not None else Status.STALLED,
         solution.iterations,
@@ -212,14 +212,14 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
     return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
 
 
-def _find_ray(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
+def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
     """Return the answer with its ray, if a certificate shows that the objective decreases without end.
 
     A certificate of (5) has a part along x and one along the multipliers. If the second does not prove by itself that
     the rows contradict each other, the first is a ray, and the program is unbounded if it has a feasible point.
     """
     solution, qp = answer.solution, problem.qp
-    if not _is_refuted(answer) or solution.certificate is None:
+    if not _is_proved_infeasible(answer) or solution.certificate is None:
         return answer
     direction, rows = solution.certificate[: len(qp.q)], qp.select_row_multipliers(solution.certificate)
     if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:

@@ -31,7 +31,7 @@ from lavender_ext.batch.world cimport (
 from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms
-from lavender_ext.velocity_newton.soft cimport is_soft
+from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 cdef object new = np.empty
 
@@ -123,7 +123,7 @@ cdef class Limits:
 
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
-        cdef bint soft = is_soft(&p.blocks, &p.general)
+        cdef bint soft = needs_no_proximal_terms(&p.blocks, &p.general)
         return (estimate_newton_cost(&p.blocks, &p.general, &self.at, work),
                 max_newton_cost(&p.blocks, &p.general, &self.at, islands, soft))
 
@@ -329,7 +329,7 @@ cdef class Worlds:
             elif p is not None:
                 set_data_task(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
 
-    def remember(self, data):
+    def store_zero_residuals(self, data):
         """Store the residuals of the zero impulse in the data of solved problems."""
         cdef int64_t i
         for i in range(self.w.n):
@@ -339,7 +339,7 @@ cdef class Worlds:
     cdef bint is_general(self, int64_t i) noexcept nogil:
         return self.tasks[i].general if self.tasks != NULL else self.w.general
 
-    cdef int32_t lay(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
+    cdef int32_t convert_world(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
                      task_t* j) noexcept nogil:
         """Convert world i for a solve or for the judge; return READY, BAD or LEFT."""
         cdef const int64_t* at = self.w.at + i * PLACES
@@ -400,7 +400,7 @@ cdef class Worlds:
         cdef bint had_derived
         if limits == NULL if self.is_general(i) else rules == NULL:
             return LEFT
-        code = self.lay(i, &h.scratch, &h.slack_error, &h.made, &j)
+        code = self.convert_world(i, &h.scratch, &h.slack_error, &h.made, &j)
         if code != READY:
             return code
         if j.p.n_rows == 0:
@@ -430,7 +430,7 @@ cdef class Worlds:
         """
         cdef task_t j
         cdef small_problem_t s
-        cdef int32_t k, code = self.lay(i, &h.scratch, &h.slack_error, &h.made, &j), m = j.p.n_rows
+        cdef int32_t k, code = self.convert_world(i, &h.scratch, &h.slack_error, &h.made, &j), m = j.p.n_rows
         cdef bint had_derived = j.has_derived
         cdef double size
         cdef double* x

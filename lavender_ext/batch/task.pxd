@@ -30,7 +30,7 @@ from lavender_ext.small.limits cimport (
 )
 from lavender_ext.small.workspace cimport grow_workspace_to
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
-from lavender_ext.velocity_newton.soft cimport is_soft
+from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 
 cdef enum:
@@ -194,7 +194,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     if j.zero_residual[0] < 0.0 and not judge_zero_impulse_of_task(j, &v, islands, workspace.real):
         return
     # cost limits, workspace
-    soft = is_soft(&j.p, &j.g)
+    soft = needs_no_proximal_terms(&j.p, &j.g)
     o.work = max_factorisation_work(&j.p, &j.g, limits, soft)
     if not o.work > 0.0:
         return

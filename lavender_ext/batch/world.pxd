@@ -171,7 +171,7 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
     return True
 
 
-cdef inline int32_t mark_new_zeros(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
+cdef inline int32_t count_zeros_and_detect_new(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
     """Count the zeros of x (n); new: whether one is not in `known`. Branch-free 64-bit integers, for vectorisation."""
     cdef int64_t zeros = 0, unknown = 0, zero
     cdef int32_t k
@@ -203,7 +203,7 @@ cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d,
         d.n_tree = n
         compute_factor_pattern(n, capacity, w.mass_ptr, w.mass_col, t)
         memset(known, 0, count * sizeof(int64_t))
-    zeros = mark_new_zeros(x, count, known, &new)
+    zeros = count_zeros_and_detect_new(x, count, known, &new)
     if new:
         for k in range(count):
             known[count + k] = known[k] | (x[k] == 0.0)

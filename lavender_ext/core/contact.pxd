@@ -14,9 +14,8 @@ from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get
                                             is_disk_friction_contact,
                                             count_angular_rows, count_tangent_rows)
 from lavender_ext.core.joint cimport relax_joint_block
-from lavender_ext.core.numbers cimport (apply_contact_changes, clip_below_zero, clip_to_bound, constant_of_type, dot_numbers,
-                                        number_t,
-                                        project_disk, compute_relative_angular_velocity)
+from lavender_ext.core.numbers cimport (apply_contact_impulse_changes_to_body, clip_below_zero, clip_to_bound,
+                                        constant_of_type, dot_numbers, number_t, project_disk, compute_relative_angular_velocity)
 from lavender_ext.core.rows cimport cross
 from lavender_ext.core.view cimport rows_t
 
@@ -145,9 +144,9 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
         change[3] = lam[spin_row] - old
     # velocities of both bodies
     if body_a >= 0:
-        apply_contact_changes(va, <const number_t*>c.inv_mass_a, inv_inertia_arm, impulse, change, nt, spins, -1)
+        apply_contact_impulse_changes_to_body(va, <const number_t*>c.inv_mass_a, inv_inertia_arm, impulse, change, nt, spins, -1)
     if body_b >= 0:
-        apply_contact_changes(vb, <const number_t*>c.inv_mass_b, inv_inertia_arm + 3, impulse, change, nt, spins, 1)
+        apply_contact_impulse_changes_to_body(vb, <const number_t*>c.inv_mass_b, inv_inertia_arm + 3, impulse, change, nt, spins, 1)
     # rolling rows
     if rolls:
         compute_relative_angular_velocity(va, vb, body_a, body_b, omega)

@@ -82,7 +82,7 @@ cdef inline void compute_relative_angular_velocity(const number_t* va, const num
             omega[k] = omega[k] - va[3 + k]
 
 
-cdef inline void apply_contact_changes(number_t* v, const number_t* inv_mass, const number_t* inv_inertia_arm,
+cdef inline void apply_contact_impulse_changes_to_body(number_t* v, const number_t* inv_mass, const number_t* inv_inertia_arm,
                                        const number_t* impulse, const number_t* change, int32_t nt, bint spins,
                                        int32_t sign) noexcept nogil:
     """Apply the impulse changes of one contact to the velocity v (6) of one body by (3) of core/rows.pxd.

@@ -353,7 +353,7 @@ cdef class Linear:
             linear_solve(&self.at.g, &out[0])
         return out_
 
-    def times(self, v_, bint transpose=False, bint edge=False):
+    def multiply_projection_derivative(self, v_, bint transpose=False, bint edge=False):
         """Return P v (m,), or dPi/de v with `edge`; with `transpose` the product with the transpose."""
         cdef const double[::1] v = v_
         out_ = np.empty(self.at.v.p.n_rows)

@@ -7,15 +7,15 @@ from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.velocity_newton.method cimport general_workspace_size, general_start, general_step
+from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
 from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, rows_workspace_size, rows_start, system_step
-from lavender_ext.velocity_newton.soft cimport is_soft
+from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 
 cdef inline method_t find_method_functions(const view_t* v) noexcept nogil:
     """Return the functions of the method for the form of the problem."""
     if v.g != NULL:
-        return method_t(general_workspace_size, general_start, general_step)
+        return method_t(islands_workspace_size, start_islands, advance_islands)
     if v.r != NULL:
         return method_t(bodies_workspace_size, bodies_start, system_step)
     return method_t(rows_workspace_size, rows_start, system_step)
@@ -100,4 +100,4 @@ cdef class Driver(Method):
     @property
     def soft(self):
         """Whether no row needs a proximal term; False unless the problem is given by J and M."""
-        return self.view.g != NULL and is_soft(&self.view.p, self.view.g)
+        return self.view.g != NULL and needs_no_proximal_terms(&self.view.p, self.view.g)

@@ -23,7 +23,7 @@ from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk_friction_con
                                             count_angular_rows,
                                       friction_components_t, get_friction_components)
 from lavender_ext.core.joint cimport relax_joint_block
-from lavender_ext.core.numbers cimport apply_contact_changes
+from lavender_ext.core.numbers cimport apply_contact_impulse_changes_to_body
 from lavender_ext.core.row_forms cimport find_panel, row_form_t, compute_row_slack, set_row_impulse
 from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, form_contact_jacobian, compute_contact_velocity,
                                      cross, dot12,
@@ -207,7 +207,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, 
     return fallback
 
 
-cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+cdef inline int32_t update_disk_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                           double* v) noexcept nogil:
     """Update a disk under Coulomb's law by (2); lam points at its normal."""
     cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k, axis
@@ -235,9 +235,9 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     for axis in range(3):
         impulse[axis] = change[0] * normal[axis] + change[1] * t1[axis] + change[2] * t2[axis]
     if a >= 0:
-        apply_contact_changes(v + 6 * a, r.inv_mass + a, inv_inertia_arm, impulse, change, 2, False, -1)
+        apply_contact_impulse_changes_to_body(v + 6 * a, r.inv_mass + a, inv_inertia_arm, impulse, change, 2, False, -1)
     if b >= 0:
-        apply_contact_changes(v + 6 * b, r.inv_mass + b, inv_inertia_arm + 3, impulse, change, 2, False, 1)
+        apply_contact_impulse_changes_to_body(v + 6 * b, r.inv_mass + b, inv_inertia_arm + 3, impulse, change, 2, False, 1)
     return k
 
 
@@ -254,7 +254,7 @@ cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32
     cdef const double* t1
     t2[0] = t2[1] = t2[2] = 0.0
     if c >= 0 and is_disk_friction_contact(p, i) and p.law != CONE:
-        return solve_sliding_contact(p, r, i, g, lam + j, v)
+        return update_disk_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
             relax_joint_block(p, r, i, lam, v)

@@ -94,7 +94,7 @@ cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
 
 
 cdef inline int64_t order_elements(const scaled_t* s, pattern_t* a, const rows_t* r) noexcept nogil:
-    """Order the bodies of the elements that `find_elements` found; return the off-diagonal blocks of L."""
+    """Order the bodies of the elements that `index_unfixed_elements` found; return the off-diagonal blocks of L."""
     cdef int32_t i
     cdef const int32_t* body
     a.k = s.e.n

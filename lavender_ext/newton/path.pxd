@@ -47,7 +47,7 @@ from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
                                       pop_phase, push_phase, score_point)
-from lavender_ext.newton.system cimport NATURAL, solve_natural, system_factor, system_sign, system_times
+from lavender_ext.newton.system cimport NATURAL, solve_natural, system_factor, determinant_sign, system_times
 
 
 cdef inline double exponential(double x) noexcept nogil:
@@ -364,7 +364,7 @@ cdef inline bint factor_path(newton_t* n, const double* z, double tau) noexcept 
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
     system_factor(&n.s, NATURAL, n.path.eps)
-    n.path.sign = system_sign(&n.s)
+    n.path.sign = determinant_sign(&n.s)
     solve_natural(&n.s, n.f, n.dz)
     solve_natural(&n.s, n.c, n.path.b)
     for j in range(m):

@@ -284,7 +284,7 @@ cdef inline void bind_vector_workspace(newton_t* n, double* workspace, int64_t m
 
 
 cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* workspace) noexcept nogil:
-    """Scale the elements of `find_elements` and assign vectors and small matrices in zeros; return the next place.
+    """Scale the elements of `index_unfixed_elements` and assign vectors and small matrices in zeros; return the next place.
 
     The caller then sets `form`, `symmetric` and the fields of the form.
     """

@@ -3,7 +3,7 @@
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   g = D^-1/2 (b - A fixed)
 
 An element is a bounded row, or a contact with its free friction components. Rows with equal bounds, components without
-friction and empty rows of A are fixed and left out. The integers come first (`find_elements`), since the workspace of a
+friction and empty rows of A are fixed and left out. The integers come first (`index_unfixed_elements`), since the workspace of a
 factor over bodies depends on them, then the values (`scale_elements`).
 """
 from libc.math cimport fabs, sqrt
@@ -144,7 +144,7 @@ cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) no
     s.e.scaling = real + 8 * m
 
 
-cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
+cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept nogil:
     """Find the rows that are not fixed and their elements; the arrays are bound by `bind_element_workspace`."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal

@@ -35,11 +35,11 @@ from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTO
                                       bind_judge_workspace, bind_real_workspace, convex_residual, judge_workspace_size,
                                       method_index_size, method_real_size, newton_t, set_problem, set_reference,
                                       write_certificate, write_impulse)
-from lavender_ext.newton.scaling cimport find_elements, form_scaled_matrix, is_known
+from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_known
 from lavender_ext.newton.steps cimport begin_interior_point, combine_pair, interior_step, multiply_duals, normal_shifts
 from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, dense_workspace_size, external_t,
                                          natural_times, solve_natural, solve_refined, system_factor, system_natural,
-                                         system_sign, system_solve, system_times)
+                                         determinant_sign, system_solve, system_times)
 
 SYSTEMS = {"barrier": BARRIER, "pair": PAIR, "natural": NATURAL}
 #: Bits of `Solve.disabled_phases`.
@@ -139,7 +139,7 @@ cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, con
     set_problem(n, &v.p, v.a, NULL, NULL)
     x = bind_judge_workspace(n, r.real)
     bind_index_workspace(n, m, r.index + head())
-    find_elements(&n.sc, v)
+    index_unfixed_elements(&n.sc, v)
     memset(x, 0, method_real_size(m, n.sc.small) * sizeof(double))
     x = bind_real_workspace(n, v, x)
     bind_dense_system(n, o.wide, x, x + m * m, x + 2 * m * m)
@@ -164,7 +164,7 @@ cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, c
             return NEEDS_WORKSPACE
         memset(n, 0, sizeof(newton_t))
         bind_bodies(n, a, r.index + head(), &v.p, v.r)
-        find_elements(&n.sc, v)
+        index_unfixed_elements(&n.sc, v)
         below = order_elements(&n.sc, a, v.r)
         if 6 * below > 2147483647:
             return UNFIT
@@ -293,7 +293,7 @@ cdef class Solve(Method):
         self.held = [matrix, judge]
         bind_judge_workspace(n, <double*>get_data_pointer(judge))
         bind_index_workspace(n, rows, self.space.index + head())
-        find_elements(&n.sc, &v)
+        index_unfixed_elements(&n.sc, &v)
         self.real = allocate_zeros(method_real_size(rows, n.sc.small))
         bind_real_workspace(n, &v, <double*>get_data_pointer(self.real))
         m = self.m = n.sc.e.m
@@ -461,7 +461,7 @@ cdef class Solve(Method):
     @property
     def sign(self):
         """Sign of the determinant of the last "natural" factor; 0 of a sparse or the augmented system."""
-        return system_sign(&self.n.s)
+        return determinant_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):
         """Solve with the last factor."""

@@ -249,7 +249,7 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
     return linear_factor(s.linear) == 0
 
 
-cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
+cdef inline int32_t determinant_sign(const system_t* s) noexcept nogil:
     """Return the sign of the determinant of the last (3); 0 if it is not known."""
     return 0 if s.augmented or s.form == SPARSE else linear_sign(s.linear)
 

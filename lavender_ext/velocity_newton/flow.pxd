@@ -126,19 +126,19 @@ cdef struct flow_t:
 # -- rows and blocks of a run of panels ------------------------------------------------------------------
 
 
-cdef inline int32_t row_from(const flow_t* f, int32_t a) noexcept nogil:
+cdef inline int32_t first_row_of_run(const flow_t* f, int32_t a) noexcept nogil:
     return f.g.prow[f.run[2 * a]]
 
 
-cdef inline int32_t row_end(const flow_t* f, int32_t a) noexcept nogil:
+cdef inline int32_t end_row_of_run(const flow_t* f, int32_t a) noexcept nogil:
     return f.g.prow[f.run[2 * a + 1]]
 
 
-cdef inline int32_t block_from(const flow_t* f, int32_t a) noexcept nogil:
+cdef inline int32_t first_block_of_run(const flow_t* f, int32_t a) noexcept nogil:
     return f.pblock[f.run[2 * a]]
 
 
-cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
+cdef inline int32_t end_block_of_run(const flow_t* f, int32_t a) noexcept nogil:
     return f.pblock[f.run[2 * a + 1]]
 
 
@@ -211,7 +211,7 @@ cdef inline void compute_island_impulses(const flow_t* f, int32_t island, const 
     """Compute lambda and V of an island."""
     cdef int32_t a
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        compute_impulses(f, block_from(f, a), block_end(f, a), s, lam, f.v)
+        compute_impulses(f, first_block_of_run(f, a), end_block_of_run(f, a), s, lam, f.v)
 
 
 # -- products over the rows of A -------------------------------------------------------------------------
@@ -246,7 +246,7 @@ cdef inline void form_y_transpose(const flow_t* f, int32_t island) noexcept nogi
                 row += 1
 
 
-cdef inline void form_column(const flow_t* f, int32_t place) noexcept nogil:
+cdef inline void form_column_of_a(const flow_t* f, int32_t place) noexcept nogil:
     """Form the column of A of the row at this index of the island, unless it is known."""
     cdef int32_t b, nc
     cdef const double* y
@@ -269,7 +269,7 @@ cdef inline bint multiply_a(const flow_t* f, const double* x, double* out) noexc
     cdef double* given = sums + rows
     for a in range(n):
         if x[own[a]] != 0.0:
-            form_column(f, a)
+            form_column_of_a(f, a)
             picks[count] = a * rows
             given[count] = x[own[a]]
             count += 1
@@ -279,7 +279,7 @@ cdef inline bint multiply_a(const flow_t* f, const double* x, double* out) noexc
     return count > 0
 
 
-cdef inline bint apply_transpose(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
+cdef inline bint multiply_y_transpose(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
     """Compute x = Y^T lam on the island's columns, or A lam over rows; return whether any lam is not 0."""
     cdef int32_t a, b, k
     cdef bint moves = False
@@ -288,7 +288,7 @@ cdef inline bint apply_transpose(const flow_t* f, int32_t island, const double* 
     for a in range(f.cptr[island], f.cptr[island + 1]):
         x[f.icols[a]] = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             if lam[k] != 0.0:
                 moves = True
                 break
@@ -298,7 +298,7 @@ cdef inline bint apply_transpose(const flow_t* f, int32_t island, const double* 
     return moves
 
 
-cdef inline void apply_y(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
+cdef inline void multiply_y(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
     """Compute out = Y x on the island's rows."""
     cdef int32_t a, b, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
@@ -311,15 +311,15 @@ cdef inline void copy_rows(const flow_t* f, int32_t island, const double* x, dou
     """Copy x to `to` on the island's rows."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        k = row_from(f, a)
-        memcpy(to + k, x + k, (row_end(f, a) - k) * sizeof(double))
+        k = first_row_of_run(f, a)
+        memcpy(to + k, x + k, (end_row_of_run(f, a) - k) * sizeof(double))
 
 
 cdef inline void clear_rows(const flow_t* f, int32_t island, double* out) noexcept nogil:
     """Set out = 0 on the island's rows."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             out[k] = 0.0
 
 
@@ -334,9 +334,9 @@ cdef inline void recompute_slack(const flow_t* f, int32_t island) noexcept nogil
     elif f.is_over_rows:
         multiply_a(f, f.y, s)
     else:
-        apply_y(f, island, f.y, s)
+        multiply_y(f, island, f.y, s)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             s[k] += phi[k] - b[k]
 
 
@@ -344,7 +344,7 @@ cdef inline double measure_error(const flow_t* f, int32_t island, const double* 
                            double* velocity) noexcept nogil:
     """Compute the energy [sqrt J] and velocity [m/s] of the errors of lam; NaN if they are not finite.
 
-    `u` must hold `apply_transpose` of lam; it is taken as 0 unless `moves`.
+    `u` must hold `multiply_y_transpose` of lam; it is taken as 0 unless `moves`.
     """
     cdef int32_t a, i, k, end, last
     cdef const int32_t* ptr = f.p.ptr
@@ -361,16 +361,16 @@ cdef inline double measure_error(const flow_t* f, int32_t island, const double* 
     elif f.is_over_rows:
         copy_rows(f, island, f.u, w)
     else:
-        apply_y(f, island, f.u, w)
+        multiply_y(f, island, f.u, w)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]
         if f.bounded_rows_only:
-            for k in range(row_from(f, a), row_end(f, a)):
+            for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
                 add_row_error(&f.p, k, compute_row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
             continue
-        last = block_end(f, a)
-        for i in range(block_from(f, a), last):
+        last = end_block_of_run(f, a)
+        for i in range(first_block_of_run(f, a), last):
             if has_independent_rows(&f.p, i):
                 end = ptr[i + 1]
                 for k in range(ptr[i], end):

@@ -9,8 +9,8 @@ from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction, has_independent_rows
 from lavender_ext.core.roots cimport find_root
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.velocity_newton.flow cimport flow_t, row_end, row_from
-from lavender_ext.velocity_newton.sparse cimport count_mass_factor_work, find_pattern, pattern_marks
+from lavender_ext.velocity_newton.flow cimport flow_t, end_row_of_run, first_row_of_run
+from lavender_ext.velocity_newton.sparse cimport count_mass_factor_work, find_pattern, pattern_index_size
 
 
 cdef enum:
@@ -57,7 +57,7 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
                     r = k
 
 
-cdef inline void measure_panels(flow_t* f, requirements_t* need) noexcept nogil:
+cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
     """Write the first block of each panel, the offsets of V, and the sizes of the largest panels."""
     cdef int32_t b, i = 0, size, nc, rows, at = 0
     cdef const int32_t* ptr = f.p.ptr
@@ -152,7 +152,7 @@ cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t
     cdef bint applies
     cdef double rows = 0.0, values = 0.0, normal = 0.0, added = 0.0, formed, size = f.cptr[island + 1] - f.cptr[island], v, nc
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        rows += row_end(f, a) - row_from(f, a)
+        rows += end_row_of_run(f, a) - first_row_of_run(f, a)
         for b in range(f.run[2 * a], f.run[2 * a + 1]):
             v = f.g.pval[b + 1] - f.g.pval[b]
             nc = f.g.pcol[b + 1] - f.g.pcol[b]
@@ -173,16 +173,16 @@ cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t
     return True
 
 
-cdef inline ssize_t index_size(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
-    """Return the number of int32 that `find_structure` uses with `per` entries in each row of L."""
+cdef inline ssize_t structure_workspace_size(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
+    """Return the number of int32 that `find_islands_and_factor_patterns` uses with `per` entries in each row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
     return (3 * n + (n if n > panels else panels) + 6 * panels + 5 * <ssize_t>p.n_rows + g.pcol[panels] + p.n_blocks + 8
-            + pattern_marks(n, g.pcol[panels], per))
+            + pattern_index_size(n, g.pcol[panels], per))
 
 
-cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
+cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
                         requirements_t* need) noexcept nogil:
-    """Find the islands of a problem and the pattern of L of each; w (`index_size`) is their memory."""
+    """Find the islands of a problem and the pattern of L of each; w (`structure_workspace_size`) is their memory."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size
     cdef int32_t* over_rows
@@ -210,7 +210,7 @@ cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_
     over_rows = w + at
     f.over_rows = over_rows
     at += panels
-    measure_panels(f, need)
+    index_panels(f, need)
     find_islands(f, w, w + n, need)
     f.linear.swap = w                                     # The scratch of `find_islands` is free again.
     f.paused.island = -1
@@ -293,7 +293,8 @@ cdef inline void bind_real_workspace(flow_t* f, const requirements_t* need, doub
     f.a = NULL
 
 
-cdef inline void set_goal(flow_t* f, double tol, int32_t steps, double reference_energy, double reference_velocity) noexcept nogil:
+cdef inline void set_required_residual(flow_t* f, double tol, int32_t steps, double reference_energy,
+                                       double reference_velocity) noexcept nogil:
     """Set the required relative residual and the reference of a problem with one island; reset the counts."""
     f.tol, f.reference_energy, f.reference_velocity = tol, reference_energy, reference_velocity
     f.steps = steps

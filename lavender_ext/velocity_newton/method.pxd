@@ -8,10 +8,10 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, require_workspace, options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
-from lavender_ext.velocity_newton.islands cimport (bind_real_workspace, find_structure, index_size, real_size,
-                                                   requirements_t, set_goal)
+from lavender_ext.velocity_newton.islands cimport (bind_real_workspace, find_islands_and_factor_patterns, real_size,
+                                                   requirements_t, set_required_residual, structure_workspace_size)
 from lavender_ext.velocity_newton.newton cimport solve_islands
-from lavender_ext.velocity_newton.sparse cimport per_column
+from lavender_ext.velocity_newton.sparse cimport initial_entries_per_row
 
 
 cdef struct state_t:            # at the beginning of the integer workspace
@@ -20,9 +20,9 @@ cdef struct state_t:            # at the beginning of the integer workspace
     int32_t done                # steps so far
 
 
-cdef inline int32_t general_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
+cdef inline int32_t islands_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Write the size of the integer workspace for the smallest pattern; the real size follows from the pattern."""
-    r.n_index = sizeof(state_t) // sizeof(int32_t) + index_size(&v.p, v.g, per_column(v.g.n) << r.tries)
+    r.n_index = sizeof(state_t) // sizeof(int32_t) + structure_workspace_size(&v.p, v.g, initial_entries_per_row(v.g.n) << r.tries)
     r.n_real = 0
     return 1
 
@@ -36,18 +36,18 @@ cdef inline bint exceeds_limits(const options_t* o, const requirements_t* need, 
     return entries > o.most or 0.0 < o.work < 0.5 * factored * factored / n
 
 
-cdef inline int32_t general_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
+cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     """Find the structure, then bind the workspace; NEEDS_WORKSPACE, UNFIT or MORE."""
     cdef state_t* s = <state_t*>r.index
     cdef requirements_t* need = &s.need
     cdef int32_t per
     cdef workspace_t smallest = r[0]
     while not r.is_bound:
-        general_workspace_size(v, o, &smallest)
+        islands_workspace_size(v, o, &smallest)
         if not require_workspace(r, smallest.n_index, 0):
             return NEEDS_WORKSPACE
-        per = per_column(v.g.n) << r.tries
-        find_structure(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
+        per = initial_entries_per_row(v.g.n) << r.tries
+        find_islands_and_factor_patterns(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
         r.is_bound = not need.exceeds_pattern
         r.work, r.islands = need.work, s.f.n_islands
         if (need.exceeds_pattern and exceeds_limits(o, need, <double>per * v.g.n, v.g.n)
@@ -58,12 +58,12 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, workspace
         return NEEDS_WORKSPACE
     bind_real_workspace(&s.f, need, r.real)
     s.f.wide = o.wide
-    set_goal(&s.f, o.tol, 0, o.e0, o.v0)
+    set_required_residual(&s.f, o.tol, 0, o.e0, o.v0)
     s.done = 0
     return MORE
 
 
-cdef inline int32_t general_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
+cdef inline int32_t advance_islands(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                  info_t* info) noexcept nogil:
     """Step the islands, beginning with a paused one."""
     cdef state_t* s = <state_t*>r.index

@@ -41,11 +41,11 @@ from lavender_ext.core.block_types cimport (
 )
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.velocity_newton.flow cimport (UNFORMED, apply_transpose, block_end, block_from, clear_rows,
+from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_error,
-                                                paused_t, recompute_slack, row_end, row_from)
+                                                paused_t, recompute_slack, end_row_of_run, first_row_of_run)
 from lavender_ext.velocity_newton.normal cimport factor_normal_matrix, form_normal_matrix, is_v_unchanged, solve_step
-from lavender_ext.velocity_newton.soft cimport min_softness
+from lavender_ext.velocity_newton.soft cimport min_relative_compliance
 
 
 cdef enum:                      # stages of a round of Coulomb friction
@@ -62,20 +62,20 @@ cdef enum:
 # -- line searches ----------------------------------------------------------------------------------------------
 
 
-cdef inline void evaluate_along(const flow_t* f, int32_t island, double t) noexcept nogil:
+cdef inline void evaluate_on_line(const flow_t* f, int32_t island, double t) noexcept nogil:
     """Evaluate w = s + t q, lambda (in `trial`) and V at y + t p."""
     cdef int32_t a, k
     cdef double* w = f.w
     cdef const double* s = f.s
     cdef const double* q = f.q
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             w[k] = s[k] + t * q[k]
     compute_island_impulses(f, island, w, f.trial)
 
 
 cdef inline void accept_trial(flow_t* f) noexcept nogil:
-    """Make the point that `evaluate_along` evaluated last the iterate."""
+    """Make the point that `evaluate_on_line` evaluated last the iterate."""
     cdef double* x = f.s
     f.s = f.w
     f.w = x
@@ -89,10 +89,10 @@ cdef inline double directional_derivative(flow_t* f, int32_t island, double py, 
     cdef int32_t a, k
     cdef double out = py + t * pp
     f.evaluations += 1
-    evaluate_along(f, island, t)
+    evaluate_on_line(f, island, t)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        k = row_from(f, a)
-        out -= dot(f.q + k, f.trial + k, row_end(f, a) - k)
+        k = first_row_of_run(f, a)
+        out -= dot(f.q + k, f.trial + k, end_row_of_run(f, a) - k)
     return out
 
 
@@ -150,14 +150,14 @@ cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
     return t
 
 
-cdef inline double search_residual(flow_t* f, int32_t island, double bound) noexcept nogil:
+cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, double bound) noexcept nogil:
     """Halve t until |G| is below `bound` (Coulomb's law); return 0 if that fails."""
     cdef int32_t a, c, _n
     cdef double t = 1.0, size
     for _n in range(8):
         f.evaluations += 1
-        evaluate_along(f, island, t)
-        apply_transpose(f, island, f.trial, f.u)
+        evaluate_on_line(f, island, t)
+        multiply_y_transpose(f, island, f.trial, f.u)
         size = 0.0
         for a in range(f.cptr[island], f.cptr[island + 1]):
             c = f.icols[a]
@@ -176,7 +176,7 @@ cdef inline void move_center(const flow_t* f, int32_t island) noexcept nogil:
     copy_rows(f, island, f.lam, f.center)
 
 
-cdef inline void equalize_theta(double* theta, int32_t first, int32_t end) noexcept nogil:
+cdef inline void set_theta_to_maximum(double* theta, int32_t first, int32_t end) noexcept nogil:
     """Set theta of rows [first, end) to the largest of these."""
     cdef double big = 0.0
     cdef int32_t k
@@ -188,7 +188,7 @@ cdef inline void equalize_theta(double* theta, int32_t first, int32_t end) noexc
 
 
 cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double softness) noexcept nogil:
-    """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_softness` d.
+    """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_relative_compliance` d.
 
     Rows of one friction component softness the largest theta'.
     """
@@ -201,11 +201,11 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
     cdef double* soft = f.inv_theta
     cdef double x, low
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        last = block_end(f, a)
-        for i in range(block_from(f, a), last):
+        last = end_block_of_run(f, a)
+        for i in range(first_block_of_run(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = min_softness(&f.p, i)
+            low = min_relative_compliance(&f.p, i)
             if softness < low:
                 low = softness
             for k in range(j, end):
@@ -217,7 +217,7 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
-                        equalize_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
+                        set_theta_to_maximum(theta, j + q.first[g], j + q.first[g] + q.size[g])
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
@@ -228,7 +228,7 @@ cdef inline bint has_proximal_terms(const flow_t* f, int32_t island) noexcept no
     """Return whether any proximal term exceeds rounding."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             if f.rho[k] > 1e-13 * f.theta[k]:
                 return True
     return False
@@ -239,7 +239,7 @@ cdef inline double proximal_error(const flow_t* f, int32_t island) noexcept nogi
     cdef int32_t a, k
     cdef double x, out = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             x = f.rho[k] * (f.lam[k] - f.center[k])
             out += x * x / f.p.d[k]
     return sqrt(out)
@@ -323,7 +323,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         if not x.response_is_known:
             compute_island_impulses(f, island, f.s, f.lam)
         x.response_is_known = 0
-        moves = apply_transpose(f, island, f.lam, f.u)
+        moves = multiply_y_transpose(f, island, f.lam, f.u)
         size = compute_gradient(f)
         over = score_iterate(f, island, moves, &energy)
         if over != over:
@@ -362,7 +362,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
                 if x.sizes[a] > bound:
                     bound = x.sizes[a]
             x.sizes[x.steps % 3] = size
-            t = search_residual(f, island, bound)
+            t = halve_step_until_residual_falls(f, island, bound)
         else:
             t = search_line(f, island)
         if t == 0.0:
@@ -391,13 +391,13 @@ cdef inline double normal_shift(const flow_t* f, int32_t i) noexcept nogil:
     return out
 
 
-cdef inline void lower_normals(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
+cdef inline void compute_normal_shifts(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """Compute phi from the slack of lam; phi must be 0 before."""
     cdef int32_t a, i
     cdef double velocity
-    measure_error(f, island, lam, apply_transpose(f, island, lam, f.u), &velocity)
+    measure_error(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for i in range(block_from(f, a), block_end(f, a)):
+        for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
             if not has_independent_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
                 f.phi[f.p.ptr[i]] = normal_shift(f, i)
 
@@ -407,19 +407,19 @@ cdef inline void clear_normal_shift(const flow_t* f, int32_t island) noexcept no
     clear_rows(f, island, f.phi)
 
 
-cdef inline void restart_from(flow_t* f, int32_t island, const double* lam) noexcept nogil:
+cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """Set y = Y^T lam, and the centre and the best impulse to lam."""
     cdef int32_t a, c
     copy_rows(f, island, lam, f.lam)
     copy_rows(f, island, lam, f.best)                   # `best` must be set even if all later errors overflow.
     move_center(f, island)
-    f.is_zero = not apply_transpose(f, island, lam, f.u)
+    f.is_zero = not multiply_y_transpose(f, island, lam, f.u)
     for a in range(f.n_unknowns):
         c = f.unknowns[a]
         f.y[c] = lam[c] if f.is_over_rows else f.u[c]
 
 
-cdef inline bint offer_impulse(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
+cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
     """Keep lam in `island_best` if its error under the problem's own law is lower; phi must be 0, `u` as in `measure_error`.
 
     Return whether the error is lower than that of the points at which no call ended.
@@ -456,7 +456,7 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
             f.rounds += 1
             x.stage = CONVEX_STAGE if x.rounds > 0 or x.cold else COULOMB_STAGE
             if x.stage == COULOMB_STAGE:
-                restart_from(f, island, impulse)
+                restart_island_from_impulse(f, island, impulse)
             begin_descent(f, island, CONE if x.stage == CONVEX_STAGE else COULOMB, 1.0 / 0.0)
         f.p.law = CONE if x.stage == CONVEX_STAGE else COULOMB
         n = descend_island(f, island, 0.1 * least if x.stage == CONVEX_STAGE and least > 1e2 else 1.0)
@@ -467,11 +467,11 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
                 copy_rows(f, island, f.phi, f.paused_start)
             copy_rows(f, island, f.best, impulse)
             clear_normal_shift(f, island)
-            offer_impulse(f, island, impulse, apply_transpose(f, island, impulse, f.u))
+            keep_impulse_if_better(f, island, impulse, multiply_y_transpose(f, island, impulse, f.u))
         else:
             if n == MORE:
                 copy_rows(f, island, impulse, f.paused_start)
-            if n != LOST and offer_impulse(f, island, f.best, apply_transpose(f, island, f.best, f.u)):
+            if n != LOST and keep_impulse_if_better(f, island, f.best, multiply_y_transpose(f, island, f.best, f.u)):
                 copy_rows(f, island, f.best, impulse)
         if x.best_error <= 1.0:
             return REACHED
@@ -479,9 +479,9 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
             x.best_error = least                        # The point at which a call ends must not change the path.
             return MORE
         if x.stage == COULOMB_STAGE:
-            lower_normals(f, island, impulse)
+            compute_normal_shifts(f, island, impulse)
             x.rounds += 1
-        restart_from(f, island, impulse)
+        restart_island_from_impulse(f, island, impulse)
         x.stage = COULOMB_STAGE if x.stage == CONVEX_STAGE else NEXT_ROUND
         if x.stage == COULOMB_STAGE:
             begin_descent(f, island, COULOMB, 1.0 / 0.0)
@@ -496,12 +496,12 @@ cdef inline void set_error_limits(flow_t* f, int32_t island) noexcept nogil:
     cdef const double* own
     cdef double energy = f.reference_energy, velocity = f.reference_velocity
     if f.p.islands != NULL:
-        own = f.p.islands.reference + 2 * f.p.islands.label[block_from(f, f.iptr[island])]
+        own = f.p.islands.reference + 2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]
         energy, velocity = max(own[0], 0.0), max(own[1], 0.0)
     f.energy_limit, f.velocity_limit = f.tol * energy, f.tol * velocity
 
 
-cdef inline void enter_island(flow_t* f, int32_t island) noexcept nogil:
+cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogil:
     """Choose the unknowns of an island, velocities or rows; no column of A is formed yet."""
     cdef int32_t a, k
     set_error_limits(f, island)
@@ -511,7 +511,7 @@ cdef inline void enter_island(flow_t* f, int32_t island) noexcept nogil:
         return
     f.unknowns, f.n_unknowns, f.rows = f.row_list, 0, f.n_unknowns      # `rows`: the columns of Y^T, until the end.
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             f.row_list[f.n_unknowns] = k
             f.n_unknowns += 1
     k, f.rows = f.rows, f.n_unknowns + 3 & ~3
@@ -522,10 +522,10 @@ cdef inline void enter_island(flow_t* f, int32_t island) noexcept nogil:
 cdef inline bint is_at_rest(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """Return whether no row of the island acts; its impulse is then the zero impulse, which solves it."""
     cdef int32_t a, k
-    if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[block_from(f, f.iptr[island])]] >= 0.0:
+    if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]] >= 0.0:
         return False
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             impulse[k] = clip_zero_to_row_bounds(&f.p, k)
     return True
 
@@ -536,14 +536,14 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
     cdef bint waits = f.paused.island == island
     f.island = island
     if not waits:
-        enter_island(f, island)
+        choose_island_unknowns(f, island)
         if is_at_rest(f, island, impulse):
             return REACHED
-        restart_from(f, island, impulse)
+        restart_island_from_impulse(f, island, impulse)
         clear_normal_shift(f, island)
         f.paused.stage, f.paused.rounds = NEXT_ROUND, 0
         f.paused.best_error = f.paused.island_error = 1.0 / 0.0
-        if not offer_impulse(f, island, impulse, not f.is_zero):
+        if not keep_impulse_if_better(f, island, impulse, not f.is_zero):
             return LOST
         if f.paused.best_error <= 1.0:
             return REACHED

@@ -18,7 +18,7 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport has_independent_rows
 from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_dense, analyse_tree, linear_factor, linear_solve, linear_t
 from lavender_ext.factor.tiles cimport combine_rows
-from lavender_ext.velocity_newton.flow cimport block_end, block_from, form_column, flow_t, apply_y
+from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_run, form_column_of_a, flow_t, multiply_y
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
@@ -58,7 +58,8 @@ cdef inline void add_row_3(double* out, const double* x, const double* y, const 
         out[i] += (f * x[i] + g * y[i]) + h * z[i]
 
 
-cdef inline int32_t weigh_block(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y, int32_t n) noexcept nogil:
+cdef inline int32_t multiply_block_by_v(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y,
+                                        int32_t n) noexcept nogil:
     """Append the non-zero rows of V Y of block i to the n rows of `weighted_y`; return their new number.
 
     `row` is the block's first row within its panel. `line`, after the columns, stores the row of Y of each.
@@ -171,8 +172,8 @@ cdef inline bint is_v_unchanged(const flow_t* f, int32_t island) noexcept nogil:
     """Return whether N was formed with the present V."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        end = f.vptr[block_end(f, a)]
-        for k in range(f.vptr[block_from(f, a)], end):
+        end = f.vptr[end_block_of_run(f, a)]
+        for k in range(f.vptr[first_block_of_run(f, a)], end):
             if f.v[k] != f.factored_v[k]:
                 return False
     return True
@@ -182,8 +183,8 @@ cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
     """Store V, with which N is formed."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        end = f.vptr[block_end(f, a)]
-        for k in range(f.vptr[block_from(f, a)], end):
+        end = f.vptr[end_block_of_run(f, a)]
+        for k in range(f.vptr[first_block_of_run(f, a)], end):
             f.factored_v[k] = f.v[k]
 
 
@@ -196,7 +197,7 @@ cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* 
     cdef const double* v
     cdef bint is_free
     for a in range(f.iptr[f.island], f.iptr[f.island + 1]):
-        for i in range(block_from(f, a), block_end(f, a)):
+        for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
             v, end = f.factored_v + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
             size = 1 if has_independent_rows(&f.p, i) else end - place
             while place < end:
@@ -205,7 +206,7 @@ cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* 
                     is_free |= v[k] != 0.0
                 if is_free and t == NULL:
                     for r in range(size):
-                        form_column(f, place + r)
+                        form_column_of_a(f, place + r)
                         f.places[n + r], f.columns[n + r] = place + r, (place + r) * f.rows
                     for r in range(size):
                         combine_rows(f.wide, f.rows, size, f.a, f.columns + n, v + r * size, x + <ssize_t>(n + r) * f.rows)
@@ -233,7 +234,7 @@ cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
         return
     for a in range(f.n_unknowns):
         if f.v[f.unknowns[a]] != 0.0:
-            form_column(f, a)
+            form_column_of_a(f, a)
             f.places[n], f.columns[n] = a, a * f.rows
             n += 1
     for a in range(n):
@@ -299,7 +300,7 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noex
             n = 0
             last = f.pblock[b + 1]
             for i in range(f.pblock[b], last):
-                n = weigh_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
+                n = multiply_block_by_v(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
             if n > 0 and square:
                 add_to_dense(f, b, n, size)
             elif n > 0:
@@ -348,4 +349,4 @@ cdef inline void solve_step(flow_t* f, int32_t island, bint square) noexcept nog
         linear_solve(&f.linear, f.local_rhs)
         for a in range(size):
             f.step[f.icols[c0 + a]] = f.local_rhs[a]
-    apply_y(f, island, f.step, f.q)
+    multiply_y(f, island, f.step, f.q)

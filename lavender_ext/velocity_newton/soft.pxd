@@ -5,7 +5,7 @@ from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
 from lavender_ext.core.view cimport generalized_t
 
 
-cdef inline double min_softness(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline double min_relative_compliance(const blocks_t* p, int32_t i) noexcept nogil:
     """Return the compliance, as a fraction of d, from which a block needs no proximal term.
 
     With less, Newton's method without a proximal term takes more steps, since the kinks of lambda(s) are sharper.
@@ -13,11 +13,11 @@ cdef inline double min_softness(const blocks_t* p, int32_t i) noexcept nogil:
     return 1e-6 if has_independent_rows(p, i) else 1e-3
 
 
-cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
+cdef inline bint needs_no_proximal_terms(const blocks_t* p, const generalized_t* g) noexcept nogil:
     """Return whether no block needs a proximal term."""
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not g.compliance[k] >= min_softness(p, i) * p.d[k]:
+            if not g.compliance[k] >= min_relative_compliance(p, i) * p.d[k]:
                 return False
     return True

@@ -19,12 +19,12 @@ cdef enum:
     COLUMN_SEARCH_WORK = 8      # Skipping one column in the search for a row's places takes the time of this many multiply-adds.
 
 
-cdef inline int32_t per_column(int32_t n) noexcept nogil:
+cdef inline int32_t initial_entries_per_row(int32_t n) noexcept nogil:
     """Return the entries per row of L, of n columns, that the first workspace provides."""
     return FIRST_ROW_ENTRIES if n > MAX_DENSE_COLUMNS else (n + 1) // 2
 
 
-cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:
+cdef inline ssize_t pattern_index_size(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:
     """Return the number of int32 that `find_pattern` uses: n columns, `per` entries per row, `reached` columns of panels."""
     return (per + 7) * n + reached + 2
 
@@ -33,7 +33,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
                                  const int32_t* cptr, const int32_t* local, int32_t per, int32_t* w) noexcept nogil:
     """Write the rows of L of all islands, columns numbered within the island; return the entries, or -1 if w is too small.
 
-    w (`pattern_marks`) receives the row pointers (n + 1) and the columns; the rest is scratch.
+    w (`pattern_index_size`) receives the row pointers (n + 1) and the columns; the rest is scratch.
     """
     cdef int32_t n = cptr[n_islands], workspace = per * g.n, i, a, b, q, k, base, first, end, most, count
     cdef int32_t* lptr = w

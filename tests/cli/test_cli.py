@@ -402,7 +402,7 @@ def _must_not_begin(*_, **__):
         ("phenomena lift --out {}/x.json", "lavender.lab.phenomena.run"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.export.library.source"),
-        ("web page {}/sub", "lavender.sim.web.pages.get_module"),
+        ("web page {}/sub", "lavender.sim.web.pages.get_or_build_module"),
         ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve_sources"),
         ("report toy_stack --workers 1 --out {}/sub", "lavender.lab.bench.resolve_sources"),
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),

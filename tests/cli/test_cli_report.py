@@ -201,10 +201,10 @@ def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
         watch(Event(1, 5, "timing: a setting", "", remaining=40.2))
     assert capsys.readouterr().err == "1 of 5, 0 s, about 40 s remain: timing: a setting\n"
     event = Event(20, 80, "stack", "newton")
-    assert measuring.format_remaining(event, 10.0) == "about 30 s remain"
-    assert measuring.format_remaining(event, 100.0) == "about 5 min remain"
-    assert measuring.format_remaining(event, 0.1) == ""  # too early
-    assert measuring.format_remaining(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
+    assert measuring.format_remaining_time(event, 10.0) == "about 30 s remain"
+    assert measuring.format_remaining_time(event, 100.0) == "about 5 min remain"
+    assert measuring.format_remaining_time(event, 0.1) == ""  # too early
+    assert measuring.format_remaining_time(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
 
 
 def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):

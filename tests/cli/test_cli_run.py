@@ -103,7 +103,7 @@ CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
 
 
 def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
-    monkeypatch.setattr(pages, "get_module", lambda say, name: name.encode())
+    monkeypatch.setattr(pages, "get_or_build_module", lambda say, name: name.encode())
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     with pytest.raises(LavenderError, match="in tests/sim/web of a checkout"):
         pages.compare_with_native_kernels()
@@ -123,7 +123,7 @@ process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === 
         pytest.skip("needs Node")
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     for data, code in ((str.encode, 0), (lambda name: b"other", 1)):
-        monkeypatch.setattr(pages, "get_module", lambda say, name, data=data: data(name))
+        monkeypatch.setattr(pages, "get_or_build_module", lambda say, name, data=data: data(name))
         assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
 
 

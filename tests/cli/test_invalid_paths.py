@@ -30,7 +30,7 @@ from lavender.io.stored import (
     FOLDER_LOCK,
     TEMPORARY_NAME,
     lock_output,
-    open_step_folder,
+    lock_step_folder,
     write_atomically,
     write_text,
 )
@@ -341,13 +341,13 @@ def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
 
 
 def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
-    with open_step_folder(tmp_path):
+    with lock_step_folder(tmp_path):
         for replace in (False, True):
             with pytest.raises(lv.InputError, match="is being written by another command"):
                 run(lv.Simulation("stack"), 3, record=tmp_path, replace=replace)
         with pytest.raises(lv.InputError, match="is being written by another command"):
             lv.Simulation("stack").record(tmp_path, 3)
-    holder = "import os, signal, lavender.io.stored as s; s.open_step_folder('.').__enter__(); os.kill(os.getpid(), 9)"
+    holder = "import os, signal, lavender.io.stored as s; s.lock_step_folder('.').__enter__(); os.kill(os.getpid(), 9)"
     python("-c", holder, cwd=tmp_path, status=-signal.SIGKILL)
     simulation = lv.Simulation("stack")
     assert len(simulation.record(tmp_path, 2)) == 2
@@ -359,7 +359,7 @@ def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
 def test_a_new_recording_removes_the_description_of_the_old_one(tmp_path):
     for name in ("engine.jsonl", "step_1.npz"):
         (tmp_path / name).write_text("of before")
-    with open_step_folder(tmp_path, replace=True) as folder:
+    with lock_step_folder(tmp_path, replace=True) as folder:
         assert folder == tmp_path
         assert [p.name for p in tmp_path.iterdir()] == [FOLDER_LOCK]
     assert not list(tmp_path.iterdir())

@@ -25,7 +25,7 @@ from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.contract.checks import make_problems_of_every_kind
 from lavender.contract.enumeration import random_bounds
-from lavender.contract.problems import change_numbers
+from lavender.contract.problems import make_problem_with_other_numbers
 from lavender.judge.residuals import get_reference
 from lavender.solvers.auto import Tree, make_step
 from lavender.solvers.newton_systems import general
@@ -56,7 +56,7 @@ def prepare_and_solve(problem, name, **options):
 
 
 def prepare_other_numbers(problem, name, **options):
-    prepared = lv.prepare(change_numbers(problem), name)
+    prepared = lv.prepare(make_problem_with_other_numbers(problem), name)
     prepared.solve(**options)
     found = prepared.solve(problem, **options)
     assert facts(prepared.solve(**options)) == facts(found), "the problem given last is kept"

@@ -14,7 +14,7 @@ from invalid_values import (
     check_memory_layouts,
     public_calls,
 )
-from random_problems import random_contact_problem, random_rows
+from random_problems import random_bodies_and_contacts, random_contact_problem
 
 import lavender as lv
 
@@ -23,7 +23,7 @@ ONES = np.ones(2)
 LCP = lv.Problem.lcp(A, B, key=np.array([3, 4]))
 LINEAR = replace(LCP, cones=lv.Cones.free(2))
 CONTACT = random_contact_problem(3)
-ROWS = random_rows(np.random.default_rng(0))
+ROWS = random_bodies_and_contacts(np.random.default_rng(0))
 ROW_ARRAYS = {f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"}
 N_JOINT_ROWS, N_CONTACTS = len(ROWS.jac), len(ROWS.normal)
 SLIDING = lv.Cones.contacts(0.5, tangents=1)
@@ -311,7 +311,7 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(
         ("Batch.make_kernel_worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
-         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_as_late",
+         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.store_late_start",
          "Problem.on_disk", "Residuals.store_residual", "Solution.late", "Solution.of", "Solution.unstretched",
          "Solutions.store_solution", "Solutions.store_late_solution", "Solutions.get_start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",

@@ -28,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 import lavender as lv
 from lavender import io
 from lavender.io import fclib
-from lavender.io.condensed import max_condensed_entries
+from lavender.io.condensed import bound_condensed_entries
 
 h5py = pytest.importorskip("h5py")
 resource = pytest.importorskip("resource")
@@ -334,7 +334,7 @@ def test_a_condensed_matrix_is_at_most_as_large_as_predicted():
             mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
         file = contents(mass, h)
         label = connected_components(file.M, directed=False)[1]
-        assert file.build_problem().csr.nnz <= max_condensed_entries(label, file.H)
+        assert file.build_problem().csr.nnz <= bound_condensed_entries(label, file.H)
 
 
 def test_dense_factors_are_rejected_and_banded_ones_are_not():

@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import CONTACTS, FORMS, random_contact_problem, random_general, random_lcp, seeds
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    random_contact_problem,
+    random_generalized_problem,
+    random_lcp,
+    seeds,
+)
 
 import lavender as lv
 import lavender.io
@@ -83,7 +90,7 @@ def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
 def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("npz") / "p.npz"
     bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]
-    for problem in (*bodies, random_lcp(seed), random_general(seed, tangents=5)):
+    for problem in (*bodies, random_lcp(seed), random_generalized_problem(seed, tangents=5)):
         lavender.io.save(problem, path)
         stored = lavender.io.read(path)
         assert stored.problem == pickle.loads(pickle.dumps(stored)).problem == problem

@@ -61,8 +61,8 @@ def test_the_number_of_worlds_follows_from_the_time_of_one(boxes, monkeypatch):
     clock = iter([0.0, 0.5, 0.0, 1e-9])
     monkeypatch.setattr(module, "perf_counter", lambda: next(clock))
     runs = Runs(str(boxes()), 1, 5)
-    assert module.choose_worlds(runs, ("float64", 1e-6), 2) == 240  # 60 s in 2 processes, 0.5 s each
-    assert module.choose_worlds(runs, ("float64", 1e-6), 2) == module.MAX_DEFAULT_WORLDS
+    assert module.choose_world_count(runs, ("float64", 1e-6), 2) == 240  # 60 s in 2 processes, 0.5 s each
+    assert module.choose_world_count(runs, ("float64", 1e-6), 2) == module.MAX_DEFAULT_WORLDS
 
 
 def test_a_busy_machine_is_named_and_changes_no_error(boxes, monkeypatch):

@@ -29,9 +29,9 @@ def test_the_manifest_has_every_problem_of_every_set_in_order():
 def test_problems_are_made_again_with_the_same_numbers(start):
     chosen, _ = collection.select_buildable(e for e in ENTRIES[start::15] if e.rows < 2000)
     chosen = [e for e in chosen if e.made == suite.get_package_versions(suite.get_model_package(e.name))]
-    assert list(collection.find_changes(chosen)) == []
+    assert list(collection.find_changed_problems(chosen)) == []
     wrong = replace(chosen[0], sha="0" * 16)
-    (line,) = collection.find_changes([wrong])
+    (line,) = collection.find_changed_problems([wrong])
     assert wrong.name in line and wrong.sha in line
 
 
@@ -48,7 +48,7 @@ def test_no_problem_hangs_on_the_processor(other):
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     if "SkylakeX" in other.values() and not set(found) & set(AVX512.split()):
         pytest.skip("this processor has no AVX-512")
-    changed = "c.find_changes(e for e in c.load_manifest() if not e.made)"
+    changed = "c.find_changed_problems(e for e in c.load_manifest() if not e.made)"
     code = f"from lavender.lab import collection as c; print(*{changed}, sep='\\n', end='')"
     assert subprocess.check_output([sys.executable, "-c", code], env=os.environ | other, text=True) == ""
 

@@ -263,7 +263,7 @@ def test_where_nothing_is_solved_nobody_agrees_and_there_is_no_reference():
 def test_an_impulse_no_better_than_none_is_excused_by_nobody():
     problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
     assert lv.residual(problem, problem.guess).roundoff_floor > 1.0
-    reference = lv.motion.store_if_better(problem, problem.guess)
+    reference = lv.motion.store_reference_if_better(problem, problem.guess)
     assert not reference.is_accepted
     assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
     assert len(lv.find_solutions(problem)) == 0

@@ -79,8 +79,8 @@ CALLS = {
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),
     "suite.names": Call(suite.names, {"text": "@hard"}, {"text": "set"}),
-    "motion.store_if_better": Call(
-        motion.store_if_better, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
+    "motion.store_reference_if_better": Call(
+        motion.store_reference_if_better, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
         accepts={"solver": ("an object", "an ellipsis", "bytes")},
     ),
     "motion.converge_to_solution": Call(motion.converge_to_solution, {"problem": LCP, "impulse": B}),

@@ -24,7 +24,7 @@ class Frozen(Stepping):
     def step(self):
         pass
     def get_state(self):
-        return self.initial_state()
+        return self.make_initial_state()
 """
 
 

@@ -48,7 +48,7 @@ def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
     handle, made = runs.load_model()
-    stage = Stage.from_runs(handle, made, runs, [0], 10)
+    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
     same = stage.judge_setting(Setting.from_options(handle, made, **mujoco_settings.CONVERGED_OPTIONS))
     assert same.motion.max() == 0.0 and same.worst_error < 1e-9
 
@@ -56,7 +56,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
 def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
     runs = Runs(str(boxes()), 1, 40)
     handle, made = runs.load_model()
-    stage = Stage.from_runs(handle, made, runs, [0], 10)
+    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
     found = [stage.judge_setting(s) for s in (Setting(), Setting((("iterations", 5),)))]
     rng, now = np.random.default_rng(1), 0.0
 

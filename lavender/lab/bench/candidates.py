@@ -15,7 +15,7 @@ from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import UNLIMITED_ITERATIONS, Plan
 from lavender.lab.bench.running.timing import CallSpec
-from lavender.lab.bench.statistics import drop_idle_cases
+from lavender.lab.bench.statistics import drop_cases_solved_at_zero
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import exceeds_default_budget
 from lavender.solvers.registry import specs
@@ -42,7 +42,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallS
         equal = [c for c in subject.best.ranking if c.solved == best.solved]
         near = [c for i, c in enumerate(equal) if i < 2 or c.score <= CANDIDATE_TIME_RATIO * best.score]
         for solver in [c.solver for c in near[:MAX_CANDIDATES]]:
-            max_iter = _required_max_iter(records, solver, tolerance)
+            max_iter = _find_required_max_iter(records, solver, tolerance)
             # Carrying impulses has its price: if steps are quick, a cold start may be faster.
             for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
                 call_specs.append(
@@ -52,17 +52,17 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallS
         single = select_calls(records, subject.timing_mode, interleaved=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
-                call_specs += _list_time_limited(records, subject, single, advice, tolerance)
+                call_specs += _list_time_limited_calls(records, subject, single, advice, tolerance)
     return list(dict.fromkeys(call_specs))
 
 
-def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
+def _find_required_max_iter(records: Records, solver: str, tolerance: float) -> int:
     """Return `max_iter` of a call to a tolerance: 0 (the default), or unlimited if a case needs more."""
     runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == tolerance)
     return UNLIMITED_ITERATIONS if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 
-def _list_time_limited(
+def _list_time_limited_calls(
     records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, tolerance: float
 ) -> list[CallSpec]:
     """List time limits for the solvers that come closest, and the budgets of sweeps that stay within the time."""
@@ -103,7 +103,7 @@ def time_candidates(
     cases: Iterable[Source], records: Records, plan: Plan, store: Any = None, **more: Any
 ) -> Records:
     """Choose the candidates among the calls that `bench.run` measured, and time them by `bench.time_alternately`."""
-    remaining = drop_idle_cases(records)
+    remaining = drop_cases_solved_at_zero(records)
     if not len(remaining) or plan.velocity_tolerances:
         return records
     return time_alternately(cases, list_candidates(remaining, plan.times), records, plan, store, **more)

@@ -149,7 +149,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
             items.append(_make_item_of_case(source, source.name))
         elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
             raise InputError(f"case {source!r:.60} is not a file, a name of the suite or a problem")
-        elif sequences or (sequences is None and _holds_steps(Path(source))):
+        elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
             steps = _rename_duplicate_sequence(list_steps_in_folder(source), items)
             name, missing = steps[0].sequence, map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
             items += [
@@ -181,8 +181,12 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
             )
         else:
             selected = [_make_item_of_name(name) for name in suite.names(str(source))]
-            items += _number_as_steps(selected) if str(source).removeprefix("@") == "sequences" else selected
-    return _number_equal_names(items)
+            items += (
+                _convert_to_sequence_steps(selected)
+                if str(source).removeprefix("@") == "sequences"
+                else selected
+            )
+    return _append_numbers_to_equal_names(items)
 
 
 def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
@@ -320,7 +324,7 @@ def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
     return [(0, int(t)) if i % 2 else (1, t) for i, t in enumerate(parts) if t]
 
 
-def _holds_steps(folder: Path) -> bool:
+def _holds_recorded_steps(folder: Path) -> bool:
     """Whether a folder holds the recorded steps of one simulation."""
     paths = _list_problem_files(folder) if folder.is_dir() else []
     if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
@@ -364,7 +368,7 @@ def _make_item_of_name(name: str) -> Item:
         return Item(name, name, _raise_when_loaded(error))
 
 
-def _number_as_steps(items: list[Item]) -> list[Item]:
+def _convert_to_sequence_steps(items: list[Item]) -> list[Item]:
     """Convert consecutive cases that differ only in `at` to the steps of sequences."""
     out, count = [], Counter[str]()
     for item in items:
@@ -397,7 +401,7 @@ def _make_item_of_file(path: Path) -> Item:
     return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))
 
 
-def _number_equal_names(items: list[Item]) -> list[Item]:
+def _append_numbers_to_equal_names(items: list[Item]) -> list[Item]:
     """Append numbers to equal names; figures are files named after cases, so case-insensitive names must differ."""
     used_names: set[str] = set()
     for item in items:

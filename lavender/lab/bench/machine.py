@@ -31,7 +31,7 @@ MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled
 BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
 
 
-def _read_cpuinfo(name: str) -> str:
+def _read_cpuinfo_entry(name: str) -> str:
     """Return Linux's value of an entry for the first processor; empty on other systems."""
     with contextlib.suppress(OSError):
         text = Path("/proc/cpuinfo").read_text(errors="replace")
@@ -42,7 +42,7 @@ def _read_cpuinfo(name: str) -> str:
 
 def get_cpu_name() -> str:
     """Return the model of the processor, as the system names it."""
-    return _read_cpuinfo("model name|Model") or platform.processor() or platform.machine() or "unknown"
+    return _read_cpuinfo_entry("model name|Model") or platform.processor() or platform.machine() or "unknown"
 
 
 def get_total_memory() -> int:
@@ -56,7 +56,7 @@ def get_total_memory() -> int:
     return min((n for n in found if n > 0), default=0)
 
 
-def get_memory_share(processes: int = 1) -> int:
+def get_memory_per_process(processes: int = 1) -> int:
     """Return the memory [bytes] that each of `processes` backend processes may use.
 
     It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
@@ -132,7 +132,7 @@ def count_runnable_processes() -> float | None:
     return get_load_average()
 
 
-def describe_busy(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
+def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
     """Return a warning if other processes used the processors, else an empty text.
 
     Parameters
@@ -180,7 +180,7 @@ def _count_cores(cores: int) -> str:
 
 def get_processor_clock() -> dict[str, str]:
     """Return the frequency of the processor and its governor, if the system provides them."""
-    mhz = _read_cpuinfo("cpu MHz")
+    mhz = _read_cpuinfo_entry("cpu MHz")
     found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
     with contextlib.suppress(OSError):
         found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()

@@ -21,14 +21,14 @@ from lavender.lab.bench.statistics import (
     MEAN_TIME_SHIFT,
     RESIDUAL_NOISE_FACTOR,
     TIME_NOISE_FACTOR,
-    collect_times_to,
+    collect_times_to_tolerance,
     compute_geometric_mean,
     compute_quantile,
     get_modes_to_tolerance,
-    get_time_of_miss,
+    get_penalty_time_of_miss,
     get_tolerances,
     group_cases_by_family,
-    group_passes,
+    group_passes_by_sequence,
 )
 from lavender.lab.bench.store import Records
 
@@ -150,15 +150,15 @@ def recommend_from_single_runs(records: Records, times: Sequence[float] = ()) ->
             by_tolerance={
                 x: rank_to_tolerance(records, name, cases, x, groups) for x in get_tolerances(records)
             },
-            by_time={t: rank_in_time(records, name, cases, t, groups) for t in times},
+            by_time={t: rank_within_time(records, name, cases, t, groups) for t in times},
             by_sweeps={
-                float(n): replace(rank_in_time(records, name, cases, math.inf, some), target=float(n))
+                float(n): replace(rank_within_time(records, name, cases, math.inf, some), target=float(n))
                 for n, some in by_sweeps.items()
             },
         )
         for is_sequence, families_of in (
             (False, group_cases_by_family(records)),
-            (True, group_steps(records)),
+            (True, list_steps_of_sequences(records)),
         )
         for name, cases in families_of.items()
     ]
@@ -217,7 +217,7 @@ def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
     return {n: groups[n] for n in sorted(groups)}
 
 
-def group_steps(records: Records) -> dict[str, list[str]]:
+def list_steps_of_sequences(records: Records) -> dict[str, list[str]]:
     """Return the names of all steps of each sequence that ran, also of steps without a run."""
     ran = {r.case for r in records if r.step >= 0}
     steps_of: dict[str, list[str]] = {}
@@ -235,7 +235,7 @@ def rank_to_tolerance(
     Only runs to a tolerance count; steps of several sequences count together, by calls with this or a tighter
     tolerance. If `groups` is given, the records are not grouped again.
     """
-    limit, liars = get_time_of_miss(records), _list_false_claims(records, cases)
+    limit, liars = get_penalty_time_of_miss(records), _list_false_claims(records, cases)
     modes = get_modes_to_tolerance(records)
     choices: list[RankedChoice] = []
     for group in _select_groups(cases, _group_runs(records) if groups is None else groups):
@@ -257,7 +257,7 @@ def rank_to_tolerance(
     return rank_choices(family, tolerance, _keep_best_of_each_solver(choices), TIME_NOISE_FACTOR)
 
 
-def rank_in_time(
+def rank_within_time(
     records: Records, family: str, cases: Sequence[str], limit: float, groups: RunGroups | None = None
 ) -> Advice:
     """Rank solvers by the residual that they leave on these cases, or steps, within a time [s].
@@ -323,8 +323,8 @@ def choose_time_budgets(records: Records) -> tuple[float, ...]:
     """Return three decades of time [s] about the median of the fastest times to the middle tolerance."""
     tolerances, modes = get_tolerances(records), get_modes_to_tolerance(records)
     tolerance = tolerances[len(tolerances) // 2]
-    fastest = [min(by.values()) for by in collect_times_to(records, tolerance).values() if by]
-    for passes in group_passes(records).values():
+    fastest = [min(by.values()) for by in collect_times_to_tolerance(records, tolerance).values() if by]
+    for passes in group_passes_by_sequence(records).values():
         reached = [
             median(w.times[start])
             for w in passes
@@ -367,12 +367,12 @@ def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject
     tolerance = tolerances[len(tolerances) // 2]
     times = tuple(times) or choose_time_budgets(records)
     cases = tuple(dict.fromkeys(r.case for r in records if r.step < 0))
-    sequences = group_steps(records)
+    sequences = list_steps_of_sequences(records)
     steps = tuple(step for some in sequences.values() for step in some)
     subjects = []
     for names, members, timing_mode in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
         if members:
-            quick = tuple(rank_in_time(records, "all", members, t) for t in times)
+            quick = tuple(rank_within_time(records, "all", members, t) for t in times)
             best = rank_to_tolerance(records, "all", members, tolerance)
             subjects.append(Subject(names, members, timing_mode, best, quick))
     return subjects

@@ -489,7 +489,7 @@ def _is_positive(value: Any) -> bool:
     return (_is_integer(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
 
 
-def _is_plan(plan: Mapping[str, Any]) -> bool:
+def _is_valid_plan(plan: Mapping[str, Any]) -> bool:
     """Whether a mapping is a plan with positive tolerances."""
     tolerances = plan.get("tolerances", [])
     return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
@@ -521,7 +521,7 @@ _TYPES: dict[str, _Rule] = {
 #: Description and test of the range of a field; "" applies to all other floats.
 _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
-    ("Run", "plan"): ("a plan with positive tolerances", _is_plan),
+    ("Run", "plan"): ("a plan with positive tolerances", _is_valid_plan),
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
     ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
     ("Record", "timing_mode"): (

@@ -26,7 +26,7 @@ from lavender.lab.bench.recommendation import (
     recommend_from_single_runs,
 )
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_time_of_miss, get_tolerances
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_penalty_time_of_miss, get_tolerances
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
@@ -154,7 +154,7 @@ def rank_calls_to_tolerance(
     )
     if not calls:
         return None
-    limit, names = get_time_of_miss(records), _list_cases(calls)
+    limit, names = get_penalty_time_of_miss(records), _list_cases(calls)
     missed = np.array(
         [[c not in f.runs or not f.runs[c].relative <= tolerance for c in names] for f in calls]
     )

@@ -100,7 +100,7 @@ class Step(WarmStep):
     coulomb: float | None
 
 
-def copy_cold(problem: Problem) -> Problem:
+def copy_without_guess(problem: Problem) -> Problem:
     """Copy a problem without its guess and without anything derived from it."""
     return replace(problem, guess=None, copy=False)
 
@@ -115,7 +115,7 @@ def measure_min_time(run: Callable[[], Any], repeats: int = N_REPEATS) -> float:
     return float(best)
 
 
-def time_engine(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
+def time_mujoco_newton(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
     """Return (tolerance, time, residual) of MuJoCo's Newton at the loosest accepted tolerance, or 0, its default."""
     model = copy.copy(model)
     default = model.opt.tolerance
@@ -136,7 +136,7 @@ def time_one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solutio
     """Return the minimum time of a solve [s], and its solution, which is always the same."""
     best = np.inf
     for _ in range(N_REPEATS):
-        cold_problem = copy_cold(problem)
+        cold_problem = copy_without_guess(problem)
         begin = perf_counter()
         solution = solve(cold_problem, tol=TARGET_RESIDUAL, impulse=impulse)
         best = min(best, perf_counter() - begin)
@@ -148,7 +148,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
     single_time, solution = time_one_call(problem)
     batch_time, residual_found = np.inf, solution.residual.relative
     for _ in range(N_REPEATS):
-        batch = [copy_cold(problem) for _ in range(BATCH_SIZE)]
+        batch = [copy_without_guess(problem) for _ in range(BATCH_SIZE)]
         begin = thread_time()  # CPU time: the batch takes milliseconds and may be interrupted.
         solutions = solve_many(batch, tol=TARGET_RESIDUAL)
         batch_time = min(batch_time, (thread_time() - begin) / BATCH_SIZE)
@@ -159,7 +159,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
 def time_prepared(problem: Problem) -> float:
     """Return the minimum time of a prepared solve from a cold start [s]."""
     prepared = prepare(problem)
-    problems = [copy_cold(problem) for _ in range(N_REPEATS)]
+    problems = [copy_without_guess(problem) for _ in range(N_REPEATS)]
     return measure_min_time(lambda: prepared.solve(problems.pop(), tol=TARGET_RESIDUAL))
 
 
@@ -195,9 +195,9 @@ def measure_model(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     for step, data, problem in _iterate_problems(mj, path, model, 20 * steps * every, every):
         if problem is None or get_reference(problem)[1] < 1e-9:
             continue
-        tolerance, engine, engine_residual = time_engine(mj, model, data, problem)
+        tolerance, engine, engine_residual = time_mujoco_newton(mj, model, data, problem)
         ours, batch_time, residual_found = time_cold_solves(problem)
-        strict = solve(copy_cold(problem), tol=STRICT_RESIDUAL).residual
+        strict = solve(copy_without_guess(problem), tol=STRICT_RESIDUAL).residual
         coulomb = None
         if not problem.cones.has_round:
             coulomb_residual = solve(

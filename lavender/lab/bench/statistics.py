@@ -79,7 +79,7 @@ def is_campaign(records: Records) -> bool:
     return any(run.plan.get("campaign") for run in records.runs.values())
 
 
-def drop_idle_cases(records: Records) -> Records:
+def drop_cases_solved_at_zero(records: Records) -> Records:
     """Return the records without cases that the zero impulse solves: no ranking counts them."""
     idle = {name for name, info in records.cases.items() if info.nothing_to_do}
     if not idle:
@@ -420,7 +420,7 @@ def compute_quantile(values: Sequence[float], q: float) -> float:
     return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]
 
 
-def collect_times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+def collect_times_to_tolerance(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the time [s] to a tolerance from a cold start by case and solver, inf if missed, without refused cases."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for reach in summarize_runs_by_case(records, [tolerance]):
@@ -435,7 +435,7 @@ MATRIX_PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
 OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
 
 
-def count_matrix_passes(record: Record) -> float:
+def count_sweeps_and_products(record: Record) -> float:
     """Return the passes over A of a run (sweeps and products); nan if it did other work, or counted none."""
     if any(record.work.get(name, 0) for name in OTHER_WORK_COUNTERS):
         return math.nan
@@ -443,30 +443,30 @@ def count_matrix_passes(record: Record) -> float:
     return float(sum(passes)) if passes else math.nan
 
 
-def find_other_work(records: Iterable[Record]) -> set[str]:
-    """Return the solvers with a run with other work than passes over A (`count_matrix_passes`)."""
-    return {r.solver for r in records if r.is_usable and math.isnan(count_matrix_passes(r))}
+def find_solvers_with_other_work(records: Iterable[Record]) -> set[str]:
+    """Return the solvers with a run with other work than passes over A (`count_sweeps_and_products`)."""
+    return {r.solver for r in records if r.is_usable and math.isnan(count_sweeps_and_products(r))}
 
 
-def count_matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+def count_sweeps_and_products_to_tolerance(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
 
     As for times, only runs to a tolerance count. Solvers with other work in their runs are left out
-    (`find_other_work`). Less than one pass counts as one.
+    (`find_solvers_with_other_work`). Less than one pass counts as one.
     """
     modes = get_modes_to_tolerance(records)
     groups = {k[:2]: group for k, group in group_runs_by_pair(records).items() if k[2] == "cold"}
-    excluded = find_other_work(r for group in groups.values() for r in group)
+    excluded = find_solvers_with_other_work(r for group in groups.values() for r in group)
     groups = {k: [r for r in group if r.is_usable and r.mode in modes] for k, group in groups.items()}
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for (case, solver), group in groups.items():
         if solver not in excluded:
-            reached = [max(1.0, count_matrix_passes(r)) for r in group if r.relative <= tolerance]
+            reached = [max(1.0, count_sweeps_and_products(r)) for r in group if r.relative <= tolerance]
             out[case][solver] = min(reached, default=math.inf)
     return out
 
 
-def get_time_of_miss(records: Records) -> float:
+def get_penalty_time_of_miss(records: Records) -> float:
     """Return the time [s] that a missed tolerance counts with: the time limit."""
     return max((r.time_limit for r in records), default=1.0)
 
@@ -476,12 +476,12 @@ def compute_mean_times_by_law(records: Records) -> dict[str, dict[float, dict[st
 
     A law's table has the solvers that accept every case of it.
     """
-    limit = get_time_of_miss(records)
+    limit = get_penalty_time_of_miss(records)
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
     for law, cases in _group_cases_by_law(records).items():
         out[law] = {}
         for tolerance in get_tolerances(records):
-            times = collect_times_to(records, tolerance)
+            times = collect_times_to_tolerance(records, tolerance)
             by: dict[str, tuple[float, int, int]] = {}
             for solver in _select_solvers_with_all_times(times, cases):
                 t = [times[c][solver] for c in cases]
@@ -579,13 +579,15 @@ def compute_profiles(records: Records, measure: str = "time") -> list[Profile]:
     ----------
     records : Records
     measure : {"time", "work"}
-        "work": passes over A, of the solvers that do no other work (`count_matrix_passes_to`).
+        "work": passes over A, of the solvers that do no other work (`count_sweeps_and_products_to_tolerance`).
     """
     check_choice("measure", measure, ("time", "work"))
     out = []
     for law, cases in _group_cases_by_law(records).items():
         for tolerance in get_tolerances(records):
-            times = (collect_times_to if measure == "time" else count_matrix_passes_to)(records, tolerance)
+            times = (
+                collect_times_to_tolerance if measure == "time" else count_sweeps_and_products_to_tolerance
+            )(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []
@@ -736,7 +738,7 @@ def _get_step_time(r: Record) -> float:
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 
-def group_passes(records: Records) -> dict[str, list[Pass]]:
+def group_passes_by_sequence(records: Records) -> dict[str, list[Pass]]:
     """Group passes by sequence."""
     out: dict[str, list[Pass]] = defaultdict(list)
     for one in group_runs_by_pass(records):

@@ -29,7 +29,7 @@ RESTITUTION_ROUNDING = (
 SUSPICIOUS_APPROACH = 30.0, 1e4
 
 
-def get_motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return J v* (m,) and target (m,) [m/s], and v*; None for a problem in matrix form."""
     if p.rows is not None:
         v = p.rows.v_free
@@ -46,7 +46,7 @@ def get_motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
 
 def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if rows that connect points of two bodies have targets far above usual speeds."""
-    motion = get_motion(p)
+    motion = get_row_velocities_and_targets(p)
     if p.rows is None or motion is None or not len(p.rows.jac):
         return
     jac, count = np.asarray(p.rows.jac), len(p.rows.jac)
@@ -70,7 +70,7 @@ def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
 def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about implausible targets of contacts."""
     c = p.cones
-    motion = get_motion(p)
+    motion = get_row_velocities_and_targets(p)
     contact = c.is_contact
     if motion is None or not contact.any():
         return
@@ -118,7 +118,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
 
 def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic if v* looks like an acceleration."""
-    motion, r = get_motion(p), reconstruct_bodies(p)
+    motion, r = get_row_velocities_and_targets(p), reconstruct_bodies(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
@@ -176,7 +176,7 @@ def check_state_arguments(
     p: Problem, velocity: Any, gap: Any, dt: float | None
 ) -> tuple[FloatArray | None, FloatArray | None, float]:
     """Validate velocity, gap and dt of `diagnose`."""
-    motion = None if velocity is None and gap is None else get_motion(p)
+    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
     if motion is None and (velocity is not None or gap is not None):
         raise InputError(
             "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
@@ -192,7 +192,7 @@ def check_state_arguments(
 
 def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
     """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
-    motion = None if velocity is None and gap is None else get_motion(p)
+    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return

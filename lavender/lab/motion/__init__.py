@@ -24,7 +24,7 @@ from lavender.lab.motion.reference import (
     get_reference,
     load_reference,
     save_reference,
-    store_if_better,
+    store_reference_if_better,
 )
 from lavender.lab.motion.unique import prove_uniqueness
 
@@ -45,5 +45,5 @@ __all__ = [
     "motion_error",
     "prove_uniqueness",
     "save_reference",
-    "store_if_better",
+    "store_reference_if_better",
 ]

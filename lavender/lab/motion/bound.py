@@ -81,7 +81,7 @@ def compute_witness(problem: Problem, operator: Operator, impulse: FloatArray) -
     `operator.explain_refusal()` must be None.
     """
     d = problem.d
-    w, off = operator.compute_slack(impulse)
+    w, off = operator.compute_slack_with_rounding_bound(impulse)
     e = np.empty(problem.m)
     measure.score_slack_array(problem.metric, impulse, w, e)
     uncertainty = _bound_projection_rounding(problem, impulse, w)

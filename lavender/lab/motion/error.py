@@ -196,10 +196,12 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
         )
     if reference.is_accepted:
         if velocity is not None:
-            values["body"], values["speed"] = _index_and_max(speed)
+            values["body"], values["speed"] = _find_index_and_max(speed)
             if spin is not None:
-                values["spin_body"], values["spin"] = _index_and_max(spin)
-        values["row"], values["rows"] = _index_and_max(np.abs(operator.compute_slack(delta)[0] + problem.b))
+                values["spin_body"], values["spin"] = _find_index_and_max(spin)
+        values["row"], values["rows"] = _find_index_and_max(
+            np.abs(operator.compute_slack_with_rounding_bound(delta)[0] + problem.b)
+        )
     proof = reference.witness
     if proof is None and not reference.refusal:
         notes.append("no bound under Coulomb's law")
@@ -221,9 +223,9 @@ def convert_to_ellipse_rows(problem: Problem, x: FloatArray, error: MotionError)
         return error
     delta = x - error.reference.impulse
     w = (
-        get_motion_cache(problem.disk).operator.compute_slack(delta)[0] + problem.disk.b
+        get_motion_cache(problem.disk).operator.compute_slack_with_rounding_bound(delta)[0] + problem.disk.b
     ) / problem.cones.stretch
-    row, rows = _index_and_max(np.abs(w))
+    row, rows = _find_index_and_max(np.abs(w))
     return drop_non_finite(replace(error, row=row, rows=rows), ("rows",))
 
 
@@ -232,7 +234,7 @@ def _divide_or_inf(x: float, reference: float) -> float:
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 
 
-def _index_and_max(x: FloatArray) -> tuple[int, float]:
+def _find_index_and_max(x: FloatArray) -> tuple[int, float]:
     """Return (index, value) of the largest number; (-1, 0) if there is none."""
     if not len(x):
         return -1, 0.0

@@ -499,13 +499,14 @@ def measure_motion_distance(problem: Problem, x: ArrayLike, y: ArrayLike) -> Dis
     x, y = problem.impulse_array(x, "x"), problem.impulse_array(y, "y")
     delta, size = subtract_impulses(operator, x, y)
     velocity = operator.compute_velocity(delta, np.zeros(problem.m))
-    rows = np.abs(operator.compute_slack(delta)[0] + problem.b)
+    rows = np.abs(operator.compute_slack_with_rounding_bound(delta)[0] + problem.b)
     speed = rows if velocity is None else operator.compute_speeds(velocity[0])[0]
     max_speed = float(np.max(speed, initial=0.0))
     if cache.refusal:
         energy = float(np.max(rows, initial=0.0))
         largest = max(
-            float(np.max(np.abs(operator.compute_slack(z)[0] + problem.b), initial=0.0)) for z in (x, y)
+            float(np.max(np.abs(operator.compute_slack_with_rounding_bound(z)[0] + problem.b), initial=0.0))
+            for z in (x, y)
         )
     else:
         energy = size.energy

@@ -66,7 +66,7 @@ class Operator:
             return f"A is not symmetric (by {self.asymmetry:.1e})"
         return None if self.semidefinite else "A is not positive semidefinite"
 
-    def compute_slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compute_slack_with_rounding_bound(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Compute w = A x - b (m,) [m/s] and a bound of its rounding."""
         return self.a @ x - self.b, self.slack_gamma * (self.abs_a @ np.abs(x) + np.abs(self.b))
 
@@ -129,7 +129,7 @@ class _Factored(Operator):
         self.velocity_gamma = _bound_sum_rounding(column + minv_entries + 1)
         self.slack_gamma = _bound_sum_rounding(column + row + minv_entries + 5)
 
-    def compute_slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compute_slack_with_rounding_bound(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         w = self.jac @ (self.minv @ (self.jac_t @ x)) + self.theta * x - self.b
         y = np.abs(x)
         g = self.abs_jac_t @ y

@@ -120,7 +120,7 @@ def get_reference(problem: Problem) -> Reference:
     return cache.reference
 
 
-def store_if_better(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
+def store_reference_if_better(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
     """Judge an impulse (m,) [N s] and store it as the problem's reference if it is better than the stored one."""
     cache = get_motion_cache(problem)
     new = make_reference(problem, problem.impulse_array(impulse, "reference"), solver)

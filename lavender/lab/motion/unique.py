@@ -136,10 +136,12 @@ def _prove_island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> t
         return None, np.inf
     if kappa < 1.0 - CRITERION_MARGIN:
         return "friction is small", kappa
-    return ("nothing slides" if _can_nothing_slide(problem, rows, kappa, inverse_diagonal) else None), kappa
+    return (
+        "nothing slides" if _proves_no_contact_slides(problem, rows, kappa, inverse_diagonal) else None
+    ), kappa
 
 
-def _can_nothing_slide(
+def _proves_no_contact_slides(
     problem: Problem, rows: np.ndarray, kappa: float, inverse_diagonal: FloatArray
 ) -> bool:
     """Whether (3) holds for the reference; `inverse_diagonal` (k,) [kg] is Z_ii of the contacts with friction."""

@@ -76,7 +76,7 @@ def find_dependent_rows(flint: Any, j: Any, target: FloatArray, sure: int = 0) -
         if len(basis) == len(columns) and not target[rows].any():
             independent_rows.append(basis)
             continue
-        split = _split_component(flint, j[rows][:, columns], target[rows])
+        split = _split_independent_and_contradicting_rows(flint, j[rows][:, columns], target[rows])
         if split is None:
             raise Tangled(rows)
         independent_rows.append(rows[split[0]])
@@ -86,7 +86,9 @@ def find_dependent_rows(flint: Any, j: Any, target: FloatArray, sure: int = 0) -
     )
 
 
-def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[int]] | None:
+def _split_independent_and_contradicting_rows(
+    flint: Any, j: Any, target: FloatArray
+) -> tuple[list[int], list[int]] | None:
     """Return (independent rows, rows that contradict them) of one component of J, or None if its rank is too large."""
     m, n = j.shape
     integer_rows = _scale_rows_to_integers(np.column_stack([j.toarray(), target]))

@@ -19,7 +19,7 @@ from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
 from lavender.lab.bench.recommendation import Choice
 from lavender.lab.bench.record import escape_unprintable
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_time_of_miss
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_penalty_time_of_miss
 from lavender.lab.bench.store import Records
 
 _NUMERIC_KEYS = ("rows", "seconds", "relative")
@@ -132,7 +132,7 @@ def rank_engine(
     if not cases or len(answers) < len(cases):
         return None
     times = {name: time if relative <= tolerance else math.inf for name, (time, relative) in answers.items()}
-    limit = get_time_of_miss(records)
+    limit = get_penalty_time_of_miss(records)
     score = compute_geometric_mean(
         [t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT
     )

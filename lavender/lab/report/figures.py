@@ -14,7 +14,7 @@ from lavender.lab.bench import statistics
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.store import Records
 from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
-from lavender.lab.report.text import format_count, name_run, name_time
+from lavender.lab.report.text import format_count, format_run_name, make_time_axis_title
 from lavender.solvers import registry
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
@@ -118,10 +118,10 @@ def build_work_precision(records: Records, case: str) -> Figure:
             points, targets = [(r.time_min, r.relative) for r in runs], tuple(r.target for r in runs)
             curves.append(
                 Curve.from_points(
-                    solver, name_run(solver, start), points, notes=targets, thin=start != "cold"
+                    solver, format_run_name(solver, start), points, notes=targets, thin=start != "cold"
                 )
             )
-    return _build_case_figure("work-precision", name_time(drawn), records, case, curves)
+    return _build_case_figure("work-precision", make_time_axis_title(drawn), records, case, curves)
 
 
 def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
@@ -171,11 +171,11 @@ def build_overall_figure(records: Records, measure: str = "time") -> Figure:
         if (r.step < 0) == single and r.start == start and r.order == "given" and not r.interleave_group
     ]  # fmt: skip
     cases = sorted({r.case for r in runs})
-    excluded = statistics.find_other_work(runs) if by_work else set()
+    excluded = statistics.find_solvers_with_other_work(runs) if by_work else set()
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for r in runs:
         if r.is_usable and r.time_min > 0.0 and r.solver not in excluded:
-            cost = max(1.0, statistics.count_matrix_passes(r)) if by_work else r.time_min
+            cost = max(1.0, statistics.count_sweeps_and_products(r)) if by_work else r.time_min
             by.setdefault(r.solver, {}).setdefault(r.case, []).append((cost, max(r.relative, MIN_RESIDUAL)))
     times = [t for own in by.values() for some in own.values() for t, _ in some]
     name = "work over all" if by_work else "over all"
@@ -202,7 +202,7 @@ def build_overall_figure(records: Records, measure: str = "time") -> Figure:
         note = f"{PASSES_NOTE}{names}. {note}"
     return Figure(
         name, f"Error against {'work' if by_work else 'time'}{over if len(cases) > 1 else ''}",
-        "passes over A" if by_work else name_time(runs), "relative residual [-]", tuple(curves),
+        "passes over A" if by_work else make_time_axis_title(runs), "relative residual [-]", tuple(curves),
         tolerances=statistics.get_tolerances(records), note=note,
     )  # fmt: skip
 
@@ -212,7 +212,9 @@ def build_budget_figure(records: Records, case: str) -> Figure:
     curves = []
     for (name, solver, start), points in sorted(statistics.group_runs_by_budget(records).items()):
         if name == case:
-            curves.append(Curve.from_points(solver, name_run(solver, start), points, thin=start != "cold"))
+            curves.append(
+                Curve.from_points(solver, format_run_name(solver, start), points, thin=start != "cold")
+            )
     # An iteration of admm solves a linear system, an iteration of pgs is a sweep.
     swept = all("sweeps" in r.work for r in records if r.mode == "budget" and r.case == case and r.is_usable)
     title = "sweeps" if swept else "iterations, each solver's own unit"
@@ -229,7 +231,7 @@ def is_plug_in(solver: str) -> bool:
     return spec is None or not spec.builtin
 
 
-def select_drawn(ranked: Sequence[str], always: Sequence[str] = ()) -> list[str]:
+def select_drawn_solvers(ranked: Sequence[str], always: Sequence[str] = ()) -> list[str]:
     """Select the solvers of a figure: plug-ins, the first of the others, `always`; up to `MAX_CURVES` in all."""
     plug_ins = [name for name in ranked if is_plug_in(name)]
     required = [name for name in ranked if name in always and name not in plug_ins]
@@ -254,7 +256,7 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
         )
 
     ranked = [w.solver for w in sorted(passes, key=rank)]
-    drawn = set(select_drawn(ranked))
+    drawn = set(select_drawn_solvers(ranked))
     curves = []
     for w in passes:
         for start, residuals in sorted(w.residuals.items()) if w.solver in drawn else ():
@@ -283,7 +285,9 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
         )
 
     ranked = sorted(profile.curves, key=standing)
-    drawn = set(select_drawn([name for name in ranked if standing(name)[0] < 0.0 or is_plug_in(name)]))
+    drawn = set(
+        select_drawn_solvers([name for name in ranked if standing(name)[0] < 0.0 or is_plug_in(name)])
+    )
     shown = [name for name in ranked if name in drawn]
     curves = [
         Curve.from_points(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True)
@@ -324,12 +328,12 @@ class Figures:
     moved: Figures | None = None
 
     @property
-    def groups_by_name(self) -> dict[str, Group]:
+    def groups_by_section(self) -> dict[str, Group]:
         """The groups by name."""
         return {name: group for name, group in vars(self).items() if name != "moved"}
 
     def __iter__(self) -> Iterator[Figure]:
-        for group in self.groups_by_name.values():
+        for group in self.groups_by_section.values():
             for some in group.values():
                 yield from some
         yield from self.moved or ()
@@ -360,7 +364,7 @@ def _relabel_for_motion(figures: Figures) -> Figures:
 
     groups: dict[str, Any] = {
         place: {name: tuple(map(relabel, own)) for name, own in group.items()}
-        for place, group in figures.groups_by_name.items()
+        for place, group in figures.groups_by_section.items()
     }
     return Figures(**groups)
 
@@ -380,7 +384,7 @@ def _build_figures(records: Records) -> Figures:
         profiles={law: _select_drawn_figures(*some) for law, some in profiles.items()},
         sequences={
             name: _build_pass_figures(name, passes)
-            for name, passes in statistics.group_passes(records).items()
+            for name, passes in statistics.group_passes_by_sequence(records).items()
         },
         cases={
             c: _select_drawn_figures(build_work_precision(part, c), build_budget_figure(part, c))

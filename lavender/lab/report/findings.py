@@ -47,7 +47,7 @@ class Report:
     @cached_property
     def ranked_records(self) -> Records:
         """The newest run without cases that the zero impulse solves."""
-        return statistics.drop_idle_cases(self.newest_run)
+        return statistics.drop_cases_solved_at_zero(self.newest_run)
 
     @cached_property
     def earlier_run(self) -> Records | None:
@@ -79,7 +79,7 @@ class Report:
             return ""
         (run,) = self.newest_run.runs.values()
         loads = (run.load if r.load is None else r.load for r in self.newest_run)
-        return machine.describe_busy(loads, run.cores)
+        return machine.make_busy_warning(loads, run.cores)
 
     @cached_property
     def load_summary(self) -> str:

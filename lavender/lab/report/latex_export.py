@@ -37,12 +37,12 @@ from lavender.lab.report.figures import (
     Group,
     build_figures,
     build_overall_figure,
-    select_drawn,
+    select_drawn_solvers,
 )
 from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import assign_styles, plot_figure
 from lavender.lab.report.table import Cell, Table
-from lavender.lab.report.text import describe_time, format_count, format_left_out
+from lavender.lab.report.text import describe_timed_code, format_count, format_left_out_count
 
 FIGURE_SIZE = (5.5, 3.4)  # [inches] The width is the text width of a page.
 FIGURES_HEAD = (
@@ -80,7 +80,7 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     work = {"all": (by_work,)} if by_work.curves else {}
     groups = (drawn.over, work, _build_folder_figures(records), drawn.profiles, drawn.sequences)
     some = [
-        _select_leaders(figure, report.verdict.leaders)
+        _reduce_figure_to_leaders(figure, report.verdict.leaders)
         for group in groups
         for fs in group.values()
         for figure in fs
@@ -89,7 +89,9 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     folder = make_folder(folder)
     for figure in some:
         canvas = plot_figure(replace(figure, title=""), look, FIGURE_SIZE)
-        write_figure(canvas, folder / _name_file(figure), metadata={"CreationDate": None, "Producer": None})
+        write_figure(
+            canvas, folder / _make_figure_file_name(figure), metadata={"CreationDate": None, "Producer": None}
+        )
     text = FIGURES_HEAD + "\n".join(_include_figure(figure, report) for figure in some)
     write_text(folder / "figures.tex", text)
     write_text(folder / "tables.tex", _write_tables(report))
@@ -114,14 +116,14 @@ def _build_folder_figures(records: Records) -> Group:
     return groups
 
 
-def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
+def _reduce_figure_to_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
     """Reduce a figure to plug-ins, leaders of the verdict, those that end lowest, and osqp; bands to two solvers."""
     if all(c.steps for c in figure.curves):
         return figure  # The curves of a profile are selected already.
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
-    drawn = select_drawn(solvers, (REFERENCE_SOLVER,))
+    drawn = select_drawn_solvers(solvers, (REFERENCE_SOLVER,))
     selected = [c for name in drawn for c in figure.curves if c.solver == name]
     selected[2:] = [replace(c, low=(), high=()) for c in selected[2:]]
     return replace(figure, curves=tuple(selected), left_out=tuple(sorted(set(solvers) - set(drawn))))
@@ -154,7 +156,7 @@ def format_latex(table: Table, caption: str, label: str) -> str:
     )
 
 
-def _name_file(figure: Figure) -> str:
+def _make_figure_file_name(figure: Figure) -> str:
     return make_file_name(figure.name.replace(" ", "-")) + ".pdf"
 
 
@@ -164,14 +166,14 @@ def _describe_unloaded_cases(records: Records) -> str:
     return f" Left out, for it did not load: {format_count(lost, 'problem')}." if lost else ""
 
 
-def _state_times(report: Report, solvers: set[str], sequences: bool = False) -> str:
+def _describe_times(report: Report, solvers: set[str], sequences: bool = False) -> str:
     """Return a sentence on the code that the times of these solvers include, with the load if it was too high."""
     records = report.ranked_records
     runs = [
         r for r in records
         if r.solver in solvers and r.order == "given" and not r.interleave_group and (r.step >= 0) is sequences
     ]  # fmt: skip
-    sentence = describe_time(runs)
+    sentence = describe_timed_code(runs)
     return f" {sentence} {report.load_warning}".rstrip() if sentence else ""
 
 
@@ -182,7 +184,7 @@ def _include_figure(figure: Figure, report: Report) -> str:
         "time" in x for x in (figure.x_title, figure.y_title)
     )
     sequences = figure.name.startswith("sequence ") or not any(r.step < 0 for r in records)
-    times = _state_times(report, solvers, sequences) if is_time else ""
+    times = _describe_times(report, solvers, sequences) if is_time else ""
     caption = f"{figure.title}.{times}{_describe_unloaded_cases(records)}"
     if any(c.steps for c in figure.curves):
         by_work = figure.name.startswith("work ")
@@ -195,9 +197,9 @@ def _include_figure(figure: Figure, report: Report) -> str:
     if figure.left_out:
         caption += f" Not drawn: {', '.join(figure.left_out)}."
     return (
-        f"\\begin{{figure}}\n\\centering\n\\includegraphics[width=\\linewidth]{{{_name_file(figure)}}}\n"
+        f"\\begin{{figure}}\n\\centering\n\\includegraphics[width=\\linewidth]{{{_make_figure_file_name(figure)}}}\n"
         f"\\caption{{{escape_tex(caption)}}}\n"
-        f"\\label{{fig:{_name_file(figure).removesuffix('.pdf')}}}\n\\end{{figure}}\n"
+        f"\\label{{fig:{_make_figure_file_name(figure).removesuffix('.pdf')}}}\n\\end{{figure}}\n"
     )
 
 
@@ -215,12 +217,12 @@ def _write_tables(report: Report) -> str:
         )
     everyone = {r.solver for r in records}
     single = any(r.step < 0 for r in records)
-    caption += _state_times(report, everyone, not single) + _describe_unloaded_cases(records)
+    caption += _describe_times(report, everyone, not single) + _describe_unloaded_cases(records)
     advice, last = table_specs.tabulate_recommended_solvers(report), 1 + len(report.tolerances)
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
-            f"{line.n_cases}{format_left_out(line.left_out)}",
+            f"{line.n_cases}{format_left_out_count(line.left_out)}",
             *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
         ]
         for row, line in zip(advice.rows, report.rankings, strict=True)
@@ -233,10 +235,10 @@ def _write_tables(report: Report) -> str:
         others = f" (not {', '.join(rest)})" if rest else ""
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the tolerance; a miss costs "
-            f"{format_seconds(statistics.get_time_of_miss(records))}. Only runs to a tolerance count, to this or a "
-            f"tighter one. Solvers that take every case{others}."
+            f"{format_seconds(statistics.get_penalty_time_of_miss(records))}. Only runs to a tolerance count, "
+            f"to this or a tighter one. Solvers that take every case{others}."
         )
-        caption += _state_times(report, solvers) + _describe_unloaded_cases(records)
+        caption += _describe_times(report, solvers) + _describe_unloaded_cases(records)
         parts.append(format_latex(table_specs.tabulate_mean_times(by_tolerance), caption, f"means-{law}"))
     backends = table_specs.tabulate_backends(records)
     if backends.rows:
@@ -276,12 +278,15 @@ def _describe_method(report: Report) -> str:
     swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     minimum = f"the minimum of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
-    limit, threads = format_seconds(statistics.get_time_of_miss(records)), format_count(run.threads, "thread")
+    limit, threads = (
+        format_seconds(statistics.get_penalty_time_of_miss(records)),
+        format_count(run.threads, "thread"),
+    )
     solvers = format_count(len({r.solver for r in own}), "solver")
-    lost = format_left_out(sum(map(len, records.left_out.values())))
+    lost = format_left_out_count(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
-    timed = describe_time(r for r in own if r.order == "given" and not r.interleave_group)
+    timed = describe_timed_code(r for r in own if r.order == "given" and not r.interleave_group)
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
         f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",

@@ -8,7 +8,7 @@ from lavender.lab.bench import statistics
 from lavender.lab.report.findings import Report
 from lavender.lab.report.table import Table
 from lavender.lab.report.table_specs import list_sections
-from lavender.lab.report.text import list_left_out
+from lavender.lab.report.text import list_cases_not_loaded
 
 
 def format_markdown(table: Table) -> list[str]:
@@ -35,7 +35,7 @@ def summarise_report(report: Report) -> str:
     for statement in report.verdict.statements:
         code = ["```python", *statement.code, "```", ""] if statement.code else []
         lines += [escape_markdown(statement.text), "", *code]
-    for what, reason in list_left_out(records):
+    for what, reason in list_cases_not_loaded(records):
         lines += [escape_markdown(f"Left out, and in no number here: {what}: {reason}"), ""]
     for section in list_sections(report):
         lines += [f"**{escape_markdown(section.title)}** ({escape_markdown(section.note)})", ""]

@@ -12,7 +12,7 @@ DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # [m/s] Used if the plan has none.
 
 
 @dataclass(frozen=True)
-class IdleCase:
+class CaseSolvedAtZero:
     """A case that the zero impulse solves, and the worst result of any solver on it.
 
     Parameters
@@ -59,11 +59,11 @@ def convert_to_motion_errors(records: Records) -> Records:
     return converted
 
 
-def list_idle_cases(records: Records) -> list[IdleCase]:
+def list_cases_solved_at_zero(records: Records) -> list[CaseSolvedAtZero]:
     """List cases that the zero impulse solves, with the worst residual of any run in units."""
     worst: dict[str, tuple[str, float, float]] = {}
     for r in sorted(records, key=lambda r: -r.velocity):
         worst.setdefault(r.case, (r.solver, r.velocity, r.energy))
     no_run = ("", 0.0, 0.0)
     idle = ((name, info.rows) for name, info in records.cases.items() if info.nothing_to_do)
-    return [IdleCase(name, rows, *worst.get(name, no_run)) for name, rows in idle]
+    return [CaseSolvedAtZero(name, rows, *worst.get(name, no_run)) for name, rows in idle]

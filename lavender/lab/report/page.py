@@ -20,10 +20,10 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import plot_for_page
 from lavender.lab.report.text import (
     format_count,
-    format_left_out,
+    format_left_out_count,
     format_residual,
+    list_cases_not_loaded,
     list_diagnostics,
-    list_left_out,
 )
 from lavender.lab.report.verdict import Verdict
 
@@ -56,7 +56,7 @@ def create_environment() -> Any:
         table_specs=table_specs,
         statistics=statistics,
         format_count=format_count,
-        format_left_out=format_left_out,
+        format_left_out_count=format_left_out_count,
         isfinite=math.isfinite,
     )
     environment.globals.update(
@@ -92,7 +92,7 @@ def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
     return create_environment().get_template("index.html.j2").render(
         report=report, records=records, verdict=report.verdict, tolerances=report.tolerances, saved=saved,
         tolerance=report.tolerances[len(report.tolerances) // 2],
-        links=_map_rankings_to_anchors(report.rankings), left_out=list_left_out(records),
+        links=_map_rankings_to_anchors(report.rankings), left_out=list_cases_not_loaded(records),
         diagnostics=list_diagnostics(records), **_render_drawings(records, figures, report.verdict),
         **_describe_cases(report),
     )  # fmt: skip
@@ -124,7 +124,7 @@ def _list_drawing_names(figures: Figures) -> dict[str, dict[str, list[str]]]:
     """Return the names of the drawings by place and subject."""
     return {
         place: {name: [make_file_name(figure.name) for figure in some] for name, some in group.items()}
-        for place, group in figures.groups_by_name.items()
+        for place, group in figures.groups_by_section.items()
     }
 
 

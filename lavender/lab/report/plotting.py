@@ -92,7 +92,7 @@ def label_axis(
     return title.replace("[s]", f"[{unit}]"), [write(tick / scale) for tick in ticks]
 
 
-def _select_points(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
+def _mask_points_outside_axes(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
     """Return the points of a curve, with nan for those that the axes cannot show: a line has a gap there."""
     points = []
     for x, y in zip(curve.x, curve.y, strict=True):
@@ -108,7 +108,7 @@ def _draw_figure(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[floa
 
     Returns each curve that has a point with its points, its line and its band (None without one).
     """
-    curves = [(c, points) for c in figure.curves for points in [_select_points(c, figure)]]
+    curves = [(c, points) for c in figure.curves for points in [_mask_points_outside_axes(c, figure)]]
     curves = [(c, points) for c, points in curves if any(not math.isnan(y) for _, y in points)]
     drawn = [p for _, points in curves for p in points if not math.isnan(p[1])]
     bands = [v for c, _ in curves for v in (*c.low, *c.high) if math.isfinite(v)]
@@ -232,7 +232,7 @@ def plot_figure(
         drawn = len({c.solver for c in figure.curves})
         place |= {"title": f"{drawn} of {drawn + len(figure.left_out)} solvers", "title_fontsize": 7}
     if axes.get_legend_handles_labels()[0]:
-        _write_literally(axes.legend(fontsize=7, frameon=False, handlelength=3, **place))
+        _escape_dollars_in_legend(axes.legend(fontsize=7, frameon=False, handlelength=3, **place))
     return canvas
 
 
@@ -259,7 +259,7 @@ def plot_panels(figures: Sequence[Figure], styles: Mapping[str, CurveStyle]) -> 
     legend = canvas.legend(
         entries.values(), entries.keys(), fontsize=6, frameon=False, loc="outside right upper"
     )
-    _write_literally(legend).set_gid("legend")
+    _escape_dollars_in_legend(legend).set_gid("legend")
     return canvas
 
 
@@ -279,7 +279,7 @@ def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) ->
     axes.set_title(_shorten_label(figure.heading), fontsize=10, parse_math=False)
 
 
-def _write_literally(legend: Any) -> Any:
+def _escape_dollars_in_legend(legend: Any) -> Any:
     """Show dollars in the names of a legend; matplotlib would read a formula between them."""
     for text in legend.get_texts():
         text.set_parse_math(False)
@@ -350,7 +350,7 @@ def plot_for_page(
         i: [(x, HEIGHT - y) for x, y in to_units([p for p in points if not math.isnan(p[1])])]
         for i, (_, points, _, _) in enumerate(artists)
     }
-    names = _place_names([c for c, *_ in artists], places, leaders, right)
+    names = _place_curve_names([c for c, *_ in artists], places, leaders, right)
     for i, (_, _, line, band) in enumerate(artists):
         line.set(gid=f"@{i} line", zorder=4 + i)
         if band is not None:
@@ -400,7 +400,7 @@ def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int
     return f"{int(log)} {low:.4f} {high:.4f} {first} {last}"
 
 
-def _place_names(
+def _place_curve_names(
     curves: Sequence[Curve],
     places: Mapping[int, Sequence[tuple[float, float]]],
     leaders: Sequence[str],

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lavender.lab.report.text import format_sizes, format_times
+from lavender.lab.report.text import format_sizes, format_times_in_one_unit
 
 #: Heads of columns of words; all other columns have numbers.
 WORDS = frozenset({
@@ -88,7 +88,7 @@ class Table:
         heads, rows = list(self.heads), [list(row) for row in self.rows]
         cells = [(row, i, c) for row in rows for i, c in enumerate(row) if isinstance(c, Cell) and c.quantity]
         times = [entry for entry in cells if entry[2].quantity == "time"]
-        unit, texts = format_times([_get_cell_value(cell) for _, _, cell in times])
+        unit, texts = format_times_in_one_unit([_get_cell_value(cell) for _, _, cell in times])
         for (row, i, cell), text in zip(times, texts, strict=True):
             row[i] = replace(cell, text=text, quantity="")
         for i in {i for _, i, _ in times}:

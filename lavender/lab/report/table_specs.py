@@ -19,17 +19,17 @@ from lavender.lab.bench.record import Record, Skip, escape_unprintable, format_t
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, is_ranked_before, list_cases_of, rank_engine
 from lavender.lab.report.findings import Report
-from lavender.lab.report.motion_tables import format_speed, list_idle_cases
+from lavender.lab.report.motion_tables import format_speed, list_cases_solved_at_zero
 from lavender.lab.report.table import WORDS, Cell, Table
 from lavender.lab.report.text import (
     NONE,
     format_count,
-    format_left_out,
+    format_left_out_count,
     format_percent,
     format_ratio,
     format_residual,
-    format_share,
-    name_run,
+    format_run_name,
+    format_solved_share,
 )
 from lavender.solvers.registry import specs
 
@@ -119,7 +119,7 @@ def list_sections(report: Report) -> list[Section]:
             ),
             *(
                 Section(f"Sequence {escape_unprintable(name)}", carried, tabulate_sequence(passes))
-                for name, passes in statistics.group_passes(records).items()
+                for name, passes in statistics.group_passes_by_sequence(records).items()
             ),
         ]
     if report.earlier_run is not None:
@@ -176,20 +176,21 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
     rows: Rows = [
         [
             c.solver,
-            Cell.time(c.score, after=format_share(c.solved, c.cases)),
+            Cell.time(c.score, after=format_solved_share(c.solved, c.cases)),
             f"{line.target}, {line.start}",
             INTERLEAVED if line.interleave_group else ALONE,
         ]
         for line, c in raced.values()
     ]
     rows += [
-        [c.solver, Cell.time(c.score, after=format_share(c.solved, c.cases)), c.how, ALONE] for c in alone
+        [c.solver, Cell.time(c.score, after=format_solved_share(c.solved, c.cases)), c.how, ALONE]
+        for c in alone
     ]
     engine = rank_engine(report.engines, report.ranked_records, report.rankings[0].cases, tolerance)
     if engine is not None and engine.solved:
         ranked = [*(choice for _, choice in raced.values()), *alone]
         before = sum(not is_ranked_before(engine, choice) for choice in ranked)
-        time = Cell.time(engine.score, after=format_share(engine.solved, engine.cases))
+        time = Cell.time(engine.score, after=format_solved_share(engine.solved, engine.cases))
         rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
     return Table(["solver", f"to {format_tolerance(tolerance)}", "target", "timed"], rows)
 
@@ -216,7 +217,7 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
             f"worst: {best.hardest}" + (f"; ≈ {title}" if ties else ""),
         )
     mark = "warn" if best.solved < best.cases else ""
-    text = ("to " if in_time else "") + write(best.score) + format_share(best.solved, best.cases)
+    text = ("to " if in_time else "") + write(best.score) + format_solved_share(best.solved, best.cases)
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 
@@ -237,7 +238,7 @@ def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None
         [
             Cell(
                 line.name,
-                after=format_left_out(line.left_out),
+                after=format_left_out_count(line.left_out),
                 more=format_count(line.n_cases, "step" if line.sequence else "case"),
                 link=(links or {}).get(line.name, ""),
             ),
@@ -255,7 +256,7 @@ def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
     """Return the engine's own solver to the tolerance of the first sentence."""
     if engine is None or not engine.solved:
         return Cell(NONE if engine is None else f"nothing to {format_tolerance(tolerance)}")
-    text = format_seconds(engine.score) + format_share(engine.solved, engine.cases)
+    text = format_seconds(engine.score) + format_solved_share(engine.solved, engine.cases)
     return Cell(text, engine.solver, f", to {format_tolerance(tolerance)}", title=INSIDE)
 
 
@@ -265,7 +266,7 @@ def tabulate_best_solver_by_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
     heads = [format_count(int(n), "sweep") for n in budgets]
     rows: Rows = [
         [
-            Cell(line.name, after=format_left_out(line.left_out)),
+            Cell(line.name, after=format_left_out_count(line.left_out)),
             *(format_advice(x, True) for x in line.by_sweeps.values()),
         ]
         for line in lines
@@ -315,7 +316,7 @@ def tabulate_times_to_tolerances(reaches: Sequence[statistics.Reach], tolerances
     rows: Rows = [
         [
             r.case,
-            name_run(r.solver, r.start),
+            format_run_name(r.solver, r.start),
             *(Cell.time(r.times[x]) for x in tolerances),
             Cell(format_residual(r.best), after=" floor" if r.at_floor else ""),
             Cell(r.status, mark="good" if r.status in GOOD else "warn"),
@@ -365,7 +366,7 @@ def tabulate_motion_errors(report: Report) -> Table:
             for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
         ]
         rows.append(
-            [m.case, name_run(m.solver, m.start), *(Cell.time(m.times[x]) for x in tolerances), *known]
+            [m.case, format_run_name(m.solver, m.start), *(Cell.time(m.times[x]) for x in tolerances), *known]
         )
     heads = [f"to {format_speed(x)}" for x in tolerances]
     return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
@@ -381,7 +382,7 @@ def tabulate_cases_solved_at_zero(records: Records) -> Table:
             f"{format_residual(c.velocity)} m/s",
             f"{format_residual(c.energy)} √J",
         ]
-        for c in list_idle_cases(records)
+        for c in list_cases_solved_at_zero(records)
     ]
     return Table(["case", "rows", "solver", "velocity", "energy"], rows)
 
@@ -391,7 +392,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     rows: Rows = [
         [
             Cell(f.case, link="" if campaign else f"case-{make_file_name(f.case)}"),
-            name_run(f.solver, f.start), f.target,
+            format_run_name(f.solver, f.start), f.target,
             f.status, format_residual(f.relative), format_residual(f.roundoff_floor), f.worst_name,
             (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
         ]
@@ -417,7 +418,7 @@ def tabulate_changed_times(old: Records, new: Records) -> Table:
     for c in changes:
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
         times_of = (format_tolerance(c.tolerance), Cell.time(c.old), Cell.time(c.new))
-        rows.append([c.case, name_run(c.solver, c.start), *times_of, c.kind + factor])
+        rows.append([c.case, format_run_name(c.solver, c.start), *times_of, c.kind + factor])
     marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in changes]
     return Table(["case", "solver", "tolerance", "before", "now", "change"], rows, marks)
 
@@ -555,11 +556,11 @@ def tabulate_sequence_passes(passes: Sequence[statistics.Pass]) -> Table:
     for w in passes:
         rows.append(
             [
-                Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.target, str(w.steps),
+                Cell(w.sequence, after=format_left_out_count(w.left_out)), w.solver, w.target, str(w.steps),
                 f"{w.carried_gain:.3g}" if math.isfinite(w.carried_gain) and w.mode == "budget" else NONE,
                 *(format_residual(w.get_median_residual(s)) if s in w.residuals else NONE for s in starts),
                 *(
-                    Cell.time(w.total_times[s], after=format_share(len(w.times[s]), w.steps))
+                    Cell.time(w.total_times[s], after=format_solved_share(len(w.times[s]), w.steps))
                     if s in w.total_times
                     else NONE
                     for s in starts
@@ -598,7 +599,9 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
                 *(
                     NONE
                     if w is None
-                    else Cell.time(w.total_times[w.start], after=format_share(len(w.times[w.start]), w.steps))
+                    else Cell.time(
+                        w.total_times[w.start], after=format_solved_share(len(w.times[w.start]), w.steps)
+                    )
                     for w in timed
                 ),
                 *(NONE if w is None else format_residual(w.get_median_residual(w.start)) for w in limited),
@@ -620,7 +623,7 @@ def tabulate_engines(report: Report) -> Table:
         rows.append(
             {
                 "recorded": c.folder,
-                "steps": f"{c.steps}{format_left_out(c.left_out)}",
+                "steps": f"{c.steps}{format_left_out_count(c.left_out)}",
                 "rows": f"{c.rows:g}",
                 "engine's own": f"{c.solver} (inside the engine)",
                 f"to {format_tolerance(tolerance)}": _format_time(engine),
@@ -651,4 +654,4 @@ def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) ->
 def _format_time(choice: Choice | None) -> str:
     if choice is None or not choice.solved:
         return NONE
-    return format_seconds(choice.score) + format_share(choice.solved, choice.cases)
+    return format_seconds(choice.score) + format_solved_share(choice.solved, choice.cases)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import escape_unprintable
 from lavender.lab.report.findings import Report
-from lavender.lab.report.motion_tables import list_idle_cases
+from lavender.lab.report.motion_tables import list_cases_solved_at_zero
 from lavender.lab.report.table import COLOURS, Cell, Table
 from lavender.lab.report.table_specs import NOT_COMPARED, build_short_table, list_sections
-from lavender.lab.report.text import format_count, format_residual, list_diagnostics, list_left_out
+from lavender.lab.report.text import format_count, format_residual, list_cases_not_loaded, list_diagnostics
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,7 +66,7 @@ def print_table(console: Console, table: Table, grouped: bool = False, cut: bool
         above = first
     is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
     if is_wide and not cut and (table.folds or _fold_words(grid, table) > console.width):
-        _print_lines(console, table)
+        _print_rows_as_lines(console, table)
         return
     console.print(grid, highlight=False)
 
@@ -89,7 +89,7 @@ def _fold_words(grid: RichTable, table: Table) -> int:
     return width
 
 
-def _print_lines(console: Console, table: Table) -> None:
+def _print_rows_as_lines(console: Console, table: Table) -> None:
     """Print each row as the line of its first cell, and a line for each other cell."""
     width = max(map(len, table.heads[1:]))
     for name, *texts in table.cell_texts:
@@ -174,7 +174,7 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
             "yellow",
             [f"{d.case}: {', '.join(d.same)}" for d in statistics.compute_difficulties(records) if d.same],
         ),
-        "left out": ("yellow", [f"{what}: {reason}" for what, reason in list_left_out(records)]),
+        "left out": ("yellow", [f"{what}: {reason}" for what, reason in list_cases_not_loaded(records)]),
     }
     for kind, (style, texts) in kinds.items():
         for i, text in enumerate(texts[:most], 1):
@@ -195,7 +195,7 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
         text = ", ".join(f"{n} {kind}" for kind, n in sorted(by_kind.items()))
         text = text or ("nothing beyond noise" if changes else NOT_COMPARED)
         yield f"Against {escape_unprintable(report.earlier_run.source)}: {text}", ""
-    idle = list_idle_cases(report.newest_run)
+    idle = list_cases_solved_at_zero(report.newest_run)
     if idle:
         worst = max(idle, key=lambda case: case.velocity)
         cases, speed = format_count(len(idle), "case"), format_residual(worst.velocity)

@@ -25,7 +25,7 @@ TIMED_CODE = {
 }
 
 
-def name_time(runs: Iterable[Record]) -> str:
+def make_time_axis_title(runs: Iterable[Record]) -> str:
     """Return the title of an axis for the times of some runs."""
     titles = {TIMED_CODE[r.timing_mode][0] for r in runs if r.is_usable}
     return titles.pop() if len(titles) == 1 else "time [s]"
@@ -37,7 +37,7 @@ def is_external(run: Record) -> bool:
     return run.backend_time_min is not None or (spec is not None and spec.external)
 
 
-def describe_time(runs: Iterable[Record]) -> str:
+def describe_timed_code(runs: Iterable[Record]) -> str:
     """Return a sentence on the code that the times of some runs include, or an empty text without times.
 
     The conversion of the problem for solvers of other packages is part of their set-up.
@@ -75,15 +75,15 @@ def format_sizes(values: Sequence[float]) -> list[str]:
     return [write(x) if math.isfinite(x) and x != 0.0 else "0" if x == 0.0 else NONE for x in values]
 
 
-def format_times(values: Sequence[float]) -> tuple[str, list[str]]:
+def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
     """Return one unit for some times [s], and each time in this unit with three digits."""
     known = [t for t in values if math.isfinite(t) and t > 0.0]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 1.0
     scale, unit = next((u for u in TIME_UNITS if middle >= 0.9995 * u[0]), TIME_UNITS[-1])
-    return unit, [format_digits(t / scale) if math.isfinite(t) else NONE for t in values]
+    return unit, [format_significant_digits(t / scale) if math.isfinite(t) else NONE for t in values]
 
 
-def format_digits(x: float, digits: int = 3) -> str:
+def format_significant_digits(x: float, digits: int = 3) -> str:
     """Return a number with so many significant digits and without an exponent: 0.0652, 16.0, 1020."""
     if x == 0.0:
         return "0"
@@ -124,7 +124,7 @@ def _get_skip_reason(skip: Skip) -> str:
     return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
 
 
-def list_reasons(skips: Iterable[Skip]) -> list[str]:
+def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
     """Return each reason of some skips once, with the number of cases that it holds for if these are several."""
     same: dict[str, list[Skip]] = {}
     for skip in skips:
@@ -136,7 +136,7 @@ def list_reasons(skips: Iterable[Skip]) -> list[str]:
     ]
 
 
-def list_left_out(records: Records) -> list[tuple[str, str]]:
+def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
     """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
     same: dict[str, list[Skip]] = {}
     for skip in records.left_out.get("", ()):
@@ -155,7 +155,7 @@ def list_left_out(records: Records) -> list[tuple[str, str]]:
     return [*single, *((n_steps, some[0].reason) for n_steps, some in steps.items())]
 
 
-def format_left_out(lost: int) -> str:
+def format_left_out_count(lost: int) -> str:
     """Return the number of cases that a number leaves out, in parentheses; empty for none."""
     return f" ({lost} left out)" if lost else ""
 
@@ -168,11 +168,11 @@ def format_percent(part: int, whole: int, digits: int = 0) -> str:
     return f"{tenths / 10**digits:.{digits}f} %"
 
 
-def format_share(solved: int, cases: int) -> str:
+def format_solved_share(solved: int, cases: int) -> str:
     """Return (7/8); empty if all are solved."""
     return "" if solved == cases else f" ({solved}/{cases})"
 
 
-def name_run(solver: str, start: str) -> str:
+def format_run_name(solver: str, start: str) -> str:
     """Return a solver with its start unless it is cold: newton (warm)."""
     return solver if start == "cold" else f"{solver} ({start})"

@@ -34,7 +34,7 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, EngineAnswers, is_ranked_before, rank_engine
 from lavender.lab.report.figures import is_plug_in
 from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
-from lavender.lab.report.text import format_count, format_left_out, format_ratio, format_residual
+from lavender.lab.report.text import format_count, format_left_out_count, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
 
@@ -114,7 +114,7 @@ def build_verdict(
     if speeds and parts:
         best = list_subjects(convert_to_motion_errors(records))[0].best.best
         if best is not None:
-            reached = _describe_speed(speeds[len(speeds) // 2])
+            reached = _describe_velocity_tolerance(speeds[len(speeds) // 2])
             statements.append(
                 Statement(f"By motion error {best.solver}: {format_seconds(best.score)} {reached}.")
             )
@@ -142,12 +142,16 @@ def _recommend_solver(
     if resampled is None or not resampled.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
         text = f"No solver brings {cases} {reached}."
-        return Verdict((Statement(_add_engine(records, text, None, engine, cases)),), near)
+        return Verdict((Statement(_add_engine_to_sentence(records, text, None, engine, cases)),), near)
     call, first = resampled.ranking[0]
     named_cases = "them" if engine is not None and is_ranked_before(engine, first) else cases
-    head = _describe_choice(records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases)
+    head = _describe_recommended_choice(
+        records, first, f"{STARTS[call.as_record.start]}, {reached}", named_cases
+    )
     statements = [
-        _add_code(records, call, _add_engine(records, head, first, engine, cases)),
+        _make_statement_with_code(
+            records, call, _add_engine_to_sentence(records, head, first, engine, cases)
+        ),
         *_state_plug_ins(subject.best, first.solver),
         *_describe_resampled_ranking(resampled),
     ]
@@ -159,7 +163,9 @@ def _recommend_solver(
     ]
     for batch in batches[:1] if len(call.runs) > 1 else ():
         statements.append(
-            _add_code(records, batch, f"As a batch: {format_seconds(batch.mean_time)} for each problem.")
+            _make_statement_with_code(
+                records, batch, f"As a batch: {format_seconds(batch.mean_time)} for each problem."
+            )
         )
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
@@ -173,7 +179,7 @@ def _recommend_solver(
             continue
         best, choice = quick.ranking[0]
         text = _describe_budget_recommendation(f"If you have only {format_seconds(t)}", choice, t)
-        statements.append(_add_code(records, best, text, bool(times)))
+        statements.append(_make_statement_with_code(records, best, text, bool(times)))
         leaders.insert(1, choice.solver)
     statements += _state_sweep_budgets(records, single, sweeps, n)
     faster = [
@@ -197,23 +203,23 @@ def _recommend_by_motion_error(records: Records) -> Verdict:
     """
     subject = list_subjects(records)[0]
     best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
-    cases, reached = _describe_subject(records, subject, n), _describe_speed(subject.best.target)
+    cases, reached = _describe_subject(records, subject, n), _describe_velocity_tolerance(subject.best.target)
     leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
     first = best.best
     if first is None:
         return Verdict((Statement(f"No solver brings {cases} so far {reached}."),), leaders)
     ties = (Statement(f"As good within noise: {', '.join(best.tied_solvers)}."),) if best.tied_solvers else ()
-    tol = _find_tolerance(records, first.solver, best.target)
+    tol = _find_tolerance_of_fastest_runs(records, first.solver, best.target)
     arguments = (
         f"tol={format_tolerance(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
     )
     code = f'lv.solve(problem, "{first.solver}", {arguments})'
     start = STARTS["carried" if "carried" in first.how else "cold"]
-    text = _describe_choice(records, first, f"{start}, {reached}", cases)
+    text = _describe_recommended_choice(records, first, f"{start}, {reached}", cases)
     return Verdict((Statement(text, (code,)), *ties), leaders)
 
 
-def _find_tolerance(records: Records, solver: str, tolerance: float) -> float:
+def _find_tolerance_of_fastest_runs(records: Records, solver: str, tolerance: float) -> float:
     """Return the smallest tolerance of the fastest runs to this speed, over the cases; nan if they had none."""
     fastest: dict[str, Record] = {}
     for r in records:
@@ -231,7 +237,7 @@ def _find_tolerance(records: Records, solver: str, tolerance: float) -> float:
 # -- sentences -----------------------------------------------------------------------------------------------
 
 
-def _describe_speed(speed: float) -> str:
+def _describe_velocity_tolerance(speed: float) -> str:
     """Return words for a velocity tolerance [m/s]."""
     return f"until no body has a velocity error above {format_speed(speed)}"
 
@@ -240,10 +246,10 @@ def _describe_subject(records: Records, subject: Subject, n: int) -> str:
     """Return words for the cases of a subject, with the number of those that did not load."""
     names, lost = subject.names, records.left_out
     if subject.timing_mode == "call":
-        return _describe_cases(records, names) + format_left_out(len(lost.get("", ())))
+        return _describe_cases(records, names) + format_left_out_count(len(lost.get("", ())))
     of = names[0] if len(names) == 1 else f"your {format_count(len(names), 'sequence')}"
     n_lost = sum(len(lost.get(name, ())) for name in names)
-    return f"the {format_count(n, 'step')} of {of}" + format_left_out(n_lost)
+    return f"the {format_count(n, 'step')} of {of}" + format_left_out_count(n_lost)
 
 
 def _describe_cases(records: Records, cases: Sequence[str]) -> str:
@@ -258,7 +264,7 @@ def _describe_cases(records: Records, cases: Sequence[str]) -> str:
     return f"your {format_count(len(cases), shape, plural)}" if len(cases) > 1 else f"your {shape}"
 
 
-def _describe_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
+def _describe_recommended_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
     """Return the first sentence: the solver, its mean time, the time of a miss, and the slowest case."""
     has_misses = first.solved < first.cases
     idle = first.cases - len(
@@ -270,20 +276,22 @@ def _describe_choice(records: Records, first: Choice, reached: str, cases: str) 
         text += " on average"
     if has_misses:
         no_run = f"; on {idle} it has no run" if idle > 0 else ""
-        text += f" (a miss counted as {format_seconds(statistics.get_time_of_miss(records))}{no_run})"
+        text += f" (a miss counted as {format_seconds(statistics.get_penalty_time_of_miss(records))}{no_run})"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
         text += f" ({format_seconds(first.worst)} at worst, {first.hardest})"
     return f"{text}, {reached}."
 
 
-def _add_engine(records: Records, head: str, first: Choice | None, engine: Choice | None, cases: str) -> str:
+def _add_engine_to_sentence(
+    records: Records, head: str, first: Choice | None, engine: Choice | None, cases: str
+) -> str:
     """Add the engine's own solver to the first sentence: before it if it ranks first, else after it."""
     if engine is None:
         return head
     has_misses = engine.solved < engine.cases
     time = format_seconds(engine.score) + (" on average" if engine.cases > 1 else "")
     if has_misses:
-        time += f" (a miss counted as {format_seconds(statistics.get_time_of_miss(records))})"
+        time += f" (a miss counted as {format_seconds(statistics.get_penalty_time_of_miss(records))})"
     if engine.solved and (first is None or is_ranked_before(engine, first)):
         of = f"{engine.solved} of " if has_misses else ""
         here = head if first is None else f"Of the solvers here, u{head[1:]}"
@@ -340,7 +348,7 @@ def _state_sweep_budgets(
         if len(budgets) > 1:
             text = text.removesuffix(f"{format_residual(choices[0].score)}.")
             text += f"{_join_names([format_residual(choice.score) for choice in choices])}."
-        statement = _add_code(records, served_by[0], text, True)
+        statement = _make_statement_with_code(records, served_by[0], text, True)
         others = ", ".join(map(str, budgets[1:]))
         code = tuple(
             f"{line}  # or {others}" if others and "lv.solve" in line else line for line in statement.code
@@ -407,7 +415,9 @@ def _explain_missing_c(records: Records, call: TimedCall) -> str:
     return ""
 
 
-def _add_code(records: Records, call: TimedCall, text: str, requested: bool = False) -> Statement:
+def _make_statement_with_code(
+    records: Records, call: TimedCall, text: str, requested: bool = False
+) -> Statement:
     """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
     if not call.as_record.times:
         text += " Records of an earlier version: the call itself was not timed."

@@ -113,7 +113,9 @@ class MujocoStage(Stage):
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def from_runs(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> MujocoStage:
+    def from_stretches_of_runs(
+        cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int
+    ) -> MujocoStage:
         """Cut worlds that run with the model's own setting into stretches."""
         starts, controls = [], []
         for world in worlds:

@@ -115,7 +115,10 @@ def tune(
 
     def make_stages() -> tuple[Stage, Stage]:
         """Simulate the worlds with even numbers, and those with odd numbers."""
-        even, odd = (stage_type.from_runs(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
+        even, odd = (
+            stage_type.from_stretches_of_runs(mj, configured, runs, range(i, worlds, 2), horizon)
+            for i in (0, 1)
+        )
         return cast("tuple[Stage, Stage]", (even, odd))
 
     return measure_settings(
@@ -158,7 +161,7 @@ def measure_settings(
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
         timed = [m for m in measured if np.isfinite(m.mean_step_time)]
-        busy = machine.describe_busy(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+        busy = machine.make_busy_warning(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
             n_held_worlds=n_held_worlds,

@@ -52,7 +52,9 @@ class WarpStage(Stage):
     ends: FloatArray
 
     @classmethod
-    def from_runs(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> WarpStage:
+    def from_stretches_of_runs(
+        cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int
+    ) -> WarpStage:
         """Cut worlds that run with the model's own setting into stretches."""
         model, chosen = copy.copy(model), list(worlds)
         model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE

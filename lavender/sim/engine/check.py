@@ -32,7 +32,7 @@ WRITTEN_SETTINGS = {"out": 8, "depth": 1, "joint_error": 1}  # Entries of `setti
 QUATERNION_TOLERANCE = 1e-9
 
 
-def check_sizes(own: State, size: np.ndarray) -> None:
+def check_state_sizes(own: State, size: np.ndarray) -> None:
     """Raise InputError if sizes other than the capacities differ from the simulation's."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
@@ -41,7 +41,7 @@ def check_sizes(own: State, size: np.ndarray) -> None:
 
 
 def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
-    """Raise InputError if `new` is not a state of the scene of `own`; call `check_sizes` first.
+    """Raise InputError if `new` is not a state of the scene of `own`; call `check_state_sizes` first.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _make_damaged_state_error(reason: str) -> InputError:
     return InputError(f"the snapshot is damaged: {reason}")
 
 
-def check_fields(snapshot: Any) -> None:
+def check_snapshot_fields(snapshot: Any) -> None:
     """Raise InputError if the fields of a snapshot have wrong types or lengths."""
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)

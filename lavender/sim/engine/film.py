@@ -33,7 +33,7 @@ class Film:
     Parameters
     ----------
     header : dict
-        Scene, dt, bodies and joints, from `make_header`.
+        Scene, dt, bodies and joints, from `make_film_header`.
     """
 
     def __init__(self, header: dict[str, Any]) -> None:
@@ -128,7 +128,7 @@ class Film:
             header, end = unpack_header(data, MAGIC, MAX_FILM_HEADER_BYTES)
             if header.pop("version") != VERSION:
                 raise ValueError
-            _check_header(header)
+            _check_film_header(header)
             film = cls(header)
             frames = np.frombuffer(data, "<f4", offset=end).astype(np.float32)
             if len(frames) % film._width or not np.isfinite(frames).all():
@@ -141,7 +141,7 @@ class Film:
         return film
 
 
-def make_header(scene: Scene, state: State) -> dict[str, Any]:
+def make_film_header(scene: Scene, state: State) -> dict[str, Any]:
     """Return the constant data that a picture needs in addition to the poses, as plain numbers."""
     a = state.a
     joints = []
@@ -162,7 +162,7 @@ def make_header(scene: Scene, state: State) -> dict[str, Any]:
     }
 
 
-def _check_header(header: dict[str, Any]) -> None:
+def _check_film_header(header: dict[str, Any]) -> None:
     """Raise an error if the header lacks data that the page and the pictures read, or has wrong values."""
     n = len(header["bodies"])
     if not isinstance(header["scene"], str) or not 0.0 < float(header["dt"]) < np.inf:

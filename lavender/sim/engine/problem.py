@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.lazy_import import lazy_module
+from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -17,7 +17,7 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.state import State
 from lavender.sim.scene.arithmetic import compute_norm
 
-motion = lazy_module("lavender.lab.motion")
+motion = import_module_lazily("lavender.lab.motion")
 
 RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 
@@ -41,7 +41,7 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
     tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
     # Contacts without friction have no tangent; `Rows` needs a unit vector orthogonal to the normal.
     frictionless = np.flatnonzero(a["mu"][kj:k] == 0.0)
-    tangent[frictionless] = _choose_tangents(normal[frictionless])
+    tangent[frictionless] = _choose_first_tangents(normal[frictionless])
     rows = Rows(
         inv_mass=a["inv_mass"].copy(),
         inv_inertia=a["inv_inertia"].copy(),
@@ -96,7 +96,7 @@ def _number_contact_points(key: np.ndarray) -> list[int]:
     return list(number.tolist())
 
 
-def _choose_tangents(normal: FloatArray) -> FloatArray:
+def _choose_first_tangents(normal: FloatArray) -> FloatArray:
     """Return a unit vector orthogonal to each normal (c, 3)."""
     out = np.zeros_like(normal)
     for i, n in enumerate(normal):

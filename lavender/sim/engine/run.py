@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
 from lavender.base.errors import require_packages
-from lavender.io.stored import open_step_folder, write_figure, write_text
+from lavender.io.stored import lock_step_folder, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import get_sweep_order
 from lavender.sim.engine.values import SOLVER_FIELDS
@@ -130,7 +130,7 @@ def run(
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done, stopped = "", 0, False
-    with nullcontext() if record is None else open_step_folder(record, replace) as folder:
+    with nullcontext() if record is None else lock_step_folder(record, replace) as folder:
         try:
             while done < steps and not lost:
                 if folder is not None:

@@ -9,11 +9,11 @@ from typing import Any
 from lavender import io
 from lavender.base.arrays import check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
-from lavender.base.lazy_import import lazy_module
-from lavender.io.stored import open_step_folder
+from lavender.base.lazy_import import import_module_lazily
+from lavender.io.stored import lock_step_folder
 from lavender.problem import Problem
-from lavender.sim.engine.check import check_fields, check_sizes, check_state
-from lavender.sim.engine.film import Film, make_header
+from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes
+from lavender.sim.engine.film import Film, make_film_header
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
@@ -156,7 +156,7 @@ class Simulation(Stepping):
         steps = check_int("steps", steps, 1)
         folder = Path(folder)
         digits, written = len(str(self._steps + steps)), []
-        with open_step_folder(folder, continued=folder.resolve() == self._recorded):
+        with lock_step_folder(folder, continued=folder.resolve() == self._recorded):
             self._recorded = folder.resolve()
             for _ in range(steps):
                 written.append(self.write_problem(folder, digits, form))
@@ -206,7 +206,7 @@ class Simulation(Stepping):
     @run_exclusively
     def start_film(self) -> Film:
         """Return a new film with the present poses; every step adds a frame until `end_film`."""
-        film = Film(make_header(self.scene, self.state))
+        film = Film(make_film_header(self.scene, self.state))
         film.add(self.time, self._make_observation())
         self.films.append(film)
         return film
@@ -278,7 +278,9 @@ class Simulation(Stepping):
             self.end_film(film)
 
         try:
-            viewer = lazy_module("lavender.sim.web.view").Viewer(film, port=port, browser=browser, end=end)
+            viewer = import_module_lazily("lavender.sim.web.view").Viewer(
+                film, port=port, browser=browser, end=end
+            )
         except BaseException:
             self.end_film(film)
             raise
@@ -356,9 +358,9 @@ class Simulation(Stepping):
             )
         if snapshot.fingerprint != self._fingerprint:
             raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
-        check_fields(snapshot)
+        check_snapshot_fields(snapshot)
         size = snapshot.size.copy()
-        check_sizes(self.state, size)
+        check_state_sizes(self.state, size)
         found_lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
         used = compute_buffer_lengths(size)
         if found_lengths != (used[0], used[1], max(used[2], 1)):

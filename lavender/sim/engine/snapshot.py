@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender.base.errors import InputError
 from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_atomically
-from lavender.sim.engine.check import check_fields
+from lavender.sim.engine.check import check_snapshot_fields
 from lavender_ext.engine.arrays import compute_buffer_lengths
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
@@ -59,7 +59,7 @@ class Snapshot:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the snapshot to a file with version and checksum; an existing file is replaced atomically."""
-        check_fields(self)
+        check_snapshot_fields(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
         header = {name: getattr(self, name) for name in HEADER_FIELDS}
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
@@ -107,7 +107,7 @@ class Snapshot:
             end += x.nbytes
             arrays[name] = x.astype(x.dtype.newbyteorder("="))
         snapshot = cls(**{name: header[name] for name in HEADER_FIELDS} | arrays)
-        check_fields(snapshot)
+        check_snapshot_fields(snapshot)
         used = compute_buffer_lengths(snapshot.size)
         if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")

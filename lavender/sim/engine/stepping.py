@@ -378,7 +378,7 @@ class Stepping:
                 try:
                     problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
-                    self._mark_lost()
+                    self._end_run_at_lost_body()
                     return
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
@@ -386,7 +386,7 @@ class Stepping:
             if kernel.finish() != OK:
                 return
 
-    def _mark_lost(self) -> None:
+    def _end_run_at_lost_body(self) -> None:
         """End the run after a prepared problem that is not valid, at the body that `finish()` reports."""
         self.state.kernel.apply()
         if self.state.kernel.finish() == OK:

@@ -184,7 +184,7 @@ def build(
             source.write_text(EXTRACT_C["extract_c"](parts, roots=names), encoding="utf-8")
         except EXTRACT_C["ExtractionError"] as error:
             raise BuildFailed(str(error)) from None
-        data = _compile(source, names, ["--import-memory"] if imports_memory else [])
+        data = _compile_to_wasm(source, names, ["--import-memory"] if imports_memory else [])
     _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
     data += make_custom_section(SOURCES_SECTION, hash_sources(root, modules).encode())
     out = out.resolve()  # A link stays; its target is replaced.
@@ -207,14 +207,14 @@ def write_atomically(path: Path, data: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
-def _compile(source: Path, names: Iterable[str], extra_options: Iterable[str] = ()) -> bytes:
+def _compile_to_wasm(source: Path, names: Iterable[str], extra_options: Iterable[str] = ()) -> bytes:
     """Compile and link one C file without Python headers to a module that exports the functions `names`."""
     compiler, linker, named = _find_tools()
     # Older versions of clang call memset and memcpy; zig uses instructions instead.
     flags = ["-std=c11", "-O3", "-g0", "-w", "-ffp-contract=off", "-ffunction-sections"]
     flags += ["-mbulk-memory"] if named else []
     compiled, linked = source.with_suffix(".o"), source.with_suffix(".wasm")
-    _run([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
+    _run_command([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
     link_options = [
         "--no-entry",
         "--gc-sections",
@@ -223,7 +223,7 @@ def _compile(source: Path, names: Iterable[str], extra_options: Iterable[str] = 
         *extra_options,
     ]
     try:
-        _run([*linker, *link_options, str(compiled), "-o", str(linked)], source.parent)
+        _run_command([*linker, *link_options, str(compiled), "-o", str(linked)], source.parent)
     except BuildFailed as error:
         if "undefined symbol" not in str(error):
             raise
@@ -239,7 +239,7 @@ def _find_tools() -> tuple[list[str], list[str], bool]:
     return named or [*zig, "cc", "-target", "wasm32-wasi"], linker, bool(named)
 
 
-def _run(command: list[str], folder: Path) -> None:
+def _run_command(command: list[str], folder: Path) -> None:
     """Run a command in a folder; raise BuildFailed with its output if it fails."""
     env = dict(os.environ)
     if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # zig caches libraries in the home folder.

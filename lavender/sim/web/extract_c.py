@@ -230,12 +230,12 @@ def _iterate_declarations(stream: list[Token]) -> Iterator[Item]:
         word, stop = _get_directive(stream[at]), at + 1
         if word in OPENING:
             stop = _find_end_of_group(stream, at)
-            yield _make_group(stream[at:stop])
+            yield _make_conditional_group(stream[at:stop])
         elif word == "define":
             yield Item("macro", [stream[at]], {WORD.findall(stream[at].text)[1]})
         elif not word:
             stop = _find_end_of_declaration(stream, at)
-            yield _make_item(stream[at:stop])
+            yield _parse_declaration(stream[at:stop])
         at = stop
 
 
@@ -287,7 +287,7 @@ def _join_tokens(part: list[Token]) -> str:
     return re.sub(r"[ \t]+\n", "\n", "".join(out))
 
 
-def _make_group(part: list[Token]) -> Item:
+def _make_conditional_group(part: list[Token]) -> Item:
     """Return the group of all declarations between `#if` and `#endif`."""
     group = Item("group", part)
     for item in _iterate_declarations([token for token in part if token.kind != "directive"]):
@@ -296,7 +296,7 @@ def _make_group(part: list[Token]) -> Item:
     return group
 
 
-def _make_item(part: list[Token]) -> Item:
+def _parse_declaration(part: list[Token]) -> Item:
     """Return one declaration with its kind and the names that it defines, from its tokens."""
     words = ["{" if token.kind == "body" else token.text for token in part]
     names = [i for i, token in enumerate(part) if token.kind == "name"]
@@ -347,10 +347,10 @@ class _Table:
         """Return all declarations that the names need, ordered so that each precedes its use."""
         done: dict[int, Item] = {}
         for name in sorted(roots):
-            self._visit(name, done, ())
+            self._add_with_dependencies(name, done, ())
         return list(done.values())
 
-    def _visit(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
+    def _add_with_dependencies(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
         """Add the declaration of a name and everything that it uses; `path` contains the names that led to it."""
         if name not in self.by_name or name in PREDEFINED:
             return
@@ -374,7 +374,7 @@ class _Table:
                 f"{path[-1] if path else 'a root'} needs {name}, which only the Python part defines ({item.origin})"
             )
         for used in sorted(item.used_names - item.defines):
-            self._visit(used, done, (*path, name))
+            self._add_with_dependencies(used, done, (*path, name))
         done[id(item)] = item
 
 

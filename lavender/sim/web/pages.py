@@ -17,7 +17,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes, write_text
+from lavender.io.stored import check_writable, load_or_make_file, make_folder, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import collect_page_data
 
@@ -42,7 +42,7 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
         raise LavenderError(str(error)) from None
 
 
-def get_module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
+def get_or_build_module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
     """Return a module of the present kernels: the one in the package, or a new one, which is stored there if possible.
 
     Parameters
@@ -68,7 +68,7 @@ def get_module(say: Callable[[str], Any] = lambda text: None, name: str = "laven
             build_module(out, name)
             return out.read_bytes()
 
-    return load_or_make(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
+    return load_or_make_file(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
@@ -84,7 +84,7 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
         A module cannot be built.
     """
     make_folder(check_writable(folder, folder=True))
-    modules = {name: get_module(say, name) for name in wasm.PARTS}
+    modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy_file, dirs_exist_ok=True)
         for name, data in modules.items():
@@ -115,7 +115,7 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
         raise LavenderError(
             "node, which runs the check, is not installed: install Node 18 or newer (nodejs.org, or apt)"
         )
-    modules = {name: get_module(say, name) for name in wasm.PARTS}
+    modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
     with TemporaryDirectory(prefix="lavender-web-") as folder:
         for name, data in modules.items():
             Path(folder, f"{name}.wasm").write_bytes(data)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import BACKENDS, DEFINITE, installed
-from random_problems import as_matrix, random_contact_problem, random_rows, spd, touching
+from random_problems import as_matrix, random_bodies_and_contacts, random_contact_problem, spd, touching
 from worked import python
 
 import lavender as lv
@@ -21,7 +21,7 @@ from lavender.external import as_qp, backends, qp_solver
 from lavender.external.as_qp import (
     build_impulse_form,
     build_velocity_form,
-    choose_form,
+    choose_program_form,
     compute_backend_tolerance,
 )
 from lavender.external.running import Answer, capture_backend_output
@@ -235,7 +235,7 @@ def test_contacts_that_separate_are_taken_out_with_their_friction(name):
     for one, taken_out in ((problem, []), (away, list(rows))):
         solution = lv.solve(one, name)
         assert solution.success, str(solution)
-        assert build_impulse_form(one, assume=True).assumed.tolist() == taken_out
+        assert build_impulse_form(one, fix_far_rows=True).assumed.tolist() == taken_out
     assert not solution.impulse[list(rows)].any()
 
 
@@ -539,7 +539,7 @@ def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
 
 def test_units_do_not_reach_the_backend():
     """Of mass, and of speed, by powers of two: no bit of the program is another one."""
-    rows = random_rows(np.random.default_rng(5), bodies=4, joints=3, contacts=7)
+    rows = random_bodies_and_contacts(np.random.default_rng(5), bodies=4, joints=3, contacts=7)
     made = [
         lv.Problem.from_rows(
             replace(
@@ -567,21 +567,21 @@ def test_a_linear_system_as_equalities_has_its_solution():
 
 def test_auto_takes_the_form_by_size_mass_ratio_and_backend():
     rng = np.random.default_rng(4)
-    rows = random_rows(rng, bodies=5, joints=0, contacts=8)
+    rows = random_bodies_and_contacts(rng, bodies=5, joints=0, contacts=8)
     small = lv.Problem.from_rows(rows)
-    assert choose_form(small, "auto") == "impulse"  # 8 rows, 30 velocities
-    assert choose_form(small, "auto", definite=True) == "velocity"
-    assert choose_form(as_matrix(small), "auto", definite=True) == "impulse"
-    many = lv.Problem.from_rows(random_rows(rng, bodies=2, joints=0, contacts=13))
-    assert choose_form(many, "auto") == "velocity"  # 13 rows, 12 velocities
+    assert choose_program_form(small, "auto") == "impulse"  # 8 rows, 30 velocities
+    assert choose_program_form(small, "auto", definite=True) == "velocity"
+    assert choose_program_form(as_matrix(small), "auto", definite=True) == "impulse"
+    many = lv.Problem.from_rows(random_bodies_and_contacts(rng, bodies=2, joints=0, contacts=13))
+    assert choose_program_form(many, "auto") == "velocity"  # 13 rows, 12 velocities
     inv_mass = rows.inv_mass.copy()
     inv_mass[0] /= 1e4
     heavy = lv.Rows(
         inv_mass, rows.inv_inertia, rows.v_free, normal=rows.normal, tangent=rows.tangent,
         arm_a=rows.arm_a, arm_b=rows.arm_b, contact_body=rows.contact_body,
     )  # fmt: skip
-    assert choose_form(lv.Problem.from_rows(heavy), "auto") == "velocity"
+    assert choose_program_form(lv.Problem.from_rows(heavy), "auto") == "velocity"
     with pytest.raises(lv.CapabilityError, match="needs a problem with rows"):
-        choose_form(as_matrix(small), "velocity")
+        choose_program_form(as_matrix(small), "velocity")
     with pytest.raises(lv.InputError, match="'impulse' or 'velocity' or 'auto'"):
-        choose_form(small, "dual")
+        choose_program_form(small, "dual")

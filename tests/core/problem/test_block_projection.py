@@ -103,7 +103,9 @@ def test_projection_and_its_derivatives_are_those_of_a_dense_twin(kind, law):
             def by_coefficient(x, rows=rows, block=block, components=components):
                 return project(law, y[block], [(r, x[0] if r == rows else c) for r, c in components])
 
-            edge = linear.times(unit, edge=True)[block] * (root[block][0] / root[block][rows[0]])
+            edge = linear.multiply_projection_derivative(unit, edge=True)[block] * (
+                root[block][0] / root[block][rows[0]]
+            )
             np.testing.assert_allclose(
                 edge.astype(float),
                 difference(by_coefficient, np.array([a], L), 0).astype(float),

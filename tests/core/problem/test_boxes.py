@@ -7,7 +7,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, dragged, random_boxes, random_ellipses, seeds
+from random_problems import (
+    as_matrix,
+    dragged,
+    random_box_friction_contacts,
+    random_ellipse_friction_contacts,
+    seeds,
+)
 
 import lavender as lv
 from lavender import registry
@@ -121,7 +127,7 @@ def test_what_findex_cannot_hold_is_told():
 @settings(max_examples=15)
 def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations):
     """Rows that depend on each other, which many impulses or none can meet; from near the best that `auto` finds."""
-    problem = random_boxes(seed, law, bodies=3, joints=4, contacts=8)
+    problem = random_box_friction_contacts(seed, law, bodies=3, joints=4, contacts=8)
     problem = replace(problem, compliance=np.zeros(problem.m))
     found = lv.solve(problem, "auto", tol=1e-8).impulse
     near = found + 1e-6 * np.random.default_rng(seed).normal(size=problem.m)
@@ -205,7 +211,7 @@ def test_disks_share_the_factor_of_the_mass_matrix(mass):
 
 
 def ellipses_of_rows(seed, friction="coulomb"):
-    base = random_ellipses(seed, friction)
+    base = random_ellipse_friction_contacts(seed, friction)
     return replace(base, compliance=base.compliance + 0.3)
 
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse as sp
 from calls import robot
 from hypothesis import given, settings
-from random_problems import random_contact_problem, random_lcp, random_tree, seeds, tree_mass
+from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, tree_mass
 
 import lavender as lv
 from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_errors
@@ -87,7 +87,7 @@ def test_j_and_m_in_float32_are_widened_exactly_and_say_so():
     p = robot(7, number=np.float32)
     assert p.precision == "float32"
     rng = np.random.default_rng(7)
-    mass = tree_mass(rng, random_tree(rng, 10)).astype(np.float32)
+    mass = tree_mass(rng, random_tree_parents(rng, 10)).astype(np.float32)
     assert np.array_equal(np.tril(p.generalized.mass.toarray()), np.tril(mass.astype(np.float64)))
     assert np.array_equal(p.generalized.v_free, p.generalized.v_free.astype(np.float32))
     assert lv.residual(p, p.start()).precision == "float32"  # the judge takes the problem's

@@ -9,7 +9,14 @@ import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import ancestors, as_matrix, random_general, random_tree, seeds, tree_mass
+from random_problems import (
+    ancestors,
+    as_matrix,
+    random_generalized_problem,
+    random_tree_parents,
+    seeds,
+    tree_mass,
+)
 
 import lavender as lv
 from lavender.problem import generalized as coordinates
@@ -43,7 +50,7 @@ def row_by_row(mass, x):
 def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 48 if seed % 5 else 160))
-    parent = np.arange(n) - 1 if seed % 3 == 0 else random_tree(rng, n)
+    parent = np.arange(n) - 1 if seed % 3 == 0 else random_tree_parents(rng, n)
     mass = tree_mass(rng, parent) + 0.1 * np.eye(n)  # long chains alone lose definiteness to rounding
     if seed % 4 == 1:  # fills in
         for i, j in rng.integers(0, n, (int(rng.integers(1, n + 1)), 2)):
@@ -76,7 +83,7 @@ def test_an_order_that_fills_in_is_left_before_its_factor_is_made(monkeypatch):
 def test_the_factor_of_a_tree_hardly_fills_in_whatever_the_order_of_its_velocities():
     rng = np.random.default_rng(1)
     n = 120  # enough that factorisations in the order that was drawn take longer than the search
-    parent = random_tree(rng, n)
+    parent = random_tree_parents(rng, n)
     mass = tree_mass(rng, parent)
     jac = rng.normal(size=(4, n))
     general = lv.Generalized(jac, mass, np.zeros(n))
@@ -170,7 +177,7 @@ def width(problem, kernel):
 @pytest.mark.parametrize("soft", [True, False])
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
-    problem = random_general(seed, friction, compliance=soft)
+    problem = random_generalized_problem(seed, friction, compliance=soft)
     tol = 1e-10 if soft else 1e-8  # of what is rigid a proximal term is taken away
     solution = lv.solve(problem, "newton", form="velocity", tol=tol)
     assert "csr" not in problem.__dict__  # A was not formed
@@ -198,7 +205,7 @@ def test_centres_stay_until_velocities_are_found_however_many_rows_these_have(nv
 def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compliance):
     """Of 20 velocities, where steps are taken by the rows that answer or by all velocities."""
     rng = np.random.default_rng(rows)
-    parent = random_tree(rng, 20)
+    parent = random_tree_parents(rng, 20)
     jac = np.zeros((rows, 20))
     for row in jac:
         on = ancestors(parent, int(rng.integers(0, 20)))
@@ -219,7 +226,7 @@ def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compli
 
 
 def test_updated_is_the_same_structure_with_new_numbers():
-    problem = random_general(9, "cone")
+    problem = random_generalized_problem(9, "cone")
     general = problem.generalized
     rng = np.random.default_rng(0)
     jac, v = general.jac.toarray() * 1.1, rng.normal(size=general.nv)
@@ -250,7 +257,7 @@ def test_entries_of_a_that_vanish_are_left_out(jac):
 
 
 def test_nothing_of_the_judge_forms_a(monkeypatch):
-    problem = random_general(6, "cone")
+    problem = random_generalized_problem(6, "cone")
     monkeypatch.setattr(
         "lavender.problem.operators.assemble.form_gram_matrix", None
     )  # which A = Y Y^T is formed by
@@ -267,7 +274,9 @@ def test_nothing_of_the_judge_forms_a(monkeypatch):
 def test_branches_are_factored_in_their_own_pattern(friction, seed):
     """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
-    problem = random_general(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
+    problem = random_generalized_problem(
+        seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts
+    )
     kernel = general.prepare(problem)
     trees = np.bincount(problem.generalized.trees)
     if friction != "coulomb":  # whose matrix lacks symmetry and is kept whole
@@ -357,14 +366,14 @@ def test_room_for_a_pattern_grows():
 
 def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
     monkeypatch.setattr(general, "MAX_MATRIX_ENTRIES", 30.0)  # five velocities, dense
-    problem = random_general(6, "cone")
+    problem = random_generalized_problem(6, "cone")
     solver, impulse = Newton(), problem.start().copy()  # behind the small call, which has room of its own
     claim = solver.run(solver.prepare(problem), impulse, 100, 1e-8)
     assert claim.form == "impulse" and lv.residual(problem, impulse).relative <= 1e-8
     with pytest.raises(lv.CapabilityError, match="accepts a matrix of"):
-        lv.solve(random_general(6, "cone"), "newton", form="velocity")
+        lv.solve(random_generalized_problem(6, "cone"), "newton", form="velocity")
     small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
-    assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]
+    assert [s.success for s in lv.solve_many([random_generalized_problem(6, "cone"), small])] == [True, True]
 
 
 def test_few_rows_on_many_velocities_that_all_meet_are_solved_over_a():
@@ -390,7 +399,9 @@ def test_few_rows_on_many_velocities_that_all_meet_are_solved_over_a():
 @settings(max_examples=8)
 def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
-    problem = random_general(seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin)
+    problem = random_generalized_problem(
+        seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin
+    )
     if lv.known(problem)[name]:
         assert name == "pgs" and problem.law == "cone"
         return
@@ -410,8 +421,8 @@ def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
 def test_the_pattern_of_a_factor_serves_again_where_it_is_the_same_and_nowhere_else(seed, same):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 12))
-    tree = random_tree(rng, n)
-    other = tree if same == "tree" else random_tree(rng, n if same == "size" else n + 1)
+    tree = random_tree_parents(rng, n)
+    other = tree if same == "tree" else random_tree_parents(rng, n if same == "size" else n + 1)
 
     def made(parent, like=None):
         lower = sp.csr_array(np.tril(tree_mass(rng, parent)))

@@ -12,7 +12,7 @@ from random_problems import (
     FORMS,
     as_matrix,
     random_contact_problem,
-    random_general,
+    random_generalized_problem,
     seeds,
     side_by_side,
     touching,
@@ -161,7 +161,7 @@ LARGE = st.lists(st.integers(3, 60), min_size=1, max_size=3).map(lambda powers: 
 @given(seed=seeds, sizes=LARGE, still=st.booleans())
 def test_inactive_rows_change_no_relative_residual(form, friction, seed, sizes, still):
     rng = np.random.default_rng(seed)
-    problem = random_general(seed, friction)
+    problem = random_generalized_problem(seed, friction)
     if still:  # the zero impulse is a solution
         problem = problem.updated(b=np.where(problem.cones.lower == 0.0, -np.abs(problem.b), 0.0))
     more = with_inactive_rows(problem, rng, sizes)
@@ -181,7 +181,7 @@ def test_solvers_converge_beside_inactive_rows(friction, size, form):
     tol, solved = 1e-6, 0
     convert = as_matrix if form == "matrix" else (lambda p: p)
     for seed in range(3):
-        problem = random_general(seed, friction, contacts=3)
+        problem = random_generalized_problem(seed, friction, contacts=3)
         more = with_inactive_rows(problem, np.random.default_rng(seed), np.array([size]))
         for name in lv.available(more):
             if get(name).external:

@@ -14,7 +14,7 @@ from random_problems import (
     FORMS,
     as_matrix,
     random_contact_problem,
-    random_general,
+    random_generalized_problem,
     random_lcp,
     seeds,
 )
@@ -69,7 +69,7 @@ def test_the_judge_equals_its_twin_in_every_form(kind, friction, seed):
 @settings(max_examples=20)
 @given(seed=seeds, tangents=st.integers(1, 5), soft=st.booleans())
 def test_the_judge_equals_its_twin_on_round_cones(seed, tangents, soft):
-    problem = random_general(seed, "cone", tangents=tangents, compliance=soft)
+    problem = random_generalized_problem(seed, "cone", tangents=tangents, compliance=soft)
     lam = np.random.default_rng(seed).normal(size=problem.m)
     for p in (problem, as_matrix(problem)):
         equals_the_twin(p, lam)

@@ -12,9 +12,9 @@ from random_problems import (
     FORMS,
     arrays_of,
     as_matrix,
+    random_bodies_and_contacts,
     random_contact_problem,
     random_lcp,
-    random_rows,
     seeds,
     touching,
 )
@@ -168,7 +168,9 @@ BAD_PROBLEMS = {
     "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
     "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),
     "both forms": (
-        lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))),
+        lambda: lv.Problem(
+            np.ones(2), lv.Cones.free(2), I2, rows=random_bodies_and_contacts(np.random.default_rng(0))
+        ),
         "one of them",
     ),
     "round cones under Coulomb's law": (
@@ -207,7 +209,7 @@ def test_bad_problems_say_what_came_and_what_was_needed(case):
 
 
 def rows_with(**changes):
-    rows = random_rows(np.random.default_rng(0))
+    rows = random_bodies_and_contacts(np.random.default_rng(0))
     values = {f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "copy"}
     return lv.Rows(**{**values, **changes})
 

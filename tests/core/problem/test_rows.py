@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_rows
+from random_problems import random_bodies_and_contacts
 
 import lavender as lv
 from lavender_ext.core import checks
@@ -14,7 +14,7 @@ from lavender_ext.core import checks
 
 def fields(seed):
     """Arrays of legal rows: joints of 1 to 3 rows, contacts between random bodies or a body and the ground."""
-    rows = random_rows(np.random.default_rng(seed), bodies=3, joints=2, contacts=4)
+    rows = random_bodies_and_contacts(np.random.default_rng(seed), bodies=3, joints=2, contacts=4)
     return {f.name: np.array(getattr(rows, f.name)) for f in dataclasses.fields(rows) if f.name != "copy"}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import dense, over_velocities
-from random_problems import FORMS, random_contact_problem, random_ellipses, random_lcp
+from random_problems import FORMS, random_contact_problem, random_ellipse_friction_contacts, random_lcp
 from worked import python
 
 import lavender as lv
@@ -213,7 +213,7 @@ def slow_disks(clock, monkeypatch):
 
 def grown(seed, form, kind):
     """Contacts with ellipses, or with disks, enough of them that no form is made in a microsecond."""
-    own = (random_ellipses if kind == "ellipse" else random_contact_problem)(
+    own = (random_ellipse_friction_contacts if kind == "ellipse" else random_contact_problem)(
         seed, "cone", bodies=30, contacts=40
     )
     return FORMS[form](own)

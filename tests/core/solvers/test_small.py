@@ -10,7 +10,14 @@ import pytest
 from calls import SHORT, check
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import as_matrix, random_contact_problem, random_general, random_lcp, seeds, side_by_side
+from random_problems import (
+    as_matrix,
+    random_contact_problem,
+    random_generalized_problem,
+    random_lcp,
+    seeds,
+    side_by_side,
+)
 from scipy.sparse import block_diag, coo_array
 
 import lavender as lv
@@ -47,9 +54,9 @@ def draw(kind, seed):
         return as_matrix(draw("rows " + kind.split()[1], seed))
     law = kind.split()[1]
     if kind.startswith("hollow"):
-        return hollow(random_general(seed, law, n=8, compliance=seed % 3 > 0), rng)
+        return hollow(random_generalized_problem(seed, law, n=8, compliance=seed % 3 > 0), rng)
     tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
-    return random_general(
+    return random_generalized_problem(
         seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents
     )
 
@@ -125,7 +132,7 @@ def test_what_rounding_hides_is_no_matter_of_time(limit):
 
 
 def test_round_cones_are_never_solved_over_rows_of_a():
-    problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    problem = random_generalized_problem(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
         lv.solve(problem, "newton", form="impulse")
     assert "newton over rows" not in {stage.solver for stage in lv.explain(problem).stages}
@@ -140,7 +147,7 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
     n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60)) if seed % 3 else 0
-    problem = random_general(seed, friction, n=n, compliance=seed > 8, contacts=contacts)
+    problem = random_generalized_problem(seed, friction, n=n, compliance=seed > 8, contacts=contacts)
     state = registry.get("newton").load()().prepare(problem)
     cost = registry.get("newton").load()().cost(problem, state).total
     step = RATES["entry"] * problem.metric.work + RATES["work"]["velocities"] * state.general.work
@@ -271,7 +278,7 @@ def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
 
 def test_one_call_has_steps_for_every_island_of_velocities():
     """A hundred arms that touch nothing of each other: steps are told of all of them together."""
-    part = random_general(3, "cone", n=6, compliance=False, contacts=2)
+    part = random_generalized_problem(3, "cone", n=6, compliance=False, contacts=2)
     many = 100
     whole = lv.Generalized(
         *(block_diag(many * [x], format="csr") for x in (part.generalized.jac, part.generalized.mass)),
@@ -294,8 +301,8 @@ def test_one_call_has_steps_for_every_island_of_velocities():
 ATTEMPTED = {
     "few rows": lambda: draw("matrix coulomb", 3),
     "few rows that the call does not solve": lambda: lv.Problem.lcp([[0.0, 1.0], [-1.0, 0.0]], [1.0, 1.0]),
-    "J and M, more rows": lambda: random_general(1, "cone", n=40, compliance=True, contacts=40),
-    "J and M, rigid": lambda: random_general(1, "coulomb", n=60, compliance=False, contacts=50),
+    "J and M, more rows": lambda: random_generalized_problem(1, "cone", n=40, compliance=True, contacts=40),
+    "J and M, rigid": lambda: random_generalized_problem(1, "coulomb", n=60, compliance=False, contacts=50),
     "islands": lambda: forms(stacks(40, 2, 0.4, False, 1))["bodies"],
     "islands that the call does not solve": lambda: side_by_side(
         [

@@ -288,8 +288,8 @@ def test_memory_is_limited_without_asking(hostile, watchdog):
         record, _ = worker.measure_task(p, task(p, "x_eat"))
     assert record.status in ("ERROR", "NUMERICAL_ERROR")
     assert "MemoryError" in record.message
-    assert worker.memory == machine.get_memory_share() == max(2**31, machine.get_total_memory() // 2)
-    assert machine.get_memory_share(10**9) == 2**31
+    assert worker.memory == machine.get_memory_per_process() == max(2**31, machine.get_total_memory() // 2)
+    assert machine.get_memory_per_process(10**9) == 2**31
 
 
 @POSIX

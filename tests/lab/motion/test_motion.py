@@ -11,7 +11,14 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from kkt_truth import HAS_WIDE, Exact, Wide, matrix_in, solution_in
 from motion_truth import draw, truth
-from random_problems import as_matrix, dragged, random_contact_problem, random_general, random_lcp, seeds
+from random_problems import (
+    as_matrix,
+    dragged,
+    random_contact_problem,
+    random_generalized_problem,
+    random_lcp,
+    seeds,
+)
 
 import lavender as lv
 from lavender import suite
@@ -80,7 +87,11 @@ def test_public_bounds_hold_for_every_body(kind):
     rng = np.random.default_rng(3)
     checked = 0
     for seed in range(12):
-        p = random_general(seed, spin=seed % 2 == 1) if kind == "J and M" else problems(kind, seed)
+        p = (
+            random_generalized_problem(seed, spin=seed % 2 == 1)
+            if kind == "J and M"
+            else problems(kind, seed)
+        )
         start = lv.motion_error(p, np.zeros(p.m))
         reference = start.reference.impulse
         a, moving = matrix_in(p, Wide)
@@ -124,7 +135,7 @@ def test_a_good_reference_moves_targets_by_rounding_alone():
 @given(seed=seeds)
 @settings(max_examples=30)
 def test_kinetic_is_the_energy_of_the_velocities(form, seed):
-    p = random_contact_problem(seed, friction="cone") if form == "rows" else random_general(seed)
+    p = random_contact_problem(seed, friction="cone") if form == "rows" else random_generalized_problem(seed)
     x = np.random.default_rng(seed).normal(size=p.m)
     e = lv.motion_error(p, x)
     if not e.reference.is_accepted:
@@ -202,8 +213,8 @@ def test_the_reference_is_solved_once_and_a_given_one_is_used():
 def test_a_worse_reference_is_not_adopted():
     p = problems("cone", 6)
     good = lv.solve(p, "newton", tol=1e-12).impulse
-    assert lv.motion.store_if_better(p, good, "mine").solver == "mine"
-    assert lv.motion.store_if_better(p, 0.9 * good, "worse").solver == "mine"
+    assert lv.motion.store_reference_if_better(p, good, "mine").solver == "mine"
+    assert lv.motion.store_reference_if_better(p, 0.9 * good, "worse").solver == "mine"
 
 
 def test_a_reference_beside_a_file_is_judged_before_it_is_used(tmp_path, monkeypatch):
@@ -537,5 +548,5 @@ def test_the_line_of_a_motion_error_has_names_and_units():
         assert re.search(rf"\b{name} [\d.e-]+{unit}", text), text
     row = bodies.jacobian[[error.row]].toarray().reshape(-1, 6)
     assert (f"rows {error.rows:.2g} rad/s" in text) == (not row[:, :3].any())
-    general = str(lv.solve(random_general(3), tol=1e-2).motion_error())
+    general = str(lv.solve(random_generalized_problem(3), tol=1e-2).motion_error())
     assert " m/s or rad/s (" in general and "compared with " in general

@@ -28,7 +28,7 @@ def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
     assert lv.residual(p, early.impulse).at_floor  # of an answer made in float32
     assert early.status is lv.Status.MAX_ITERATIONS
     assert not early.residual.at_floor
-    assert not lv.motion.store_if_better(p, early.impulse).is_accepted
+    assert not lv.motion.store_reference_if_better(p, early.impulse).is_accepted
     for solution in (exact, lv.solve(p, max_iter=1000)):  # by a compiled call, and step by step
         assert solution.residual.precision == "float64"
 

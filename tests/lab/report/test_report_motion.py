@@ -74,10 +74,10 @@ def test_without_motion_errors_there_is_nothing_to_show(tmp_path):
 
 def test_what_has_nothing_to_do_is_in_no_ranking(records, tmp_path):
     """Nobody solves it, nobody fails: it counts in no table, and its residual is told in units."""
-    busy = statistics.drop_idle_cases(records)
+    busy = statistics.drop_cases_solved_at_zero(records)
     assert {r.case for r in busy} == set(busy.cases) == {"stack(n=16)"}
-    assert statistics.drop_idle_cases(busy) is busy
-    (case,) = motion_tables.list_idle_cases(records)
+    assert statistics.drop_cases_solved_at_zero(busy) is busy
+    (case,) = motion_tables.list_cases_solved_at_zero(records)
     assert (case.case, case.rows) == ("flying apart", 3)
     assert case.velocity == max(r.velocity for r in records if r.case == "flying apart")
     text = write(records, tmp_path, figures=False).read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from lavender.lab.report.plotting import LEFT, RIGHT, WIDTH, plot_for_page
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.terminal import print_table
-from lavender.lab.report.text import NONE, format_digits, format_sizes, format_times
+from lavender.lab.report.text import NONE, format_significant_digits, format_sizes, format_times_in_one_unit
 from tests.lab.report.synthetic import info, record, records_of
 
 
@@ -50,12 +50,12 @@ def test_sizes_of_a_column_have_one_format(values, texts):
     ("x", "text"), [(0.06522, "0.0652"), (16.0, "16.0"), (1023.0, "1020"), (9.996, "10.0"), (0.0, "0")]
 )
 def test_digits_are_significant_ones(x, text):
-    assert format_digits(x) == text
+    assert format_significant_digits(x) == text
 
 
 def test_the_unit_is_that_of_the_middle():
-    assert format_times([2e-6, 4e-6])[0] == "µs"
-    assert format_times([20e-6, 20.0]) == ("ms", ["0.0200", "20000"])
+    assert format_times_in_one_unit([2e-6, 4e-6])[0] == "µs"
+    assert format_times_in_one_unit([20e-6, 20.0]) == ("ms", ["0.0200", "20000"])
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from calls import over_velocities
 from random_families import drawn, wild
-from random_problems import as_matrix, general, random_general, random_lcp
+from random_problems import as_matrix, general, random_generalized_problem, random_lcp
 
 import lavender as lv
 from lavender import registry, suite
@@ -138,7 +138,7 @@ def test_explain_counts_nothing_anew_and_refuses_what_is_none():
     [
         (lambda: random_lcp(1, m=12), ("direct", "lemke")),
         (lambda: as_matrix(suite.pyramid(k=2, friction="coulomb").problem), ("anderson", "newton")),
-        (lambda: random_general(1, "cone", n=6, compliance=True, contacts=3), ("newton",)),
+        (lambda: random_generalized_problem(1, "cone", n=6, compliance=True, contacts=3), ("newton",)),
     ],
 )
 def test_a_small_problem_is_told_by_who_solves_it(make, names):
@@ -359,7 +359,7 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
 
 
 def test_cones_that_sweeps_do_not_take_have_steps_that_do():
-    general = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    general = random_generalized_problem(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "admm", "nncg", "certificate"}
     matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
     assert {stage.solver for stage in lv.explain(matrix).stages} == {"admm", "nncg"}

@@ -18,11 +18,11 @@ from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
-from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
+from lavender.lab.bench.running.runner import Runner, Watch, is_third_party_solver, open_runner
 from lavender.lab.bench.running.timing import (
     CallSpec,
     Task,
-    copy_into_new_arrays,
+    copy_problem_into_new_arrays,
     make_outcome,
     make_record,
     measure_calibration_time,
@@ -135,7 +135,7 @@ class _Alternation:
                         if call.timing_mode != "batch" and any(info is other for _, other in accepted[call]):
                             self.add_record(records, self.time_case(call, item, info, None)[0])
             for call in order:
-                if call.timing_mode == "batch" and _is_batch(accepted[call], is_sequence):
+                if call.timing_mode == "batch" and _is_timed_as_batch(accepted[call], is_sequence):
                     self.time_batch(call, accepted[call], records)
         for repeated in records.values():
             self.runner.add_entry(_merge_repetitions(repeated))
@@ -143,7 +143,7 @@ class _Alternation:
     def can_time(self, call: CallSpec, item: Item) -> bool:
         """Whether the solver of a call can be timed on a case."""
         spec = self.runner.specs[call.solver]
-        if is_foreign(spec) and (call.timing_mode == "batch" or call.mode == "time"):
+        if is_third_party_solver(spec) and (call.timing_mode == "batch" or call.mode == "time"):
             return False  # An isolated process adds its start to the time, or has no time limit.
         return spec.refuses(item.problem) is None
 
@@ -187,7 +187,7 @@ class _Alternation:
         tasks = [self.make_task(call, info) for _, info in cases]
         if all(task.key in self.known for task in tasks):
             return
-        problems = [copy_into_new_arrays(item.problem, call.start) for item, _ in cases]
+        problems = [copy_problem_into_new_arrays(item.problem, call.start) for item, _ in cases]
         calibration_time = measure_calibration_time()
         start_time = perf_counter()
         try:
@@ -206,7 +206,7 @@ class _Alternation:
             )
 
 
-def _is_batch(cases: Cases, is_sequence: bool) -> bool:
+def _is_timed_as_batch(cases: Cases, is_sequence: bool) -> bool:
     """Whether cases are timed as one batch: steps of a sequence, or problems of similar size."""
     rows = [info.rows for _, info in cases]
     return len(rows) > 1 and (is_sequence or max(rows) <= MAX_SIZE_RATIO * min(rows))

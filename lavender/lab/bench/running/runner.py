@@ -126,7 +126,7 @@ def remove_times(record: Record, time_limit: float) -> Record:
     )  # fmt: skip
 
 
-def is_foreign(spec: SolverSpec) -> bool:
+def is_third_party_solver(spec: SolverSpec) -> bool:
     """Whether a solver is code of another package that a separate process can import by its name."""
     return spec.from_entry_point or (spec.builtin and (spec.external or bool(spec.requires)))
 
@@ -318,7 +318,7 @@ class Runner:
         import joblib
 
         if backend == "loky" and memory is None:
-            memory = machine.get_memory_share(joblib.effective_n_jobs(workers))
+            memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
         local = tuple(
             spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.from_entry_point)
         )
@@ -528,10 +528,10 @@ class Runner:
 
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
-        if self.plan.campaign and not is_foreign(spec):
+        if self.plan.campaign and not is_third_party_solver(spec):
             # The clock ends only processes of other packages' solvers.
             task = replace(task, time_limit=math.inf)
-        if self.worker is not None and is_foreign(spec):
+        if self.worker is not None and is_third_party_solver(spec):
             record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
         else:
             record, found = measure_task(problem, task, impulse)
@@ -620,7 +620,7 @@ _last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
 def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
     """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its entries."""
     global _last_case
-    shared = machine.get_memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
+    shared = machine.get_memory_per_process(os.cpu_count() or 1) if order.memory is None else order.memory
     with _register_solvers(order.local), limit_to_one_thread(pair.solver):
         runner = Runner(order.run, order.plan, [pair.solver], worker=_get_isolated_worker(shared))
         runner.known = {record.key: record for record in pair.known}

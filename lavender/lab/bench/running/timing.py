@@ -113,7 +113,7 @@ _SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)} - {"
 
 
 @cache
-def _warm_up(solver: str) -> None:
+def _import_solver_code(solver: str) -> None:
     """Import the code that a solver needs, so that no measurement includes it."""
     spec = registry.get(solver)
     spec.load()
@@ -222,17 +222,17 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Rec
     KeyboardInterrupt
         Ctrl-C was pressed; nothing is recorded.
     """
-    return judge_outcome(problem, task, attempt_task(problem, task, impulse))
+    return judge_outcome(problem, task, run_task_or_return_error(problem, task, impulse))
 
 
-def attempt_task(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
+def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
     runs: list[tuple[Solution, float]] = []  # (solution, time of the call)
     calibration_times: list[float] = []
     backend_times: list[float] = []
     guard: Solution | None = None
     try:
-        _warm_up(task.solver)
+        _import_solver_code(task.solver)
         with _stabilise_timing(task.solver):
             start_time = perf_counter()
             if task.timing_mode and task.guarded:
@@ -266,7 +266,7 @@ def attempt_task(problem: Problem, task: Task, impulse: Any = None) -> Outcome |
             solution = runs[-1][0] if runs else guard
             if guard is None and task.timing_mode and _ended_by_budget(solution, task):
                 # The solve needs more iterations than the solver's default limit: repeat it with a guarded solve.
-                return attempt_task(problem, replace(task, guarded=True), impulse)
+                return run_task_or_return_error(problem, replace(task, guarded=True), impulse)
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
@@ -328,7 +328,7 @@ def measure_calibration_time() -> float:
     return perf_counter() - start_time
 
 
-def copy_into_new_arrays(problem: Problem, start: str) -> Problem:
+def copy_problem_into_new_arrays(problem: Problem, start: str) -> Problem:
     """Copy the problem into newly written arrays, with nothing derived from them, as a simulator leaves it.
 
     With `start` "cold", its guess is removed, as in the printed call.
@@ -340,7 +340,7 @@ def copy_into_new_arrays(problem: Problem, start: str) -> Problem:
 def _time_call(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
     """Make the call once and return its solution and time [s]."""
     arguments = {**task.options, **make_call_arguments(task, 0 if guard is None else guard.iterations)}
-    fresh = copy_into_new_arrays(problem, task.start)
+    fresh = copy_problem_into_new_arrays(problem, task.start)
     if task.start == "carried":
         arguments["impulse"] = problem.start() if impulse is None else impulse
     start_time = perf_counter()

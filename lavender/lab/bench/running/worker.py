@@ -18,9 +18,15 @@ from lavender.base.lazy_import import import_numerics
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.lab.bench.cases import hash_problem
-from lavender.lab.bench.machine import get_memory_share
+from lavender.lab.bench.machine import get_memory_per_process
 from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
-from lavender.lab.bench.running.timing import Outcome, Task, attempt_task, judge_outcome, make_solution
+from lavender.lab.bench.running.timing import (
+    Outcome,
+    Task,
+    judge_outcome,
+    make_solution,
+    run_task_or_return_error,
+)
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.limits import check_time_limit
@@ -48,11 +54,11 @@ class Worker:
     Parameters
     ----------
     memory : int, optional, bytes
-        Limit of the worker's address space if the system has one; `machine.get_memory_share()` if None.
+        Limit of the worker's address space if the system has one; `machine.get_memory_per_process()` if None.
     """
 
     def __init__(self, memory: int | None = None) -> None:
-        self.memory = get_memory_share() if memory is None else memory
+        self.memory = get_memory_per_process() if memory is None else memory
         self._process = ProcessBackend(run_task, memory=self.memory or 0, environment=ONE_THREAD)
         self._problem_hash = ""  # of the problem that the process holds
 
@@ -169,7 +175,7 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
     _problem = _problem if problem is None else problem
     assert _problem is not None
     subprocesses.limit_cpu_time(3.0 * task.time_limit + ORPHAN_CPU_TIME)
-    outcome = attempt_task(_problem, task, impulse)
+    outcome = run_task_or_return_error(_problem, task, impulse)
     if isinstance(outcome, str):
         return {"error": outcome[: subprocesses.MAX_ERROR_LENGTH]}, ()
     message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))

@@ -83,12 +83,12 @@ def map_unordered(
 def _call_in_worker(parent: int, function: Callable[..., Any], call_arguments: tuple[Any, ...]) -> Any:
     """Call the function in a worker, which ends when its parent does."""
     if parent and parent != os.getpid():
-        _end_workers_with(parent)
+        _end_this_process_with_parent(parent)
     return function(*call_arguments)
 
 
 @cache
-def _end_workers_with(parent: int) -> None:
+def _end_this_process_with_parent(parent: int) -> None:
     """Start a thread that ends this process soon after its parent was killed."""
 
     def watch() -> None:

@@ -50,7 +50,7 @@ class Stepping:
         """Return positions (n, 3) [m], quaternions (n, 4) w x y z, world velocities (n, 6) [m/s, rad/s]."""
         raise NotImplementedError
 
-    def initial_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def make_initial_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return a state with every body at rest at its position in the scene."""
         x, q = (
             np.array([getattr(b, name) for b in self.scene.bodies]) for name in ("position", "quaternion")

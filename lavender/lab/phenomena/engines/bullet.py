@@ -170,7 +170,7 @@ class Engine(Stepping):
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        x, q, v = self.initial_state()
+        x, q, v = self.make_initial_state()
         for i, (body, link) in self.ids.items():
             if link < 0:
                 x[i], orientation = pybullet.getBasePositionAndOrientation(body, **self.client_arguments)

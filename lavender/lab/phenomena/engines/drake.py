@@ -139,7 +139,7 @@ class Engine(Stepping):
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        x, q, v = self.initial_state()
+        x, q, v = self.make_initial_state()
         for i, body in enumerate(self.bodies):
             if body is None:
                 continue

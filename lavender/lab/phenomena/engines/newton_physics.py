@@ -99,7 +99,7 @@ class Engine(Stepping):
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; the engine computes in float32."""
         poses, velocities = self.now.body_q.numpy().astype(float), self.now.body_qd.numpy().astype(float)
-        x, q, v = self.initial_state()
+        x, q, v = self.make_initial_state()
         for i, k in enumerate(self.bodies):
             if k >= 0:
                 x[i], q[i], v[i] = poses[k, :3], np.roll(poses[k, 3:], 1), velocities[k]
