@@ -271,7 +271,7 @@ def check_float(
         raise InputError(f"{name} is {value!r}; a number is needed")
     try:
         x = float(value)
-    except OverflowError:  # an int above the largest float
+    except OverflowError:  # The int is above the largest float.
         x = np.inf if value > 0 else -np.inf
     if not np.isfinite(x):
         raise InputError(f"{name} is {x}; a finite number is needed")
@@ -416,7 +416,7 @@ def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -
 def _suggest_unit(unit: str) -> str:
     """Return advice which unit to change for a quantity with this unit."""
     if unit == "-":
-        return "it has no unit that could be another"
+        return "this quantity has no unit that you could change"
     letters = set(unit.replace("rad", "").replace("N s", "kg m/s"))
     units = [name for letter, name in (("k", "mass"), ("m", "length"), ("s", "time")) if letter in letters]
     return f"another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"

@@ -9,7 +9,7 @@ MODULE = "lavender_ext.judge.measure"
 def check_build(module: str = MODULE) -> None:
     """Raise ImportError if a compiled module of the kernels cannot be found."""
     if importlib.util.find_spec(module) is None:
-        from pathlib import Path  # 4 % of the time of `import lavender`
+        from pathlib import Path  # This import would take 4 % of the time of `import lavender`.
 
         spec = importlib.util.find_spec("lavender_ext")
         folder = Path(spec.origin).parent if spec is not None and spec.origin else Path("lavender_ext")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from time import perf_counter
 
-# s between two readings of the clock, which also bounds the delay after Ctrl-C. Users notice delays of about 50 ms.
+# [s] Time between two readings of the clock. It also bounds the delay after Ctrl-C; users notice about 50 ms.
 CHUNK_TIME = 0.01
 
 

@@ -17,11 +17,12 @@ EXIT_INTERRUPTED = 130  # Shells report this status for a command that Ctrl-C en
 def _is_lavender_command() -> bool:
     """Return whether this process runs the command `lavender`, by any of the ways to start it."""
     program = sys.argv[0] if sys.argv else ""
-    if (
-        program == "-m"
-    ):  # `sys.argv[0]` until Python has found the module; then read the original command line.
+    if program == "-m":
+        # `sys.argv[0]` is "-m" until Python has found the module: read the original command line instead.
         option = sys.orig_argv[-len(sys.argv)]
-        module = option.partition("m")[2] if option.startswith("-") else option  # "-Imlavender" or "lavender"
+        module = (
+            option.partition("m")[2] if option.startswith("-") else option
+        )  # The option is "-Imlavender" or "lavender".
         return module in ("lavender", "lavender.cli")
     folder, name = os.path.split(program)
     if name == "__main__.py":

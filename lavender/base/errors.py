@@ -54,7 +54,7 @@ class UnknownName(LavenderError, KeyError):
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str], successor: str = "") -> None:
-        import difflib  # not imported unless an error occurs
+        import difflib  # Imported only if an error occurs.
 
         known = sorted(set(known))
         by_lower_case = {word.lower(): word for word in reversed(known)}
@@ -135,8 +135,8 @@ class InUse(LavenderError, RuntimeError):
     """An object that serves one thread at a time is used by another thread, or by the caller of this callback."""
 
 
-# Exceptions that valid numbers can cause; a solve that ends with one returns a result with the error as its message:
-# a breakdown of arithmetic, missing memory, an A that is too large and is first needed now.
+# Exceptions that a solve of a valid problem can raise: arithmetic breaks down, memory is missing, or A, which is
+# formed at its first use, is too large. The solve then returns a result with the exception as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, TooLarge)
 
 

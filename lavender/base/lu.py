@@ -18,7 +18,7 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
 
     `options` are the options of `scipy.sparse.linalg.splu`.
     """
-    from scipy.sparse.linalg import splu  # takes 0.1 s to import, and is only needed here
+    from scipy.sparse.linalg import splu  # The import takes 0.1 s, and only this function needs it.
 
     a = sp.csc_array(matrix)
     # A full diagonal implies full structural rank.

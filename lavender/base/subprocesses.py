@@ -3,7 +3,7 @@
 Code that hangs, calls `os._exit`, starts processes or exhausts memory ends only its own call. Requests are pickled.
 Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
-No process pool of a library gives this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
+No process pool of a library provides this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
 the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
 the output of the code; and a script without `if __name__ == "__main__"` cannot use the pool.
 """
@@ -229,7 +229,7 @@ class ProcessBackend:
         if self._exchange_thread is not None:
             self._exchange_thread.join(PIPE_TIMEOUT)
             if self._exchange_thread.is_alive():
-                return  # It closes the streams.
+                return  # That thread closes the streams.
         _close_streams(process)
 
     def _close_lifeline(self) -> None:
@@ -299,7 +299,7 @@ def serve_requests(lifeline: int, memory: int) -> None:
         except EOFError:
             return
         try:
-            arguments = pickle.loads(request)  # from the parent
+            arguments = pickle.loads(request)  # The request comes from the parent.
             if function is None:
                 (function,) = arguments
                 text, numbers = _pack_answer({}, ())

@@ -25,12 +25,14 @@ MAX_THREADS = (
 @cache
 def get_thread_pool() -> ThreadPoolExecutor:
     """Return the pool of threads of this process."""
-    from concurrent.futures import ThreadPoolExecutor  # takes 5 ms to import, and is only needed here
+    from concurrent.futures import (
+        ThreadPoolExecutor,
+    )  # The import takes 5 ms, and only this function needs it.
 
     return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="lavender")
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
+if hasattr(os, "register_at_fork"):  # Windows cannot fork.
     os.register_at_fork(
         after_in_child=get_thread_pool.cache_clear
     )  # A forked process has none of the threads.
@@ -39,7 +41,7 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 @contextmanager
 def _defer_sigint() -> Iterator[None]:
     """Deliver Ctrl-C after the block: an interrupted start leaves a thread that the pool never ends."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
+    if not hasattr(signal, "pthread_sigmask"):  # Windows has no signal masks.
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -357,8 +357,8 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, starts do not fit the problems, `like` is no array of such a library,
-        or as for `solve`.
+        `threads` is not an integer of at least 1, starts do not fit the problems, or `like` is not an array of a supported
+        library. The errors of `solve` are raised, too.
     UnknownName, CapabilityError, SolverUnavailable
         As for `solve`, for the first world that is not accepted.
     KeyboardInterrupt

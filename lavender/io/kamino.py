@@ -218,7 +218,7 @@ class _Worlds:
         if not self.engine._config.sparse_jacobian:
             data = self.engine._jacobians.data
             return data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
-        blocks = self.engine._jacobians._J_cts.bsm  # of one row and the six columns of a body
+        blocks = self.engine._jacobians._J_cts.bsm  # Each block has one row and the six columns of a body.
         count, start = _as_int(blocks.num_nzb), _cumulate_counts(self.rows * self.columns)
         world = np.repeat(np.arange(self.n), count)
         block = _as_int(blocks.nzb_start)[world] + np.arange(len(world)) - _cumulate_counts(count)[world]

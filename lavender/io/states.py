@@ -11,7 +11,7 @@ bodies, applied forces, the state of plug-ins. Quantities without an array have 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -90,6 +90,14 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     return _read_arrays(mj, model, arrays, "states")
 
 
+def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -> None:
+    """Raise InputError at the first name that is neither valid nor one of `LABELS`; `source` begins the message."""
+    valid = tuple(valid)
+    for name in names:
+        if name not in (*valid, *LABELS):
+            raise InputError(f"{source}: a state has no array {name!r}; its arrays are {', '.join(valid)}")
+
+
 def _read_keyframes(mj: Any, model: Any) -> StartStates:
     """Return the model's keyframes; raise InputError if it has none."""
     if not model.nkey:
@@ -103,10 +111,7 @@ def _read_keyframes(mj: Any, model: Any) -> StartStates:
 
 def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) -> StartStates:
     """Build states from arrays by name; `source` begins the error messages."""
-    known = (VECTOR, *NEEDED, *OPTIONAL, *LABELS)
-    unknown = [name for name in arrays if name not in known]
-    if unknown:
-        raise InputError(f"{source}: {unknown[0]!r} is no part of a state; known are {', '.join(known)}")
+    check_array_names(source, arrays, (VECTOR, *NEEDED, *OPTIONAL))
     if VECTOR in arrays:
         return _read_vectors(mj, model, arrays[VECTOR], source)
     missing = [name for name in NEEDED if name not in arrays]
@@ -126,7 +131,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(f"{source}: {sizes}; as many of each, and at least one, are needed")
+        raise InputError(f"{source}: {sizes}; all arrays must have equally many entries, at least one")
     vectors = []
     for i in range(n):
         data = mj.MjData(model)

@@ -1,1 +1,1 @@
-"""The judge: residuals, other measures, certificates, what each block does, and a solution that carries them."""
+"""The judge: residuals, other measures, certificates, states of blocks, and the solution that holds them."""

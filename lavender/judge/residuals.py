@@ -67,14 +67,15 @@ from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
 
-# [-] Above this relative residual, rounding to float64 does not excuse a solver.
+# [-] A relative residual above this is never attributed to rounding to float64.
 MAX_EXCUSED_RESIDUAL = 1e-5
 MAX_REST_VELOCITY = (
     1e-9  # m/s. With a smaller V0 a problem is at rest: the zero impulse counts as its solution.
 )
-UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half its spacing at 1
+UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to the next number.
 
-# at_floor(relative, floor) of one island; solvers and the judge share this test, its reason is in the kernel.
+# at_floor(relative, floor) tests the residual of one island. Solvers and the judge call the same kernel, which states
+# the reason of the test.
 at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
@@ -84,7 +85,7 @@ DEFAULT_THRESHOLD = (
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
 )  # fmt: skip
-VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # verdicts in files of earlier versions
+VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # Verdicts in files of earlier versions.
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,9 @@ class Residual:
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = DEFAULT_THRESHOLD
-    _float64_relative: float = field(default=math.nan, repr=False)  # before an ill-conditioned M was refined
+    _float64_relative: float = field(
+        default=math.nan, repr=False
+    )  # Relative residual before the refinement of an ill-conditioned M.
 
     if not TYPE_CHECKING:  # Type checkers report unknown names.
 

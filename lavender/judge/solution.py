@@ -312,7 +312,7 @@ class Solution:
             rest = attributes.get("_rest")
             if rest is not None:
                 function, arguments = rest
-                attributes.update(function(*arguments))  # two threads write equal values
+                attributes.update(function(*arguments))  # Two threads may do this; their values are equal.
                 attributes.pop("_rest", None)
             if name in attributes:
                 return attributes[name]
@@ -367,7 +367,7 @@ class Solution:
         """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
         s = problem.cones.stretch
         impulse, proof = mark_read_only(s * self.impulse), self.certificate
-        # The residual of the returned numbers, since s (lambda / s) rounds.
+        # Judge the returned numbers: s (lambda / s) differs from lambda by rounding.
         found = residual(problem, impulse, "float64", tol=self.tol)
         return replace(
             self,

@@ -27,7 +27,7 @@ NAMES = (
     "free",
     "at a bound",
     "at a bound",
-)  # indexed by the case numbers of the kernels
+)  # The index is the case number of the kernels.
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 

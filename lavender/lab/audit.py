@@ -60,7 +60,7 @@ from lavender.problem import PRECISIONS, Problem
 
 AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
-VELOCITY_UNIT = "m/s, rad/s"  # of linear and of angular rows
+VELOCITY_UNIT = "m/s, rad/s"  # Linear rows have the first unit, angular rows the second.
 WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.

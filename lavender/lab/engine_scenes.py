@@ -5,13 +5,14 @@ A scene is a Python file with a function `build`, or the name of a builder in `n
     def build():            # newton: returns a newton.ModelBuilder of one world, or a finalized newton.Model
     def build(worlds):      # genesis: returns a built genesis.Scene with this number of environments
 
-States have one entry for each world in their first dimension. Their names are those of the engines:
+A state is a dict of arrays; the first dimension of each array is the world. The arrays have the engines' names:
 
     newton      body_q, body_qd, joint_q, joint_qd: poses [m, -] and velocities [m/s, rad/s] of bodies and joints
-    genesis     qpos, qvel: as `get_qpos` and `get_dofs_velocity` return them
+    genesis     qpos, qvel: the results of `get_qpos` and `get_dofs_velocity`
 
-A state of newton with bodies or joints only is completed by the engine's kinematics. Without states, world 0 starts as
-the scene was built, and velocities of the others differ from it by `spread` N(0, 1), drawn with (seed, world).
+If a state of newton has only the arrays of bodies, or only the arrays of joints, the engine's kinematics computes the
+others. Without states, world 0 starts as the scene was built. The velocities of each other world differ from world 0 by
+`spread` times a standard normal number, drawn with the seed (seed, world).
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.newton_mujoco import NEWTON_ADVICE, from_newton_mujoco
 from lavender.io.npz import Archive
-from lavender.io.states import LABELS
+from lavender.io.states import check_array_names
 from lavender.io.stored import read_first_bytes
 
 CLAIM_ENGINES = ("kamino", "newton-mujoco", "genesis")
-DEFAULT_TIME_STEP = 0.01  # [s] of scenes of newton, which do not state one
+DEFAULT_TIME_STEP = 0.01  # [s] Scenes of newton do not define a time step.
 NEWTON_MISSING = "newton cannot be imported: pip install newton warp-lang"
 NEWTON_STATE = ("body_q", "body_qd", "joint_q", "joint_qd")
-# Arrays of which a state of newton needs all of one group, and the numbers of one body or coordinate.
+# A state of newton needs all arrays of at least one of these groups.
 NEWTON_GROUPS = (("body_q", "body_qd"), ("joint_q", "joint_qd"))
+#: Shape of the entry of one body or coordinate in each array.
 NEWTON_ITEM_SIZES = {"body_q": (7,), "body_qd": (6,), "joint_q": (), "joint_qd": ()}
 GENESIS_STATE = ("qpos", "qvel")
 
@@ -146,9 +148,7 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
         raise InputError(
             f"states is a {type(source).__name__}; the path of an .npz, or a dict of arrays, is needed"
         )
-    unknown = [name for name in source if name not in (*names, *LABELS)]
-    if unknown:
-        raise InputError(f"{label}: {unknown[0]!r} is no part of a state; known are {', '.join(names)}")
+    check_array_names(label, source, names)
     arrays = {
         name: as_array(f"{label}: {name}", x, (None,) * np.ndim(x))
         for name, x in source.items()
@@ -157,9 +157,7 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     counts = {name: len(x) if x.ndim > 1 else 0 for name, x in arrays.items()}
     if not counts or len(set(counts.values())) != 1 or not min(counts.values()):
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "no arrays"
-        raise InputError(
-            f"{label}: {sizes}; as many of each, and at least one, are needed of {', '.join(names)}"
-        )
+        raise InputError(f"{label}: {sizes}; {', '.join(names)} must have equally many entries, at least one")
     return arrays
 
 
@@ -229,7 +227,7 @@ class NewtonScene:
         self.before, self.after, self.control = model.state(), model.state(), model.control()
         self.pipeline = newton.CollisionPipeline(model)
         self.contacts = self.pipeline.contacts()
-        self.velocity: Any = None  # of SolverMuJoCo, which overwrites it
+        self.velocity: Any = None  # Velocities before the step; SolverMuJoCo overwrites its own copy.
 
     def step(self) -> None:
         """Detect collisions and step all worlds."""
@@ -276,7 +274,7 @@ class NewtonScene:
         """Continue from a state of all worlds (n, ...); the solver's memory of earlier steps is cleared."""
         if not self._has_equal_worlds:
             raise InputError(
-                "worlds of this scene have different bodies or joints: they cannot start from states"
+                "the worlds of this scene have different bodies or joints, so they cannot start from states: call without states"
             )
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:

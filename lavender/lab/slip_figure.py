@@ -33,8 +33,8 @@ def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        The contacts that slide fastest, at most 20. Parts are norms of vector differences: their sum is at least the
-        speed of the engine's answer.
+        One bar for each of the contacts that slide fastest, at most 20. The parts of a bar are norms of vector
+        differences. By the triangle inequality their sum is at least the sliding speed in the engine's answer.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:
     averages = average_slip(explanations)
     if not averages:
         raise InputError(
-            "there is no contact to draw: explanations of at least one step with contacts are needed"
+            "the explanations have no contact to draw: at least one step with a contact is needed"
         )
     fastest = sorted(averages, key=lambda a: -a.speeds[0])[:MAX_DRAWN_CONTACTS]
     figure = Figure(figsize=(WIDTH, MARGIN_HEIGHT + BAR_HEIGHT * len(fastest)), layout="constrained")

@@ -178,15 +178,15 @@ class Builders(Operators):
         tangents = len(b) // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
         if not 0 <= tangents <= 2:
             raise InputError(
-                f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
-                "spin with patch_radius, and two rows that roll with rolling"
+                f"{len(b)} rows for {len(mu)} contacts; a contact has a normal row, up to two tangent rows, "
+                "a spin row if patch_radius is given, and two rolling rows if rolling is given"
             )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
         elif tangents == 0 and np.any(mu > 0.0):
             raise InputError(
-                f"mu has {len(mu)} values for {len(b)} rows, so each contact is a normal alone, without a row for "
-                "friction: give one mu for each contact (normal and tangents together), or mu = 0"
+                f"mu has {len(mu)} values for {len(b)} rows, so each contact has a normal row only and no row for "
+                "friction: give one mu for each contact, not for each row, or mu = 0"
             )
         return cls(b, Cones.contacts(mu, tangents, patch_radius, rolling=rolling), A, **more)
 
@@ -425,7 +425,7 @@ class Builders(Operators):
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
         return cls(
-            generalized.bias(target),  # the class rejects entries that are not finite
+            generalized.bias(target),  # The class rejects entries that are not finite.
             cones,
             friction=friction,
             compliance=compliance,
@@ -525,11 +525,11 @@ class Builders(Operators):
         general = self.generalized
         new = (J, M, v_free, target)
         if general is None and any(x is not None for x in new):
-            raise InputError("J, M, v_free and target go with a problem in generalised coordinates; give b")
+            raise InputError("J, M, v_free and target need a problem in generalised coordinates; give b")
         if b is not None and target is not None:
             raise InputError("give b or target, not both")
         if b is None and target is None and (J is not None or v_free is not None):
-            raise InputError("with a new J or v_free the right-hand side is another: give target or b")
+            raise InputError("a new J or v_free changes the right-hand side: give target or b")
         if general is not None and any(x is not None for x in (J, M, v_free)):
             general = (
                 general.with_jacobian(J, v_free)
@@ -577,8 +577,8 @@ def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rollin
         raise InputError("tangents must be 0, 1 or 2 for each contact")
     if has_rolling and min_tangents < 2:
         raise InputError(
-            f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling needs two, about which it "
-            "rolls: give tangents=2"
+            f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling rows rotate about two "
+            "tangents: give tangents=2"
         )
     if min_tangents == 0 and not has_spin:
         bad = np.flatnonzero((mu > 0.0) & (tangents == 0))

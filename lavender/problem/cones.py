@@ -71,15 +71,17 @@ __all__ = [
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
 CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
-SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"  # name of the product in messages
+SPIN_COEFFICIENT_LABEL = (
+    "mu patch_radius (of boxes and ellipses mu_2)"  # Messages name the product of mu and patch_radius so.
+)
 # For each kind of contact: minimum and maximum number of rows, its name, and its permitted rows.
 CONTACT_ROWS = {
-    CONTACT: (1, 3, "a contact", "a normal and up to two tangents are known, and one spin row of CONTACT_SPIN"),
-    CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are known"),
-    ROUND: (4, 6, "a round cone", "a normal and up to five tangents (two slide, one spins, two roll) are known"),
-    CONTACT_BOX: (3, 3, "a box", "a normal and two tangents are known"),
+    CONTACT: (1, 3, "a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
+    CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are allowed"),
+    ROUND: (4, 6, "a round cone", "a normal and three to five tangents (two sliding, one spin, two rolling) are allowed"),
+    CONTACT_BOX: (3, 3, "a box", "a normal and two tangents are needed"),
     CONTACT_ROLLING: (5, 6, "a contact with rolling",
-                      "a normal, two tangents, perhaps spin, and two that roll are needed: 5 rows or 6"),
+                      "a normal, two tangents, optionally a spin row, and two rolling rows are needed: 5 or 6"),
     CONTACT_ELLIPSE: (3, 3, "an ellipse", "a normal and two tangents are needed"),
 }  # fmt: skip
 
@@ -179,7 +181,7 @@ class Cones:
         """Concatenate the blocks of several cones."""
         blocks = kernels.concatenate_blocks([each._blocks for each in cones])
         if blocks is None:
-            raise InputError("together these have more rows than 32-bit numbers count")
+            raise InputError("the blocks have more than 2^31 - 1 rows together")
         return cls._from_blocks(blocks)
 
     def _convert_fields(self) -> tuple[np.ndarray, ...]:
@@ -194,9 +196,8 @@ class Cones:
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
-                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
-                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING}, CONTACT_ELLIPSE={CONTACT_ELLIPSE} are "
-                "known"
+                f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
+                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
             )
         kind = _check_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
@@ -443,7 +444,8 @@ class Cones:
             bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
                 raise InputError(
-                    f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
+                    f"block {bad[0]} has more rows than a normal and two tangents; a box cannot bound its "
+                    "spin or rolling"
                 )
             kind[has_pair], radius[has_pair & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
@@ -595,12 +597,12 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     _, kind, lower, upper, mu, radius, rolling = fields
     if fault == "bounds":
         raise InputError(
-            f"row {index}: lower = {lower[index]}, upper = {upper[index]}; lower <= upper is needed, "
-            "and a number between them"
+            f"row {index}: lower = {lower[index]}, upper = {upper[index]}; a finite number must lie "
+            "between them (lower <= upper)"
         )
     if fault == "ratio":
         raise InputError(
-            f"block {index} is an ellipse with mu_2 / mu_1 = {radius[index]:g} in the place of the patch radius; "
+            f"block {index} is an ellipse with mu_2 / mu_1 = {radius[index]:g} (stored in patch_radius); "
             "1e-18 to 1e18 is needed"
         )
     if fault in ("lower", "upper"):

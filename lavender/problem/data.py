@@ -119,7 +119,7 @@ class ProblemData:
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
-            raise InputError("give matrix=, rows= or generalized=, one of them")
+            raise InputError("give exactly one of matrix=, rows= and generalized=")
         if isinstance(self.friction, str) and self.friction in ("box", "pyramid", "pyramidal"):
             raise InputError(
                 f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed: shape='box' bounds each tangent "
@@ -131,7 +131,7 @@ class ProblemData:
         put(self, "precision", check_choice("precision", self.precision, PRECISIONS))
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
-                "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
+                "Coulomb's law is not supported for a round cone of more than two tangents: give friction='cone'"
             )
         if self.rows is not None:
             self._check_rows(self.rows, m, k)
@@ -139,12 +139,11 @@ class ProblemData:
             self._check_generalized(self.generalized, m)
         else:
             put(self, "matrix", check_matrix(self.matrix, m, self.copy))
-            if issparse(
-                self.matrix
-            ):  # the checked arrays, because callers can replace the arrays of the matrix object
+            if issparse(self.matrix):
+                # Store the checked arrays separately, because callers can replace the arrays of the matrix object.
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
-                raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
+                raise InputError("compliance needs rows; a matrix A already contains it on its diagonal")
         if self.guess is not None:
             guess = as_array("guess", self.guess, (m,), finite=False, unit="N s", copy=self.copy)
             check_finite("guess [N s]", guess)
@@ -167,7 +166,7 @@ class ProblemData:
         put(self, "name", str(self.name))
         put(
             self, "copy", True
-        )  # `copy` applies to this call only: a problem derived from this one copies by default
+        )  # `copy` applies to this call only: problems derived from this one copy by default.
 
     def _set_rhs(self, b: FloatArray) -> None:
         """Replace the zeros of a new problem's right-hand side by b (m,) [m/s].
@@ -366,10 +365,14 @@ ProblemData.__init__.__qualname__ = "Problem.__init__"  # A TypeError then names
 def check_problem(problem: Any) -> None:
     """Raise InputError unless `problem` is a `Problem`."""
     if not isinstance(problem, ProblemData):
-        advice = "make one by Problem.lcp(A, b, lower, upper), linear, contact, from_rows or from_jacobian"
-        if isinstance(getattr(problem, "problem", None), ProblemData):  # a case, or a file that was read
+        advice = "make one with Problem.lcp(A, b, lower, upper), linear, contact, from_rows or from_jacobian"
+        if isinstance(
+            getattr(problem, "problem", None), ProblemData
+        ):  # The object is a case, or the result of reading a file.
             advice = "give its .problem"
-        elif callable(getattr(problem, "velocity_after", None)):  # a `RowBuilder`, which is not imported here
+        elif callable(
+            getattr(problem, "velocity_after", None)
+        ):  # The object is a `RowBuilder`, which is not imported here.
             advice = "give the result of its .problem()"
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
 

@@ -23,17 +23,14 @@ def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
     for i in rows:
         j = int(findex[i])
         if j >= m:
-            raise InputError(
-                f"findex[{i}] is {j}; a row below {m} is needed, or -1 where bounds are constant"
-            )
+            raise InputError(f"findex[{i}] is {j}; a row below {m} is needed, or -1 for constant bounds")
         if j == i:
             raise InputError(
-                f"findex[{i}] is its own row; give the row of its normal, or -1 where bounds are constant"
+                f"findex[{i}] is its own row; give the row of its normal, or -1 for constant bounds"
             )
         if findex[j] >= 0:
             raise InputError(
-                f"findex[{i}] is {j}, which is no normal: it follows row {findex[j]} itself; a row with findex -1 is "
-                "needed"
+                f"findex[{i}] is {j}; a normal row is needed, with findex -1, and row {j} has findex {findex[j]}"
             )
     normal = np.where(findex >= 0, findex, np.arange(m))
     # Sort by the normal row, then the normal before its friction rows, then by the original order.
@@ -52,7 +49,7 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
             (~is_friction & ~(low <= high), "lower <= upper is needed"),
             (
                 is_friction & ~(np.isfinite(high) & (high >= 0.0)),
-                "upper is mu where findex >= 0, a finite number >= 0",
+                "on a row with findex >= 0, upper is mu: a finite number >= 0 is needed",
             ),
         ):
             if is_bad.any():
@@ -64,16 +61,16 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
         i = int(bad[0])
         raise InputError(
             f"row {i} is the normal of row {int(np.flatnonzero(findex == i)[0])} with bounds [{low[i]}, {high[i]}]; "
-            "a normal has [0, inf]: give friction with other bounds as constant ones (findex -1)"
+            "a normal needs [0, inf]: give the friction rows of other rows constant bounds (findex -1)"
         )
     count = np.bincount(findex[is_friction], minlength=m) if m else np.zeros(0, int)
     bad = np.flatnonzero(count > 2)
     if len(bad):
         raise InputError(
-            f"{count[bad[0]]} rows follow row {bad[0]}; up to two, its tangents, are known: give the others constant "
-            "bounds, or spin as patch_radius of Cones.contacts"
+            f"findex of {count[bad[0]]} rows is {bad[0]}; a normal has at most two such rows, its tangents: give the "
+            "others constant bounds, or spin as patch_radius of Cones.contacts"
         )
-    first = order[~is_friction[order]]  # first row of each block in the arrays
+    first = order[~is_friction[order]]  # First row of each block, as an index of the arrays.
     size = 1 + count[first]
     ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
     k = len(first)
@@ -97,8 +94,8 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     disks = np.flatnonzero(cones.n_together > 1)
     if len(disks):
         raise InputError(
-            f"block {disks[0]} bounds its tangents together, a disk; findex bounds each by itself: "
-            "give the problem cones.shaped('box'), which is another law"
+            f"block {disks[0]} bounds the norm of its tangents (a disk); findex bounds each tangent separately: "
+            "give the problem cones.shaped('box'), which is another friction law"
         )
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)

@@ -33,20 +33,22 @@ def check_combination(mu: Any, tangents: int, spin: bool, rolling: bool, is_box:
     """Raise InputError if no kind of contact has this combination of rows."""
     if is_box and (spin or rolling or tangents > 2):
         raise InputError(
-            "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
-            "out, or give them as a disk's (shape='disk')"
+            "a box has up to two tangents, and neither spin nor rolling: leave patch_radius, rolling and tangents "
+            "out, or give shape='disk'"
         )
     if is_pair and not is_box:
         raise InputError(
-            f"mu has shape {np.shape(mu)}; one for each of two tangents makes an ellipse, which bounds no spin "
-            "and no rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
+            f"mu has shape {np.shape(mu)}; two coefficients for each contact define an ellipse, which has "
+            "neither spin nor rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
         )
     if tangents > 2 and spin:
-        raise InputError(f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius")
+        raise InputError(
+            f"{tangents} tangents make a round cone, which includes spin: leave patch_radius out"
+        )
     if rolling and tangents != 2:
         raise InputError(
-            f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
-            + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
+            f"rolling needs tangents=2, because the rolling rows rotate about two tangents; tangents is {tangents}"
+            + (" (a round cone, which includes rolling)" if tangents > 2 else "")
         )
 
 
@@ -76,8 +78,8 @@ def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None
     bad = np.flatnonzero((smaller < 2.0 * MIN_COEFFICIENT_RATIO * larger) & (larger > 0.0))
     if len(bad):
         raise InputError(
-            f"mu of contact {bad[0]} is {pairs[bad[0]].tolist()}; an ellipse needs two numbers above 0 (or no "
-            "friction at all), none 1e18 times the other: shape='box' takes a tangent without friction"
+            f"mu of contact {bad[0]} is {pairs[bad[0]].tolist()}; an ellipse needs two numbers above 0 with a "
+            "ratio below 1e18, or two zeros: give shape='box' for a tangent without friction"
         )
     first, second = pairs[:, 0], pairs[:, 1]
     ratio = np.divide(second, first, out=np.ones(len(first)), where=first > 0.0)

@@ -119,7 +119,7 @@ class Generalized:
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
             if as_plain_array(x, ANY_LENGTH, True, False) is None:
-                as_array(name, x, ANY_LENGTH, copy=False)  # raises with a message
+                as_array(name, x, ANY_LENGTH, copy=False)  # Raises an InputError with a message.
         free = as_plain_array(v_free, (n,), True, False)
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
@@ -433,7 +433,7 @@ def convert_to_compressed_rows(name: str, matrix: Any, sign: float = 1.0) -> Com
         )
         if arrays is not None:
             return arrays
-    csr = as_csr(name, matrix)  # converts other types, or raises with a message
+    csr = as_csr(name, matrix)  # Converts other types, or raises an InputError.
     return stack_csr_matrices(n, [(csr.indptr, csr.indices, csr.data, False, sign, m)])
 
 

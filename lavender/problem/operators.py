@@ -213,7 +213,9 @@ class Operators(ProblemData):
                 "J and M as they are (operator 'generalized')"
             )
         assert self.generalized is not None
-        y = self.metric.whitened()  # without SciPy: a first solve with a time limit has no time to import it
+        y = (
+            self.metric.whitened()
+        )  # SciPy is not used: the first solve with a time limit has no time to import it.
         indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
@@ -363,7 +365,7 @@ def analyse_symmetric_matrix(a: Any) -> tuple[LinearSystem, FloatArray]:
     TooLarge
         The factor would have 2^31 entries or more.
     """
-    a = sp.csr_array(0.5 * (a + a.T))  # makes pattern and rounded entries symmetric
+    a = sp.csr_array(0.5 * (a + a.T))  # The pattern and rounded entries become symmetric.
     a.sort_indices()
     try:
         system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))

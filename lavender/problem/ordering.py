@@ -100,10 +100,10 @@ def compute_block_order(
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
     rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
-        raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
+        raise InputError(f"seed={seed} needs order='random'; other orders are not random")
     if not isinstance(order, str):
         if ground is not None:
-            raise InputError("ground= goes with bottom_up and top_down, not with an array of blocks")
+            raise InputError("ground= needs order='bottom_up' or 'top_down', not an array of blocks")
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")
@@ -111,7 +111,7 @@ def compute_block_order(
     if order not in SWEEP_ORDERS:
         raise UnknownName("order", order, SWEEP_ORDERS)
     if ground is not None and order not in ("bottom_up", "top_down"):
-        raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
+        raise InputError(f"ground= needs order='bottom_up' or 'top_down', not {order!r}")
     blocks = np.arange(k, dtype=np.int32)
     if order == "given":
         return Order(blocks, split, GIVEN, rng, is_given=True)
@@ -142,12 +142,12 @@ def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
     if problem.rows is not None:
         if ground is not None:
             raise InputError(
-                "ground= is for problems given as a matrix; with rows the static bodies are known"
+                "ground= needs a problem given as a matrix; rows already define the static bodies"
             )
         return compute_block_levels(problem.rows.block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
-            "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
+            "levels of a matrix need ground=: the blocks that touch the ground (rows already define them)"
         )
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):

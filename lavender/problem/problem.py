@@ -137,7 +137,7 @@ class Problem(Builders):
             )
         if keys is not None:
             if before.key is None:
-                raise InputError("the problem of the step before has no keys: make it with key=")
+                raise InputError("the problem of the previous step has no keys: build it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
         start = self.start()
         old_cones, new_cones = before.cones, self.cones

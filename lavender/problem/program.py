@@ -304,7 +304,7 @@ class QuadraticProgram:
         if general is None:
             diagonal = self.hessian.diagonal()
             return np.divide(np.abs(self.q), diagonal, out=np.zeros(len(self.q)), where=diagonal > 0.0)
-        ptr, _, value = general.operator.mass  # the lower triangle, diagonal last
+        ptr, _, value = general.operator.mass  # The lower triangle, with the diagonal last in each row.
         force, free = np.abs(self.q), np.abs(general.v_free)
         if general.order is not None:
             force, free = force[general.order], free[general.order]
@@ -428,7 +428,7 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
         or abs(matrix[:n, n:] + jac.T).nnz
         or cones != _make_one_sided_cones(n + free, len(b))
     ):
-        raise InputError(f"the problem is not that of a quadratic program of {n} variables")
+        raise InputError(f"the problem was not built from a quadratic program of {n} variables")
     lower = extract_lower_triangle("P", hessian, "give both triangles")
     rows = convert_to_compressed_rows("J", jac)
     _factor_definite(lower, rows, -b[:n])
@@ -552,7 +552,7 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
     if len(bad):
         i = bad[0]
         raise InputError(
-            f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb <= ub is needed, and a number between them"
+            f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; a finite number must lie between them (lb <= ub)"
         )
 
 
@@ -602,7 +602,7 @@ def _describe_indefinite(lower: Compressed, diagonal: FloatArray) -> str:
         ptr, idx, val = lower
         dense = np.zeros((n, n))
         dense[np.repeat(np.arange(n), np.diff(ptr)), idx] = val
-        value = np.linalg.eigvalsh(dense)  # reads only the lower triangle
+        value = np.linalg.eigvalsh(dense)  # `eigvalsh` reads only the lower triangle.
         return f"its smallest eigenvalue is {value[0]:.3g}, its largest {value[-1]:.3g}"
     i = int(np.argmin(diagonal))
     return (

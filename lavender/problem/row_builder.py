@@ -528,7 +528,7 @@ class RowBuilder:
         on_b = on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
         factor = check_float("ratio", ratio)
         if factor == 0.0:
-            raise InputError("ratio is 0; another number is needed: 0 would hold a and leave b free")
+            raise InputError("ratio is 0; a nonzero number is needed: 0 would stop a and leave b free")
         error = check_float("angle_error", angle_error)
         row = self._make_angular_row(pair, _scale(-1.0, on_a), _scale(factor, on_b), error)
         return self._add_joint("gear", pair, [row], feature, name)
@@ -732,7 +732,7 @@ class RowBuilder:
 
     def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> Vector:
         """Return a vector of the builder's dimension with three components."""
-        if get_shape(name, value) == ():  # as_array would fill the vector with it
+        if get_shape(name, value) == ():  # `as_array` would fill the vector with a scalar.
             raise InputError(f"{name} is {value!r:.60}; a vector ({self._dimensions},) is needed")
         x = as_array(name, value, (self._dimensions,), unit=unit).tolist()
         return x[0], x[1], x[2] if len(x) == 3 else 0.0

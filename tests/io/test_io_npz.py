@@ -324,7 +324,7 @@ def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tm
         lv.solve(loaded, "newton")
     meta = {"operator": "csr", "friction": "coulomb", "name": "", "names": None}
     for n, sign in (
-        (1, "not that of a quadratic program of 1 "),
+        (1, "not built from a quadratic program of 1 "),
         (99, "program is 99"),
         (-1, "program is -1"),
     ):

@@ -331,13 +331,13 @@ def test_worlds_start_from_keyframes(tmp_path):
     ("arrays", "words"),
     [
         ({"qpos": np.zeros((2, 15))}, "qvel missing"),
-        ({"qpos": np.zeros((2, 15)), "qvel": np.zeros((3, 13))}, "as many of each"),
+        ({"qpos": np.zeros((2, 15)), "qvel": np.zeros((3, 13))}, "equally many entries"),
         ({"qpos": np.zeros((2, 14)), "qvel": np.zeros((2, 13))}, "qpos"),
         ({"qpos": np.full((1, 15), np.nan), "qvel": np.zeros((1, 13))}, "qpos"),
         ({"qpos": np.zeros((0, 15)), "qvel": np.zeros((0, 13))}, "at least one"),
         (
             {"qpos": np.zeros((1, 15)), "qvel": np.zeros((1, 13)), "speed": np.zeros(1)},
-            "'speed' is no part of a state",
+            "a state has no array 'speed'",
         ),
         ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"),
     ],

@@ -103,7 +103,7 @@ def test_states_before_the_worst_answers_are_written(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ({"qpos": np.zeros((2, 7))}, "'qpos' is no part of a state; known are body_q"),
+        ({"qpos": np.zeros((2, 7))}, "a state has no array 'qpos'; its arrays are body_q"),
         ({"joint_q": np.zeros((2, 7)), "joint_qd": np.zeros((3, 6))}, "2 of joint_q, 3 of joint_qd"),
         ({"joint_q": np.zeros((0, 7))}, "0 of joint_q"),
         ({"joint_q": np.full((1, 7), np.nan)}, "joint_q"),

@@ -183,7 +183,7 @@ def test_bars_of_the_figure_are_the_parts():
     widths = [float(bar.patches[0].get_width()) for bar in axes.containers]
     assert widths == pytest.approx(list(average.parts.values()), rel=1e-6)
     assert axes.lines[0].get_xdata() == [average.speeds[0]] and average.count == len(explanations[0].contacts)
-    with pytest.raises(lv.InputError, match="no contact to draw"):
+    with pytest.raises(lv.InputError, match="have no contact to draw"):
         draw_slip([])
 
 

@@ -169,11 +169,11 @@ class _RunGroup:
     """A solver with all of its runs on single cases, or with the runs of one call over the steps of sequences."""
 
     solver: str
-    how: str = ""  # the call; empty for single cases
+    how: str = ""  # Description of the call; empty for single cases.
     iterations: int = 0
-    tol: float = 0.0  # that a call has
-    mode: str = ""  # of the call
-    runs: dict[str, list[Record]] = field(default_factory=dict)  # by case
+    tol: float = 0.0  # Tolerance of the call; 0 for single cases.
+    mode: str = ""  # Mode of the call; empty for single cases.
+    runs: dict[str, list[Record]] = field(default_factory=dict)  # Runs of each case.
 
     def describe_budget(self, runs: Sequence[Record]) -> dict[str, Any]:
         """Return `how` and `iterations` of a choice from these of its runs: the median number of sweeps, if known."""

@@ -91,7 +91,7 @@ class Report:
 
     @cached_property
     def load_warning(self) -> str:
-        """A sentence on single runs with more runnable processes than cores; empty if there are none."""
+        """A sentence on the runs during which more processes were runnable than the machine has cores; else empty."""
         if self.is_campaign or not len(self.newest_run):
             return ""
         (run,) = self.newest_run.runs.values()

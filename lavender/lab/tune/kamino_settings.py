@@ -21,14 +21,14 @@ from lavender.lab.tune.measured import Measured, Setting, Stage, make_unmeasured
 
 KAMINO_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 KAMINO_ITERATIONS = (10, 25, 50, 100, 200, 400)
-KAMINO_PENALTIES = (0.01, 0.1, 1.0, 10.0, 100.0)  # rho
+KAMINO_PENALTIES = (0.01, 0.1, 1.0, 10.0, 100.0)  # Initial penalty rho of ADMM.
 KAMINO_CONVERGED = {"max_iterations": 2000, "tolerance": 1e-8}
 TOLERANCE_NAMES = ("primal_tolerance", "dual_tolerance", "compl_tolerance")
 
 
 @dataclass(frozen=True)
 class KaminoSetting(Setting):
-    """Fields of PADMMSolverConfig that differ from the present ones; "tolerance" stands for all three tolerances."""
+    """Fields of PADMMSolverConfig with values that differ from the present configuration; "tolerance" stands for all three tolerances."""
 
     merge_note: ClassVar[str] = (
         "The lines change a configuration before the solver is built: config = SolverKamino.Config.from_model(model), "

@@ -38,7 +38,7 @@ def test_one_shape_becomes_the_other_and_back():
     assert two.shaped("disk").shaped("box") == two
     with pytest.raises(lv.InputError, match="two numbers above 0"):
         lv.Cones.contacts([(0.0, 0.2)], shape="box").shaped("disk")
-    with pytest.raises(lv.InputError, match="no box bounds its spin"):
+    with pytest.raises(lv.InputError, match="a box cannot bound its spin"):
         lv.Cones.contacts(0.5, patch_radius=0.1).shaped("box")
 
 
@@ -85,7 +85,7 @@ def test_findex_comes_back_in_any_order(seed):
     ("lower", "upper", "findex", "words"),
     [
         ([0, -1, -1], [np.inf, 1, 1], [-1, 1, 0], "its own row"),
-        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 1], "no normal: it follows row 0"),
+        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 1], "and row 1 has findex 0"),
         ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 3], "a row below 3"),
         ([0, -1, -1], [np.inf, np.inf, 1], [-1, 0, 0], "upper is mu"),
         ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "upper is mu"),

@@ -34,7 +34,7 @@ INVALID_PROBLEM = {
         lambda: lv.Cones([0, 7], [lv.ROUND], np.zeros(7), np.zeros(7), [1.0], [0.0]),
         "a round cone of 7 rows",
     ),
-    "spin beside a round cone": (lambda: lv.Cones.contacts(0.5, 3, 0.1), "no patch_radius"),
+    "spin beside a round cone": (lambda: lv.Cones.contacts(0.5, 3, 0.1), "leave patch_radius out"),
     "no such shape": (lambda: lv.Cones.contacts(0.5, shape="square"), "unknown shape 'square'"),
     "a side below zero": (lambda: lv.Cones.contacts([(0.5, -0.2)], shape="box"), "mu"),
     "three sides": (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),

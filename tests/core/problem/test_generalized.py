@@ -120,7 +120,7 @@ def test_m_is_refused_where_it_is_no_mass_matrix():
         lv.Generalized(jac, good, np.zeros(2), ["hip"])
     with pytest.raises(lv.InputError, match="J has 1 rows; 2 are needed"):
         lv.Problem.from_jacobian(jac, good, np.zeros(2), cones=lv.Cones.free(2))
-    with pytest.raises(lv.InputError, match="one of them"):
+    with pytest.raises(lv.InputError, match="exactly one of"):
         lv.Problem(
             np.zeros(1), lv.Cones.free(1), np.eye(1), generalized=lv.Generalized(jac, good, np.zeros(2))
         )

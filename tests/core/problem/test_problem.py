@@ -171,13 +171,13 @@ BAD_PROBLEMS = {
         lambda: lv.Problem(
             np.ones(2), lv.Cones.free(2), I2, rows=random_bodies_and_contacts(np.random.default_rng(0))
         ),
-        "one of them",
+        "exactly one of",
     ),
     "round cones under Coulomb's law": (
         lambda: lv.Problem(np.ones(4), lv.Cones.contacts(0.5, 3), np.eye(4)),
-        "more than two tangents has no Coulomb law",
+        "law is not supported for a round cone",
     ),
-    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
+    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "exactly one of"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
     "sparse J of one dimension": (lambda: lv.Generalized(ONE, I2, [0, 0]), r"J has shape \(2,\)"),
     "sparse M of one dimension": (lambda: lv.Generalized(I2, ONE, [0, 0]), r"M has shape \(2,\)"),
