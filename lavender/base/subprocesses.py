@@ -3,8 +3,8 @@
 Code that hangs, calls `os._exit`, starts processes or exhausts memory ends only its own call. Requests are pickled.
 Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
-No process pool of a library provides this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
-the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
+No process pool of a library provides this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return
+to the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
 the output of the code; and a script without `if __name__ == "__main__"` cannot use the pool.
 """
 

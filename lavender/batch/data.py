@@ -123,11 +123,13 @@ class Batch(Sequence[Problem]):
                 n, velocities = len(rows) - 1, _check_world_pointers("velocity_ptr", velocity_ptr)
             else:
                 raise InputError(
-                    f"J has shape {jac.shape}; ragged it is (rows of all worlds, nv), or one array of "
-                    "all entries with velocity_ptr"
+                    f"J has shape {jac.shape}; a ragged batch needs (rows of all worlds, nv), or "
+                    "with velocity_ptr one array of all entries"
                 )
             if len(velocities) != n + 1:
-                raise InputError(f"velocity_ptr is of {len(velocities) - 1} worlds, row_ptr of {n}")
+                raise InputError(
+                    f"velocity_ptr has {len(velocities) - 1} worlds, row_ptr {n}; equal numbers are needed"
+                )
             sizes, nvs = np.diff(rows), np.diff(velocities)
             self.shape: tuple[int, ...] = (int(rows[-1]),)
             self.velocity_shape: tuple[int, ...] = (int(velocities[-1]),)
@@ -139,12 +141,10 @@ class Batch(Sequence[Problem]):
             rows, velocities = capacity * np.arange(n + 1), nv * np.arange(n + 1)
             self.shape, self.velocity_shape = (n, capacity), (n, nv)
         else:
-            raise InputError(
-                f"J has shape {jac.shape}; stacked it is (n, m, nv), ragged (rows, nv) with row_ptr"
-            )
+            raise InputError(f"J has shape {jac.shape}; (n, m, nv) is needed, or with row_ptr (rows, nv)")
         self._n, self.friction = n, friction
         self.precision = get_common_precision(*(np.asarray(x) for x in (jac, mass, free)))
-        # offsets and sizes of each world (n, columns of PLACE)
+        # (n, columns of PLACE): offsets and sizes of each world.
         self.at = at = np.zeros((n, len(PLACE)), np.int64)
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
@@ -260,8 +260,10 @@ class Batch(Sequence[Problem]):
         batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = m, m * np.arange(n)
         return batch
 
-    names_of: Callable[[int], Sequence[str]] | None = None  # returns the names of a world's blocks
-    contact_counts: np.ndarray | None = None  # (n,) contacts with rows; None if not known
+    names_of: Callable[[int], Sequence[str]] | None = (
+        None  # Function that returns the names of a world's blocks.
+    )
+    contact_counts: np.ndarray | None = None  # (n,) Number of contacts with rows; None if it is not known.
     _has_shared_cones = True
     _pattern: tuple[np.ndarray, np.ndarray] | None = None
     _jac_row = _mass_row = 0
@@ -278,7 +280,7 @@ class Batch(Sequence[Problem]):
         self.cones = cones
         if cones.has_round and self.friction != "cone":
             raise InputError(
-                "a round cone of more than two tangents has no Coulomb law: give friction='cone'"
+                "Coulomb's law is not supported for a round cone of more than two tangents: give friction='cone'"
             )
         if len(self) and (sizes == cones.n_rows).all():
             at[:, PLACE["blocks"]] = cones.n_blocks
@@ -369,8 +371,8 @@ class Batch(Sequence[Problem]):
         problem = Problem.from_rows(Rows(**fields), **bounds)
         if i and problem.m != self.shape[1]:
             raise InputError(
-                f"it has {problem.m} rows, the first world {self.shape[1]}: give tangents=, because contacts with mu 0 "
-                "have no tangents by default"
+                f"this world has {problem.m} rows, the first world {self.shape[1]}: give tangents=, because "
+                "contacts with mu 0 have no tangents by default"
             )
         return problem
 
@@ -455,7 +457,7 @@ class Batch(Sequence[Problem]):
             return None
         if "mu" in stacked and (mu.shape[1] != rows.n_contacts or ((mu > 0.0) != (mu[0] > 0.0)).any()):
             return None
-        # arrays of the first world, which are used for all worlds unless a stacked array is given
+        # Arrays of the first world. They are used for all worlds unless a stacked array is given.
         of_first: dict[str, Any] = {name: getattr(rows, name) for name in (*BODY_FIELDS, *BODY_PAIRS)}
         goal = 0.0 if "target" in stacked else more.get("target", 0.0)
         of_first["target"] = np.array(np.broadcast_to(goal, first.m), float)
@@ -499,7 +501,9 @@ def _check_world_pointers(name: str, value: Any) -> np.ndarray:
     """Convert pointers of worlds to an array (n + 1,); raise InputError for invalid ones."""
     ptr = as_array(name, value, (None,), dtype=np.int32).astype(np.int64)
     if not len(ptr) or ptr[0] != 0 or (np.diff(ptr) < 0).any():
-        raise InputError(f"{name} must start with 0 and not fall: the first of each world, then their number")
+        raise InputError(
+            f"{name} must start with 0 and must not decrease: the first index of each world, then their total number"
+        )
     return ptr
 
 
@@ -521,7 +525,7 @@ def check_shared_lower_triangles(
         or (col[ptr[1:] - 1] != np.arange(nv)).any()
         or not (np.diff(col)[np.diff(row) == 0] > 0).all()
     ):
-        raise InputError("M's rows must ascend to a last entry on the diagonal; lower triangles are needed")
+        raise InputError("M must hold lower triangles: ascending columns in each row, the diagonal last")
     if (nvs != nv).any() or values.ndim != 2 or values.shape[1] != len(col):
         raise InputError(
             f"M has values of shape {values.shape} for {len(col)} entries of {nv} velocities; (worlds, entries), and "
@@ -536,7 +540,7 @@ def check_row_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray
     bad = np.flatnonzero((count < 0) | (count > capacity))
     if len(bad):
         raise InputError(
-            f"{name} of world {bad[0]} is {count[bad[0]]}; 0 to {capacity}, the rows that J has, are needed"
+            f"{name} of world {bad[0]} is {count[bad[0]]}; 0 to {capacity}, the number of rows of J, is needed"
         )
     return count
 
@@ -598,9 +602,7 @@ def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, A
     """Return the concatenated numbers of all worlds, and their offsets."""
     total = int(np.sum(sizes))
     if x.size != total:
-        raise InputError(
-            f"{name} has shape {x.shape}; {total} numbers, those of all worlds in order, are needed"
-        )
+        raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")
     return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes)
 
 

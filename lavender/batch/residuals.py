@@ -39,7 +39,7 @@ from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_problem_data
 
-NO_MORE_WORLDS = -1  # return value of the methods of `Worker`
+NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
 
 class Many:
@@ -197,7 +197,7 @@ class Many:
 
         run_on_threads(work, min(threads, len(self)))
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
-            try_single(i, bytearray(1))  # raises an error with a message
+            try_single(i, bytearray(1))  # This single call raises an error with a message.
         if self.faults and errors == "raise":
             raise self.faults[min(self.faults)]
         self.faults.update(self._invalid_starts)
@@ -232,7 +232,7 @@ class Residuals(Many):
         self.precision, self.threshold = precision, threshold
         if not isinstance(problems, Batch):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
-        self._nothing_to_do: dict[int, bool] = {}  # of worlds that single calls processed
+        self._nothing_to_do: dict[int, bool] = {}  # Values of the worlds that single calls processed.
 
     @cached_property
     def verdict(self) -> np.ndarray:

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 __all__ = ["Solutions", "solve_many"]
 
 # Worlds that are not started before the deadline are late: their start is judged.
-# Costs [ns]: to judge such a world with J and M in the compiled loop, which grows with the judge's rate per entry, and
-# to store one of a list, whose numbers are judged when they are read.
+# Costs [ns] of such a world: to judge it in the compiled loop if it has J and M (the cost per entry is added), and to
+# store it if it belongs to a list of problems, whose numbers are judged when they are read.
 JUDGED_LATE_WORLD_COST, LATE_WORLD_COST = 4e3, 4e4
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
@@ -97,9 +97,9 @@ class Solutions(Many, Sequence[Solution]):
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
-        self._late_worlds: list[int] = []  # worlds with a start that is not judged yet
+        self._late_worlds: list[int] = []  # Worlds whose start is not judged yet.
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
-        # For a batch, the loop overwrites the starts.
+        # The loop overwrites the starts of a batch.
         self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -191,7 +191,7 @@ class Solutions(Many, Sequence[Solution]):
 
     def _judge_late_worlds(self) -> None:
         """Judge the starts of late worlds."""
-        # Another thread may do the same at the same time, with the same numbers.
+        # Another thread may compute this at the same time; its numbers are the same.
         for i in self._late_worlds:
             try:
                 self.store_solution(i, self._get_result(i))
@@ -220,7 +220,7 @@ class Solutions(Many, Sequence[Solution]):
             rows, columns = (
                 self.problems.at[:, PLACE[name]].astype(float) for name in ("rows", "velocities")
             )
-            entries = np.where(columns > 0.0, columns, rows)  # entries of a row of J, or of A
+            entries = np.where(columns > 0.0, columns, rows)  # Entries of a row of J, or of A.
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
             return float(JUDGED_LATE_WORLD_COST * len(rows) + RATES["judge entry"] * products)
         return sum(
@@ -357,8 +357,8 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not an integer of at least 1, starts do not fit the problems, or `like` is not an array of a supported
-        library. The errors of `solve` are raised, too.
+        `threads` is not an integer of at least 1, starts do not fit the problems, or `like` is not an array of a
+        supported library. The errors of `solve` are raised, too.
     UnknownName, CapabilityError, SolverUnavailable
         As for `solve`, for the first world that is not accepted.
     KeyboardInterrupt
@@ -473,7 +473,7 @@ def _convert_starts(
     if isinstance(worlds, Batch):
         if impulses is not None:
             raise InputError(
-                "impulses are of a list of problems; give impulse=, one array of the whole batch"
+                "impulses= needs a list of problems; a batch takes impulse=, one array for all worlds"
             )
         if impulse is None:
             return None, invalid
@@ -485,6 +485,8 @@ def _convert_starts(
                     flat[rows] = 0.0
         return flat, invalid
     if impulse is not None:
-        raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
+        raise InputError(
+            "impulse= needs a batch; a list of problems takes impulses=, one for each problem or None"
+        )
     starts = [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
     return [x if x is None or is_valid(i, x) else None for i, x in enumerate(starts)], invalid

@@ -93,7 +93,7 @@ class Gradients(_LazySequence):
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
                 raise AttributeError(
-                    f"gradients have no {name!r} of all problems; [i] is the gradient of problem i"
+                    f"gradients of all problems have no {name!r}; [i] is the gradient of problem i"
                 )
             if self._is_complete and name in ("b", "target", "v_free"):
                 of = self._of

@@ -84,7 +84,9 @@ class BodyChain:
     def __init__(self, derivative: Any) -> None:
         rows, cones = derivative.problem.rows, derivative.problem.cones
         if rows is None:
-            raise CapabilityError(f"{', '.join(BODIES)} are data of problems with bodies (Problem.from_rows)")
+            raise CapabilityError(
+                f"{', '.join(BODIES)} exist only for problems with bodies (Problem.from_rows)"
+            )
         self.derivative, self.rows = derivative, rows
         kj, mj = rows.n_joints, len(rows.jac)
         first, tangents = cones.ptr[kj:-1], cones.n_tangents[kj:]

@@ -64,7 +64,7 @@ class Unique:
             if len(rows):
                 names = ", ".join(self._problem.row_name(int(i)) for i in rows[:3])
                 lines.append(f"{name}: not of {len(rows)} rows ({names}{', ...' if len(rows) > 3 else ''})")
-        return "; ".join(lines) or "all of it is unique"
+        return "; ".join(lines) or "all quantities are unique"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Tangent:
 class Derivative:
     """Derivative of a solution: gradients by `vjp`, directional derivatives by `jvp`, checks of existence.
 
-    It is factor_dense by `lavender.derivative`.
+    It is built by `lavender.derivative`.
     """
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
@@ -390,7 +390,7 @@ class Derivative:
         """
         p, linear = self.problem, self._linear
         data = self._check_changes(changes)
-        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db: change of w with fixed impulses
+        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db is the change of w with fixed impulses.
         for name in ("b", "target"):
             dw -= data.get(name, 0.0)
         for name, weight in zip(("lower", "upper"), self._bound_weights, strict=True):
@@ -408,7 +408,7 @@ class Derivative:
         dj = self._body_chain.compute_jacobian_change(data) if p.rows is not None else data.get("J")
         if p.rows is not None and "J" in data:
             dj = data["J"] if dj is None else dj + data["J"]
-        momentum = None  # dJ^T lambda - dM v'
+        momentum = None  # This is dJ^T lambda - dM v'.
         if dj is not None:
             dw += dj @ self._velocity
             momentum = dj.T @ self._impulse
@@ -461,7 +461,7 @@ class Derivative:
                 if out[name].shape != like.shape:
                     raise InputError(f"{name} has shape {out[name].shape}; {like.shape} is needed")
                 if name == "M" and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max():
-                    raise InputError("the change of M is not symmetric; M is: give both triangles")
+                    raise InputError("the change of M must be symmetric, because M is: give both triangles")
             elif name in COEFFICIENT_INPUTS:
                 shape: tuple[int, ...] = (p.n_blocks,)
                 out[name] = as_array(

@@ -22,7 +22,7 @@ from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
 ARGUMENTS = ("J", "M", "v_free", "mu", "target", "compliance")
-ARGUMENT_AXES = (2, 2, 1, 1, 1, 1)  # number of axes of each argument without batch axes
+ARGUMENT_AXES = (2, 2, 1, 1, 1, 1)  # Number of axes of each argument without batch axes.
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
     shapes = [tuple(x.shape) for x in arrays]
     for name, shape, n in zip(ARGUMENTS, shapes, ARGUMENT_AXES, strict=True):
         if len(shape) < n:
-            raise InputError(f"{name} has shape {shape}; {n} axes are needed, and before them any of a batch")
+            raise InputError(f"{name} has shape {shape}; {n} axes are needed, after any number of batch axes")
     m, nv = shapes[0][-2:]
     required_shapes = ((m, nv), (nv, nv), (nv,), shapes[3][-1:], (m,), (m,))
     for name, shape, required in zip(ARGUMENTS, shapes, required_shapes, strict=True):
@@ -137,7 +137,7 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
         )
     except ValueError:
         raise InputError(
-            f"shapes {shapes} of {', '.join(ARGUMENTS)} have batches that do not fit each other"
+            f"shapes {shapes} of {', '.join(ARGUMENTS)} have batch axes that cannot be broadcast together"
         ) from None
     return (*batch, nv), (*batch, m)
 

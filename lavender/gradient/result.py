@@ -44,7 +44,7 @@ class _Input:
         name, derivative = self.name, gradient._derivative
         if self.operators is not OPERATORS and derivative.problem.operator not in self.operators:
             raise CapabilityError(
-                f"{name} is of problems given as {' or '.join(self.operators)}, and this one was given as "
+                f"{name} exists only for problems given as {' or '.join(self.operators)}, and this one was given as "
                 f"{derivative.problem.operator}"
             )
         if self.is_row_input and not derivative._uses_kernel:
@@ -84,7 +84,7 @@ class Gradient:
     """
 
     def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
-        self._derivative, self._adjoint = derivative, adjoint  # concatenated q, s (m), f (nv), c (m)
+        self._derivative, self._adjoint = derivative, adjoint  # q, s (m), f (nv) and c (m), concatenated.
 
     if TYPE_CHECKING:  # `_Input` sets these below; lower, upper and the others are (m,) or (k,) arrays.
         b: FloatArray
@@ -235,8 +235,10 @@ class Gradient:
             The problem has no such matrix, or the derivative does not exist.
         """
         if name not in MATRICES:
-            raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern")
-        getattr(self, name)  # raises CapabilityError
+            raise InputError(
+                f"full needs one of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern"
+            )
+        getattr(self, name)  # Raises CapabilityError.
         return np.asarray(sum(np.outer(u, v) for u, v in self._list_outer_product_pairs(name)))
 
 

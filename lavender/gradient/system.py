@@ -19,9 +19,9 @@ from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import free_part
 
 MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
-SHIFT_OF_SINGULAR = 1e-11  # eps of (6), relative to the diagonal
-# Steps of (6). Components with a pivot of 1e-11 of the diagonal then have an error of 2^-8, with 1e-9 an error of
-# 1e-16.
+SHIFT_OF_SINGULAR = 1e-11  # eps of (6), divided by the diagonal entry.
+# Number of steps of (6). A component with a pivot of 1e-11 times the diagonal entry then has an error of 2^-8, with a
+# pivot of 1e-9 an error of 1e-16.
 MAX_PROXIMAL_STEPS = 8
 MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by up to this fraction of its largest entry.
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
@@ -29,7 +29,9 @@ MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense ma
 # Systems of up to this many rows are also dense if A is not symmetric and sparse, or if a contact slides.
 MAX_DENSE_ROWS = 400
 
-Solve = Callable[[FloatArray, bool], FloatArray]  # arguments: right-hand side, transpose
+Solve = Callable[
+    [FloatArray, bool], FloatArray
+]  # The arguments are the right-hand side and whether to transpose.
 
 
 def factor_dense(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
@@ -67,8 +69,8 @@ class System:
             solve = factor(SHIFT_OF_SINGULAR)
         if solve is None:
             raise CapabilityError(
-                f"the equations of this solution's states have no factor, shifted by {SHIFT_OF_SINGULAR:g} of their "
-                "diagonal either: an A that is indefinite, or states that are wrong"
+                f"the equations of this solution's states cannot be factored, even if shifted by {SHIFT_OF_SINGULAR:g} "
+                "of their diagonal: A is indefinite, or the states are wrong"
             )
         self._solve_factored = solve
 

@@ -144,4 +144,6 @@ def save(
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, form=form, drop=drop)
     else:
-        raise InputError(f"{path} ends with {suffix!r}; .npz or .hdf5 says which format is meant")
+        raise InputError(
+            f"{path} ends with {suffix!r}; a suffix .npz or .hdf5 is needed, which selects the format"
+        )

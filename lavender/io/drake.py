@@ -33,7 +33,7 @@ from lavender.problem.cones import Cones
 # A joint limit may push only if it is reached within this many steps at the present speed.
 LIMIT_HORIZON_STEPS = 4.0
 # Largest accepted error of A (v+ - v*) = J^T lambda, as a fraction of |A| |v+ - v*| + |J|^T |lambda| in SAP's norm [-].
-# SAP's own tolerance leaves less than this; above it, something acts on the plant that this module does not know.
+# SAP's own tolerance leaves less than this; above it, a force that this module does not read acts on the plant.
 MOMENTUM_TOLERANCE = 1e-6
 
 
@@ -90,7 +90,7 @@ def _convert_contact_problem(plant: Any, context: Any, *options: Any) -> tuple[P
         from pydrake.multibody.plant import MultibodyPlant_
         from pydrake.systems.framework import Context_
     except ImportError:
-        raise InputError("pydrake cannot be imported: pip install drake; a plant comes from it") from None
+        raise InputError("pydrake cannot be imported: pip install drake, which provides plants") from None
     if not isinstance(plant, MultibodyPlant_[float]) or not isinstance(context, Context_[float]):
         raise InputError(
             f"got a {type(plant).__name__} and a {type(context).__name__}; a MultibodyPlant and its Context are needed"
@@ -113,12 +113,12 @@ def _build_problem(
         )
     dt = step if dt is None else check_float("dt", dt)
     if not math.isclose(dt, step, rel_tol=1e-12):
-        raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be one")
+        raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be equal")
     correction = check_float("correction", correction, low=0.0, high=1.0)
     if plant.num_constraints() > 0:
         raise CapabilityError(
-            f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); joints, "
-            "contacts at points and joint limits are known here"
+            f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); only "
+            "joints, point contacts and joint limits are supported"
         )
     _check_no_locked_joints(plant, context)
     dynamics, v_free = compute_free_motion(plant, context, dt)
@@ -158,7 +158,7 @@ def _check_no_locked_joints(plant: Any, context: Any) -> None:
     joints = [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
     locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
     if locked:
-        raise CapabilityError(f"locked joints are not known here: {', '.join(locked):.200}; weld them")
+        raise CapabilityError(f"locked joints are not supported: {', '.join(locked):.200}; weld them")
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
 
     if hasattr(plant, "has_sampled_output_ports") and plant.has_sampled_output_ports():
         raise CapabilityError(
-            "the plant's output ports are sampled: its contacts are those of the step before; call "
+            "the plant's output ports are sampled: its contacts belong to the previous step; call "
             "plant.SetUseSampledOutputPorts(False) before Finalize"
         )
     port = plant.get_geometry_query_input_port()
@@ -269,7 +269,7 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
     results = plant.get_contact_results_output_port().Eval(context)
     if results.num_hydroelastic_contacts():
         raise CapabilityError(
-            f"{results.num_hydroelastic_contacts()} hydroelastic contacts; contacts at points are known here "
+            f"{results.num_hydroelastic_contacts()} hydroelastic contacts; only point contacts are supported "
             "(plant.set_contact_model(ContactModel.kPoint))"
         )
     inspector = port.Eval(context).inspector()
@@ -374,5 +374,5 @@ def _complete_impulses(
         raise CapabilityError(
             f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {momentum_error[worst]:.3g} of "
             f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; a force "
-            "acts on the plant that this import does not read"
+            "that this import does not read acts on the plant"
         )

@@ -159,7 +159,10 @@ def from_efc(
     _check_rows("efc_D", inv_compliance, used_rows & (inv_compliance <= 0.0), "above 0")
     has_loss = used_rows & ((row_type == FRICTION[0]) | (row_type == FRICTION[1]))
     _check_rows(
-        "efc_frictionloss", loss, has_loss & ~((loss >= 0.0) & (loss < np.inf)), "a finite number from 0"
+        "efc_frictionloss",
+        loss,
+        has_loss & ~((loss >= 0.0) & (loss < np.inf)),
+        "a finite number of at least 0",
     )
     mass = _convert_mass(M, n, nv)
     precision = get_common_precision(jac, mass, before)
@@ -228,7 +231,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     word = mj.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
     if word not in map(str.lower, single.MASS_MATRIX_INTEGRATORS):
         raise CapabilityError(
-            f"integrator={word!r} puts damping into M; "
+            f"integrator={word!r} adds damping to M; "
             f"{', '.join(map(repr, single.MASS_MATRIX_INTEGRATORS))} have M itself"
         )
     check_choice("errors", errors, ERRORS)
@@ -259,7 +262,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             try:
                 mj.mj_forward(model, data)
             except mj.FatalError as error:
-                raise InputError(f"state {i}: MuJoCo ends in an error, {error}") from None
+                raise InputError(f"state {i}: MuJoCo raised an error, {error}") from None
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             # MuJoCo's own efc_vel also contains the velocities of moving surfaces.
             mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)

@@ -230,7 +230,7 @@ def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -
         raise InputError(f"{path}: {error}") from None
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(
-            f"{path} cannot be read as HDF5 ({error}); it is damaged or of another kind"
+            f"{path} cannot be read as HDF5 ({error}); it is damaged, or not an HDF5 file"
         ) from None
 
 
@@ -250,14 +250,14 @@ class _Reader:
             if link is None:
                 return None
             if not isinstance(link, self.h5py.HardLink):
-                raise InputError(f"{path} is a {type(link).__name__}; links out of a group are not followed")
+                raise InputError(f"{path} is a {type(link).__name__}; links to other places are not followed")
             node = node[part]
         if (
             isinstance(node, self.h5py.Dataset)
             and node.fletcher32
             and node.id.chunk_iter(_stop_at_short_chunk)
         ):
-            raise InputError(f"{path}: numbers are cut off; their chunk is shorter than its checksum")
+            raise InputError(f"{path}: numbers are missing; their chunk is shorter than its checksum")
         return node
 
     def has_path(self, path: str) -> bool:
@@ -278,7 +278,7 @@ class _Reader:
         if not isinstance(data, self.h5py.Dataset):
             raise InputError(f"{path} is missing or not a dataset")
         if data.is_virtual or data.external:
-            raise InputError(f"{path} keeps its numbers in other files; they are not followed")
+            raise InputError(f"{path} stores its numbers in other files, which are not read")
         if data.dtype.kind not in kinds or data.shape is None:
             wanted = "whole numbers" if kinds == "iu" else "numbers"
             raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
@@ -319,7 +319,7 @@ class _Reader:
         """Return the numbers of rows and columns that a matrix declares."""
         m, n = (self.read_integer(f"{path}/{name}") for name in ("m", "n"))
         if min(m, n) < 0:
-            raise InputError(f"{path}: m {m}, n {n}; sizes are not negative")
+            raise InputError(f"{path}: m {m}, n {n}; sizes must not be negative")
         return m, n
 
     def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
@@ -330,7 +330,7 @@ class _Reader:
             self.read_integer(f"{path}/nzmax"),
         )
         if nzmax < 0 or nz < -2 or nz > nzmax:
-            raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz is -2, -1 or 0 to nzmax")
+            raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz must be -2, -1 or 0 to nzmax")
         if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
             raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
@@ -380,8 +380,8 @@ def _read_file(r: _Reader) -> Contents:
     if not present:
         found = ", ".join(list(r.file)[:8]) or "nothing"
         raise InputError(
-            f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}, with {ROLLING} behind it where contacts "
-            "resist rolling"
+            f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}, with the suffix {ROLLING} if contacts have "
+            "rolling friction"
         )
     group, rolling = present[0], present[0].endswith(ROLLING)
     if present[-1].endswith(ROLLING) != rolling:
@@ -543,22 +543,24 @@ def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -
         kind = "free rows" if np.all(free[rows]) else "bounded rows"
         obstacles.append(f"blocks of bounded rows ({int(rows.sum())} {kind}; contacts only)")
     if c.has_ellipse:
-        obstacles.append("ellipses (give problem.disk, whose impulses are problem.on_disk of those here)")
+        obstacles.append("ellipses (give problem.disk; problem.on_disk converts impulses)")
     if c.has_box:
-        obstacles.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
+        obstacles.append(
+            "boxes (FCLIB's friction is a disk: give cones.shaped('disk'), which is another law)"
+        )
     if np.any(c.spin_rows >= 0) or c.has_round:
         obstacles.append("torsional friction")
     rolls = np.count_nonzero(c.rolling_rows >= 0)
     contacts = c.n_tangents[c.is_contact]
     if 0 < rolls < len(contacts):
-        obstacles.append(f"contacts with rolling beside others ({rolls} of {len(contacts)}; all, or none)")
+        obstacles.append(f"contacts with and without rolling rows ({rolls} of {len(contacts)}; all, or none)")
     if problem.n_blocks == 0:
         obstacles.append("a problem without contacts")
     elif len(contacts) and (contacts.min() != contacts.max() or contacts[0] == 0):
         sizes = sorted({int(t) + 1 for t in contacts})
         obstacles.append(f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)")
     if problem.friction != "coulomb":
-        obstacles.append("the 'cone' law (it means Coulomb friction: pass problem.relaxed('coulomb'))")
+        obstacles.append("the 'cone' law (FCLIB means Coulomb friction: give problem.relaxed('coulomb'))")
     if problem.names is not None and "names" not in drop:
         obstacles.append("names of blocks (drop=('names',) leaves them out)")
     if problem.key is not None and "key" not in drop:
@@ -568,9 +570,9 @@ def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -
     if problem.precision != "float64" and "precision" not in drop:
         obstacles.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
     if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
-        obstacles.append("half a surrogate pair in its name (give it another)")
+        obstacles.append("half a surrogate pair in its name (give another name)")
     if "\0" in problem.name:
-        obstacles.append("a NUL character in its name, which ends a text there (give it another)")
+        obstacles.append("a NUL character in its name, which ends texts in FCLIB (give another name)")
     if form == "global":
         obstacles += _list_reasons_against_global_form(problem)
     return obstacles
@@ -663,6 +665,6 @@ def _import_h5py() -> Any:
         import h5py
     except ImportError:
         raise InputError(
-            "FCLIB files are HDF5, which needs h5py: pip install 'lavender-contact[fclib]' (an .npz needs nothing)"
+            "FCLIB files are HDF5, which need h5py: pip install 'lavender-contact[fclib]' (or use .npz)"
         ) from None
     return h5py

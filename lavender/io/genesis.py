@@ -25,7 +25,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.io.efc import ELLIPTIC, EQUALITY, FRICTION, from_efc
 from lavender.io.engine_step import Claims, EngineStep
 
-LIMIT, PYRAMIDAL = 3, 6  # values of mjtConstraint: a joint limit, an edge of a pyramid
+LIMIT, PYRAMIDAL = 3, 6  # Values of mjtConstraint: a joint limit, an edge of a pyramid.
 ROWS_OF_NORMAL_AND_TANGENTS = 3
 GENESIS_ADVICE = "genesis-world 1.4 is known"
 
@@ -140,9 +140,9 @@ def _check_configuration(scene: Any, solver: Any) -> None:
     for is_used, name in (
         (solver._options.noslip_iterations > 0, "noslip_iterations changes impulses after the solve"),
         (config.use_hibernation, "use_hibernation leaves bodies out of the problem"),
-        (coupler != "LegacyCoupler" and coupler != "NoneType", f"the {coupler} solves contacts of its own"),
+        (coupler != "LegacyCoupler" and coupler != "NoneType", f"the {coupler} solves additional contacts"),
         (config.enable_signorini_contact and has_more_friction,
-         "contact_resolution=signorini with torsional or rolling friction is not one of the known laws"),
+         "contact_resolution=signorini with torsional or rolling friction is another friction law"),
     ):  # fmt: skip
         if is_used:
             raise CapabilityError(f"{name}: it is not supported here")

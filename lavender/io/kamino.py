@@ -45,19 +45,22 @@ from lavender.problem.cones import CONTACT, ROW, Cones
 # Largest accepted difference of the engine's D and J M^-1 J^T + compliance, relative to the largest entry of the world:
 # 200 roundings of float32. Observed: up to 4e-7. A wrong row or a missing term differs by 1e-2 or more.
 MATRIX_TOLERANCE = 2.4e-5
-# At most this many worlds, those with the most rows, are compared at a first step; `verify=True` compares all.
+# At the first step, up to this number of worlds are compared, the ones with the largest numbers of rows.
+# `verify=True` compares all worlds.
 MAX_VERIFIED_WORLDS = 64
 ROWS_PER_CONTACT, COLUMNS_PER_BODY = 3, 6
 # Position of each row of a contact in the engine, which stores both tangents before the normal.
 NORMAL_FIRST = np.array([2, 0, 1])
-# Entries of the lower triangle of a body's M that can differ from 0: mass three times, inertia.
+# Entries of the lower triangle of a body's M that can differ from 0: the mass three times, then the inertia.
 BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2, 3, 3, 4, 3, 4, 5])
 BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
 INERTIA_ENTRIES = np.tril_indices(3)
-# Compared with its tolerances by the engine; see its PADMMStatus and DVIStatus.
+# Residuals that the engine compares with its tolerances; see its PADMMStatus and DVIStatus.
 RESIDUAL_NAMES = ("r_p", "r_d", "r_c", "r_b")
 DYNAMICS_SOLVERS = ("padmm", "dvi")
-KAMINO_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
+KAMINO_ADVICE = (
+    "newton 1.8 is supported; the class is experimental and its attributes change between versions"
+)
 
 
 _LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # of each solver
@@ -65,7 +68,7 @@ _LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # of each solve
 _VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # Numbers of a diverged world.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # A diverged world has NaN or huge numbers.
 def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     """Return the problems that a `SolverKamino` solved in its last step, its impulses and its claims.
 
@@ -302,8 +305,8 @@ class _Worlds:
         if is_singular.any():
             body = int(np.flatnonzero(is_singular)[0])
             raise CapabilityError(
-                f"body {body} ({self.engine._model.bodies.label[body]!r}) can move in some directions only: its "
-                "inverse mass or inertia is singular; bodies that move freely or not at all are supported"
+                f"body {body} ({self.engine._model.bodies.label[body]!r}) has a singular inverse mass or inertia, "
+                "so it moves in some directions only; only free and static bodies are supported"
             )
         inertia = np.linalg.inv(inv_inertia)
         values = np.concatenate(

@@ -74,11 +74,13 @@ SUM_TOLERANCE = 2.0**-40
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
 # Bytes of MuJoCo's memory for a row (12 numbers and more), a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
-CHANGED_ADVICE = "MjData was changed since its forward pass, or is of another model: run mj_forward"
+CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
 # Integrators with a constraint problem that uses M itself.
 MASS_MATRIX_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
-OTHER_MODEL_ADVICE = "The model was changed, or MjData is of another one: give a model and data made from it"
+OTHER_MODEL_ADVICE = (
+    "The model was changed, or MjData belongs to another model: give a model and data made from it"
+)
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 NO_CONTACT = SimpleNamespace(
     dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
@@ -255,7 +257,7 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise InputError(
-            "mujoco cannot be imported: pip install mujoco; a model and its data come from it"
+            "mujoco cannot be imported: pip install mujoco, which provides models and data"
         ) from None
     if not hasattr(mujoco.MjModel, "M_rowadr"):
         raise InputError(f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco")
@@ -288,15 +290,18 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
         *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
     )
     if result is None:
-        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
+        )
     mass, gap = result
     if not gap <= MASS_TOLERANCE:
         number = int(model.opt.integrator)
         names = [name for name, value in seen.mj.mjtIntegrator.__members__.items() if int(value) == number]
         word = names[0].removeprefix("mjINT_").lower() if names else str(number)
-        why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, MASS_MATRIX_INTEGRATORS))} have M itself"
+        why = f"integrator={word!r} adds damping to it; {', '.join(map(repr, MASS_MATRIX_INTEGRATORS))} have M itself"
         raise CapabilityError(
-            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
+            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: the problem was built with "
+            "another matrix than M. "
             f"{CHANGED_ADVICE if word in map(str.lower, MASS_MATRIX_INTEGRATORS) else why}"
         )
     return mass
@@ -331,7 +336,7 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
             f"row {result} of efc_J has {count[result]} entries from position {first[result]} of {len(columns)}, in "
             f"columns of {n}: an index is out of range. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
-    if result is None:  # Rows with unsorted or repeated columns.
+    if result is None:  # Some rows have unsorted or repeated columns.
         indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
         source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
         jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
@@ -353,7 +358,7 @@ def _compute_compliance(data: Any) -> FloatArray:
     empty = r == 0.0
     if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > COMPLIANCE_TOLERANCE):
         raise CapabilityError(
-            "efc_R and 1 / efc_D disagree: the softness of these constraints is not known. Run mj_forward on "
+            "efc_R and 1 / efc_D disagree: the compliance of these constraints is ambiguous. Run mj_forward on "
             "this MjData, or copy both from where the step ran"
         )
     return np.where(empty, 1.0 / inverse, r)
@@ -375,7 +380,9 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     axis, spatial, v = data.cdof, data.cvel, data.qvel
     gap, size = mujoco_rows.compare_spatial_velocities(parent, bodies, axis, spatial, v)
     if gap < 0.0:
-        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"dof_bodyid and body_parentid do not describe a tree of these bodies. {OTHER_MODEL_ADVICE}"
+        )
     if gap <= SUM_TOLERANCE * size or (
         not np.any(spatial) and np.any(data.efc_vel)
     ):  # A copy may not fill cvel.
@@ -387,8 +394,8 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
         <= SUM_TOLERANCE * size
     ):
         raise CapabilityError(
-            "the velocity before the step cannot be computed from cvel and cdof: joints of one body move it alike, or "
-            "MjData was changed since its forward pass: run mj_forward"
+            "the velocity before the step cannot be computed from cvel and cdof: joints of one body have "
+            "dependent axes, or MjData was changed since its forward pass: run mj_forward"
         )
     return v
 
@@ -444,16 +451,16 @@ def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tupl
     if isinstance(result, int):  # The number of the first invalid row.
         kind, which, known = int(types[result]), int(ids[result]), codes.tolist()
         if kind not in known:
-            raise CapabilityError(f"constraint row {result} is of type {kind}, which is not known here")
+            raise CapabilityError(f"constraint row {result} is of type {kind}, which is not supported")
         count = type_counts[known.index(kind)]
         dim = f", of condim {dims[which]}" if known.index(kind) > 4 and 0 <= which < count else ""
         raise InputError(
             f"constraint row {result} of {len(types)} is of type {kind} and names number {which} of {count}{dim}: "
-            f"that is not there, or has not so many rows. {CHANGED_ADVICE}"
+            f"it does not exist, or has fewer rows. {CHANGED_ADVICE}"
         )
     blocks, scale, key = result
     if blocks is None:
-        raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED_ADVICE}")
+        raise InputError(f"efc_frictionloss or a contact's friction is not a valid bound. {CHANGED_ADVICE}")
     return Cones._from_blocks(blocks), scale, key
 
 

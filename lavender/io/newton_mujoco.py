@@ -20,7 +20,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.io.efc import from_efc
 from lavender.io.engine_step import Claims, EngineStep
 
-NEWTON_ADVICE = "newton 1.8 with mujoco-warp 3.17 to 4.0 is known"
+NEWTON_ADVICE = "newton 1.8 with mujoco-warp 3.17 to 4.0 is supported"
 
 
 def from_newton_mujoco(solver: Any, velocity: Any) -> EngineStep:
@@ -78,7 +78,7 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
         getattr(contact, name).numpy()[:count] for name in ("worldid", "efc_address", "dim", "friction")
     )
     mass = data.M.numpy()
-    if mass.ndim == 2:  # lower triangles in compressed rows
+    if mass.ndim == 2:  # M is given as lower triangles in compressed rows.
         mass = mass[:, : len(model.M_colind)], model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
     else:
         mass = mass[:, :nv, :nv]

@@ -86,7 +86,7 @@ class _Header:
         size = self.n_elements * self.dtype.itemsize
         raw = self.stream.read(size)
         if len(raw) != size or self.stream.read(1):
-            raise EOFError(f"{len(raw)} of {size} bytes are there")
+            raise EOFError(f"the file holds {len(raw)} of {size} bytes")
         return np.frombuffer(raw, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
 
 
@@ -117,11 +117,13 @@ class Archive(Mapping[str, np.ndarray]):
             name = entry.filename.removesuffix(".npy")
             if name == entry.filename or name in self._headers:
                 raise InputError(
-                    f"{self.path} holds {entry.filename!r}; an .npz holds one .npy under each name"
+                    f"{self.path} holds {entry.filename!r}; an .npz must hold one .npy for each name"
                 )
             try:
                 if entry.compress_type not in ACCEPTED_COMPRESSION:
-                    raise ValueError(f"it is packed by method {entry.compress_type}; deflate is read")
+                    raise ValueError(
+                        f"it has the compression method {entry.compress_type}; deflate is needed"
+                    )
                 self._headers[name] = _read_npy_header(self._zip.open(entry), entry.file_size)
             except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
@@ -171,7 +173,7 @@ class Archive(Mapping[str, np.ndarray]):
 def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
     """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
     if npy.read_magic(stream) != (1, 0):  # Later versions are for long field names.
-        raise ValueError("it is a record array, or none at all; plain numbers (.npy, version 1.0) are needed")
+        raise ValueError("it is a record array or not an array; plain numbers (.npy, version 1.0) are needed")
     shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_NPY_HEADER_BYTES)
     if dtype.kind not in "buifUS":
         raise ValueError(

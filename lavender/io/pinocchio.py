@@ -26,7 +26,9 @@ from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-OTHER_MODEL_ADVICE = "A model was changed, or the data are of another one: give data made from this model"
+OTHER_MODEL_ADVICE = (
+    "The model was changed, or the data belong to another model: give data made from this model"
+)
 # Largest accepted deviation of a quaternion from unit length and of a matrix from a rotation [-]. With a larger one,
 # J does not map joint velocities to velocities.
 ROTATION_TOLERANCE = 1e-6
@@ -85,7 +87,7 @@ def from_pinocchio(
     try:
         import pinocchio as pin
     except ImportError:
-        raise InputError("pinocchio cannot be imported: pip install pin; a model comes from it") from None
+        raise InputError("pinocchio cannot be imported: pip install pin, which provides models") from None
     dt, correction = _check_arguments(constraint_models, constraint_datas, dt, correction)
     _check_model(pin, model, data)
     nv = int(model.nv)
@@ -94,7 +96,7 @@ def from_pinocchio(
     tau = np.array(as_array("tau", 0.0 if tau is None else tau, (nv,), unit="N, N m"))
     if not pin.isNormalized(model, q, ROTATION_TOLERANCE):
         raise InputError(
-            "q holds a rotation that is none: pinocchio.normalize(model, q) makes quaternions unit ones"
+            "q has a quaternion that is not of unit length: pinocchio.normalize(model, q) normalises quaternions"
         )
     mass, a = _compute_mass_and_acceleration(pin, model, data, q, v, tau)
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
@@ -166,7 +168,7 @@ def _compute_mass_and_acceleration(
         (np.abs(mass) @ np.abs(a) + np.abs(force)).max(initial=0.0)
     ):
         raise CapabilityError(
-            "M aba(q, v, tau) differs from tau - nle(q, v): these are not accelerations of this M"
+            "M aba(q, v, tau) differs from tau - nle(q, v): the accelerations were computed with another M"
         )
     return mass, a
 
@@ -180,7 +182,7 @@ def wrap_engine_errors(engine: str, advice: str) -> Iterator[None]:
         raise
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         message = " ".join(str(error).split())
-        raise InputError(f"{engine} cannot take these: {message:.300}. {advice}") from None
+        raise InputError(f"{engine} does not accept these data: {message:.300}. {advice}") from None
 
 
 def _check_model(pin: Any, model: Any, data: Any) -> None:
@@ -222,7 +224,7 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
                 f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL_ADVICE}"
             )
         if not _is_rotation(model.jointPlacements[i].rotation):
-            raise InputError(f"the placement of joint {i} holds a rotation that is none")
+            raise InputError(f"the placement of joint {i} has a matrix that is not a rotation")
         at_v, at_q = at_v + joint.nv, at_q + joint.nq
     sizes = {len(data.oMi), len(data.v), len(data.f)}
     if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv):
@@ -253,7 +255,7 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
         raise InputError(f"constraint data {i} are {type(data).__name__}; those of a {kind} are needed")
     for name in ("joint1_placement", "joint2_placement"):
         if hasattr(constraint, name) and not _is_rotation(getattr(constraint, name).rotation):
-            raise InputError(f"constraint {i}, a {kind}: {name} holds a rotation that is none")
+            raise InputError(f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation")
     if kind == "FrameAnchorConstraintModel" and np.any(constraint.desired_constraint_offset):
         raise CapabilityError(
             f"constraint {i}, a {kind}, has a desired offset, which Pinocchio does not read: put it into a placement"
@@ -315,7 +317,7 @@ def _convert_constraint(
         low, high = np.array(model.getFrictionLowerLimit()), np.array(model.getFrictionUpperLimit())
         return Cones.bounded(dt * low, dt * high), np.zeros(n), order
     raise CapabilityError(
-        f"a {kind} is not known here; anchors, point contacts, joint limits and joint friction are"
+        f"a {kind} is not supported; anchors, point contacts, joint limits and joint friction are"
     )
 
 

@@ -117,8 +117,10 @@ class Recorder:
         self._stack = contextlib.ExitStack()
         self.folder = self._stack.enter_context(lock_step_folder(folder, check_bool("replace", replace)))
         self._lines: dict[str, dict[str, Any]] = {}
-        self._worst: list[tuple[float, str]] = []  # heap of (velocity error, file), the smallest first
-        self._unjudged: set[int] = set()  # worlds with a line for their first invalid step
+        self._worst: list[
+            tuple[float, str]
+        ] = []  # Heap of (velocity error, file) with the smallest error first.
+        self._unjudged: set[int] = set()  # Worlds that already have a line for their first invalid step.
 
     def __enter__(self) -> Recorder:
         return self
@@ -222,7 +224,9 @@ class Recorder:
             return lambda i: arrays
         for name, x in arrays.items():
             if x.ndim == 0 or len(x) != n:
-                raise InputError(f"state {name!r} has shape {x.shape}; {n} worlds first are needed")
+                raise InputError(
+                    f"state {name!r} has shape {x.shape}; a first dimension of {n} worlds is needed"
+                )
         return lambda i: {name: x[i] for name, x in arrays.items()}
 
     def _record_selected_world(

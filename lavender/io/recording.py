@@ -154,7 +154,7 @@ def record(
                     continue
                 mj.mj_forward(model, data)
             except mj.FatalError as error:
-                raise InputError(f"step {step + 1}: MuJoCo ends in an error, {error}") from None
+                raise InputError(f"step {step + 1}: MuJoCo raised an error, {error}") from None
             file = folder / f"step_{step + 1:0{width}d}.npz"
             try:
                 result = _solve_step(mj, model, data, f"step {step + 1}", precision, threshold)
@@ -231,7 +231,7 @@ def record_file(
     result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
     if not result.files:
         why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"
-        raise InputError(f"{path}: no step had a constraint that could be kept{why}")
+        raise InputError(f"{path}: no step had a constraint that could be recorded{why}")
     return result
 
 
@@ -265,7 +265,9 @@ def _load_controls_npy(path: str) -> Any:
         raise InputError(f"controls {path}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
     if not isinstance(result, np.ndarray):
         result.close()
-        raise InputError(f"controls {path}: an archive of several arrays; a .npy file of one is needed")
+        raise InputError(
+            f"controls {path}: it is an archive of several arrays; a .npy file of one array is needed"
+        )
     return result
 
 
@@ -293,5 +295,5 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
         return lambda data, step: rng.uniform(low, high)
     rows = as_array("control", control, (None, n))
     if len(rows) == 0:
-        raise InputError(f"control has shape {rows.shape}; (any, {n}) with a row at least is needed")
+        raise InputError(f"control has shape {rows.shape}; (any, {n}) with at least one row is needed")
     return lambda data, step: rows[step % len(rows)]

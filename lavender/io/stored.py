@@ -165,7 +165,7 @@ def _resolve_links(path: Path) -> Path:
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
-        reason = "the working directory is gone" if isinstance(error, FileNotFoundError) else error
+        reason = "the working directory no longer exists" if isinstance(error, FileNotFoundError) else error
         raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
 
 
@@ -212,10 +212,10 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
     except OSError as error:
         raise InputError(f"cannot write {path}: {_explain_write_failure(error, parent)}") from None
     if not stat.S_ISDIR(mode):
-        raise InputError(f"cannot write {path}: {parent} is no folder; give a path in one")
+        raise InputError(f"cannot write {path}: {parent} is not a folder; give a path in a folder")
     existing = [path] if not folder and path.exists() else []
     if not all(os.access(x, os.W_OK) for x in (parent, *existing)):
-        raise InputError(f"cannot write {path}: you may not write there; give a path that you may write to")
+        raise InputError(f"cannot write {path}: you have no permission to write there; give another path")
     return path
 
 
@@ -226,7 +226,7 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"cannot make the folder {folder}: {error.strerror or error}; give another path"
+            f"cannot create the folder {folder}: {error.strerror or error}; give another path"
         ) from None
     return folder
 
@@ -234,9 +234,11 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
 def _explain_write_failure(error: OSError, folder: Path) -> str:
     """Return the reason why a file could not be written, and advice."""
     if isinstance(error, FileNotFoundError) and not folder.is_dir():
-        return f"the folder {folder} is not there; make it first"
+        return f"the folder {folder} does not exist; create it first"
     disk_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return f"{error.strerror or error}; {'make room' if disk_full else 'give a path that can be written'}"
+    return (
+        f"{error.strerror or error}; {'free disk space' if disk_full else 'give a path that can be written'}"
+    )
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
@@ -365,7 +367,7 @@ def as_path(path: str | os.PathLike[str]) -> Path:
     if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
         raise InputError(f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed")
     if "\0" in os.fspath(path):
-        raise InputError(f"path {path!r} holds a NUL character; no file has such a name")
+        raise InputError(f"path {path!r} has a NUL character, which no file name may have")
     return Path(path)
 
 
@@ -390,7 +392,7 @@ def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "
         status = os.stat(path)
         if not stat.S_ISREG(status.st_mode):
             kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
-            raise InputError(f"cannot read {named}: it is no file but {kind}; a file is needed")
+            raise InputError(f"cannot read {named}: it is {kind}; a regular file is needed")
         if count < 0 and status.st_size > MAX_BYTES:
             raise InputError(f"cannot read {named}: it holds {status.st_size} bytes, more than {MAX_BYTES}")
         with open(path, "rb") as stream:

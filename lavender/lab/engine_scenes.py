@@ -274,7 +274,8 @@ class NewtonScene:
         """Continue from a state of all worlds (n, ...); the solver's memory of earlier steps is cleared."""
         if not self._has_equal_worlds:
             raise InputError(
-                "the worlds of this scene have different bodies or joints, so they cannot start from states: call without states"
+                "the worlds of this scene have different bodies or joints, so they cannot start from states: "
+                "call without states"
             )
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:

@@ -29,16 +29,16 @@ from lavender.solving.limits import check_time_limit
 from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 
-MAX_SOLVES = 5  # solves of one constraint problem, each with a smaller tol
-MIN_TOL = 1e-15  # the smallest tol of such a solve
-TOL_RATIO = 0.1  # the next tol over the one with which the error would be tol, if both fall together
+MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
+MIN_TOL = 1e-15  # The smallest tol of such a solve.
+TOL_RATIO = 0.1  # The next tol is this fraction of the tol at which the error would reach its limit if both were proportional.
 # The backend is called first if n 2^-53 cond(M) is above this share of tol, as the judge then refines M^-1.
 MAX_LOSS = 0.1
-# A solve that ends otherwise has used up its budget, or a smaller tol does not change its result.
+# After any other status the budget is used up, or a smaller tol does not change the result.
 CONTINUED = (Status.CONVERGED, Status.STALLED)
-# Of the constraint problem, whatever the program's error is.
+# A claim about the constraint problem holds for every error of the program.
 FINAL_STATUSES = (Status.ROUNDOFF_LIMIT, Status.INTERRUPTED)
-FEASIBLE_TOL = 1e-7  # relative residual of a point that shows that an unbounded program has a feasible point
+FEASIBLE_TOL = 1e-7  # An unbounded program counts as feasible at a point of at most this relative residual.
 
 
 def solve_qp(
@@ -90,8 +90,8 @@ def solve_qp(
     qp = getattr(problem, "qp", None)
     if qp is None:
         raise InputError(
-            "problem is not a quadratic program: make it with Problem.from_qp; updated() and files keep the "
-            "constraint problem alone"
+            "problem is not a quadratic program: make it with Problem.from_qp; updated() and files contain "
+            "only the constraint problem"
         )
     begun = perf_counter()
     tol, end = check_float("tol", tol, low=0.0), begun + check_time_limit(time_limit)
@@ -224,7 +224,7 @@ def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> Q
     direction, rows = solution.certificate[: len(qp.q)], qp.select_row_multipliers(solution.certificate)
     if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:
         return answer
-    unit = problem.d[: len(qp.q)]  # min sum unit_i x_i^2 under the same constraints
+    unit = problem.d[: len(qp.q)]  # The objective is the sum of unit_i x_i^2, under the same constraints.
     general = Generalized(qp.jacobian, sp.diags_array(unit), np.zeros(len(unit)))
     cones = problem.cones.select(np.arange(len(qp.q), problem.n_blocks))
     nearest = Problem(qp.target, cones, generalized=general, copy=False)

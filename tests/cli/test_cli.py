@@ -191,7 +191,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
         (("phenomena", "stick", "--steppers", "fast"), "unknown stepper"),
         (("phenomena", "stick", "--steppers", "none"), "no stepper and no engine"),
-        (("phenomena", "stick", "--out", "no/such/folder/x.json"), "is not there; make it first"),
+        (("phenomena", "stick", "--out", "no/such/folder/x.json"), "does not exist; create it first"),
         (("nonsense",), "unknown command 'nonsense'"),
         (("slove", "stack(n=4)"), "did you mean 'solve'"),
         (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
@@ -435,7 +435,7 @@ def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, word
     os.rmdir(os.getcwd())
     words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
     code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
-    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory is gone" in err)
+    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err)
     for words in (
         "run stack --steps 2 --record r",
         "export c c",
@@ -443,7 +443,7 @@ def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, word
         "report toy_stack",
     ):
         code, _, err = lavender(*words.split())
-        assert code == cli.EXIT_BAD_INPUT and "the working directory is gone" in err
+        assert code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err
 
 
 def _unread(*words):

@@ -231,7 +231,7 @@ def test_a_full_disk_while_records_are_added_is_an_error_and_releases_the_file(t
     with (
         Store(path) as store,
         file_size_limit(0),
-        pytest.raises(lv.InputError, match=r"cannot write .* make room"),
+        pytest.raises(lv.InputError, match=r"cannot write .* free disk space"),
     ):
         store.add(Skip("run", "case", "pgs", "reason"))
     Store(path).close()
@@ -437,7 +437,7 @@ def test_a_folder_that_cannot_be_made_is_named(name, lavender, tmp_path, monkeyp
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
     code, _, err = lavender(*words)
-    why = f"cannot make the folder {out}: {os.strerror(errno.ENOENT)}; give another path"
+    why = f"cannot create the folder {out}: {os.strerror(errno.ENOENT)}; give another path"
     assert (code, err.splitlines()[-1]) == (2, f"lavender: {why}")
 
 

@@ -241,7 +241,7 @@ BOMBS = {
     ),
     "a packing that chooses its memory": (
         lambda path: write_npz(path, zipfile.ZIP_LZMA, **OWN),
-        "packed by method",
+        "it has the compression method",
     ),
     "one body under many contacts": (one_wide_body, "max_bytes="),
     "triplets of a huge matrix": (

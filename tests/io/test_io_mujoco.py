@@ -413,7 +413,7 @@ def test_of_a_model_only_what_cannot_change_is_kept_and_it_is_let_go():
         lv.io.from_mujoco(model, data)
         whole = getattr(model, name)
         kept, whole[-1] = int(whole[-1]), 1000
-        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid are no tree"):
+        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid do not describe a tree"):
             lv.io.from_mujoco(model, data)
         whole[-1] = kept
     alive = weakref.ref(model)

@@ -99,7 +99,7 @@ def test_arguments_and_folders_are_checked(tmp_path):
         with pytest.raises(lv.InputError, match="another"):  # the folder is locked
             lv.io.Recorder(tmp_path / "a", every=1)
         recorder.add(step_of([0.1]))
-        with pytest.raises(lv.InputError, match=r"state 'q' has shape \(3,\); 1 worlds first"):
+        with pytest.raises(lv.InputError, match=r"state 'q' has shape \(3,\); a first dimension of 1 worlds"):
             recorder.add(step_of([0.1]), state={"q": np.zeros(3)})
     with pytest.raises(lv.InputError, match="holds 1 problem files"):
         lv.io.Recorder(tmp_path / "a", every=1)

@@ -61,7 +61,7 @@ def test_a_model_that_ends_mujoco_in_an_error_is_refused_by_its_words(tmp_path, 
 
     model, data = state(steps=1)
     monkeypatch.setattr(mj, name, ends)
-    with pytest.raises(lv.InputError, match="step 1: MuJoCo ends in an error, not supported"):
+    with pytest.raises(lv.InputError, match="step 1: MuJoCo raised an error, not supported"):
         lv.io.record(model, data, tmp_path / "steps", 4)
 
 

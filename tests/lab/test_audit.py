@@ -364,7 +364,7 @@ def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypat
         raise mj.FatalError("not supported")
 
     monkeypatch.setattr(mj, "mj_forward", ends)
-    with pytest.raises(lv.InputError, match="state 0: MuJoCo ends in an error, not supported"):
+    with pytest.raises(lv.InputError, match="state 0: MuJoCo raised an error, not supported"):
         audit(boxes(), worlds=1, steps=12, workers=1)
 
 

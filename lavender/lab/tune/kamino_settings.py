@@ -28,7 +28,10 @@ TOLERANCE_NAMES = ("primal_tolerance", "dual_tolerance", "compl_tolerance")
 
 @dataclass(frozen=True)
 class KaminoSetting(Setting):
-    """Fields of PADMMSolverConfig with values that differ from the present configuration; "tolerance" stands for all three tolerances."""
+    """Fields of PADMMSolverConfig that differ from the present configuration.
+
+    "tolerance" sets all three tolerances.
+    """
 
     merge_note: ClassVar[str] = (
         "The lines change a configuration before the solver is built: config = SolverKamino.Config.from_model(model), "

@@ -130,7 +130,7 @@ class MujocoStage(Stage):
                 MujocoSetting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
             )[1]
         except mj.FatalError as error:
-            raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
+            raise InputError(f"{runs.model}: MuJoCo raised an error, {error}") from None
         return configured
 
     def run_stretches(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:

@@ -276,7 +276,7 @@ def test_batches_of_another_length_are_refused():
     with pytest.raises(lv.InputError, match="a list of them is needed"):
         lv.derivatives(p, s)
     found = lv.derivatives([p], [s]).vjp(impulse=[np.ones(p.m)])
-    with pytest.raises(AttributeError, match=r"gradients have no 'M' of all problems; \[i\]"):
+    with pytest.raises(AttributeError, match=r"gradients of all problems have no 'M'; \[i\]"):
         found.M  # noqa: B018 - read
     with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is not a matrix"):
         found[0].full("mu")

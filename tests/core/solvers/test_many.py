@@ -464,7 +464,7 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"J": np.zeros((3, 12))}, "stacked it is"),
+        ({"J": np.zeros((3, 12))}, "or with row_ptr"),
         ({"M": np.zeros((4, 3, 3))}, "M has shape"),
         ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
         ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),

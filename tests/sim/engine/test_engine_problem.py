@@ -232,7 +232,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
         later.record(tmp_path / "later", 60, form="fclib")
     assert later.steps == len(list((tmp_path / "later").iterdir())) > 0  # that step is not done
     (tmp_path / "file").write_text("")
-    with pytest.raises(lv.InputError, match="is no folder"):
+    with pytest.raises(lv.InputError, match="is not a folder"):
         sim.record(tmp_path / "file", 1)
 
 

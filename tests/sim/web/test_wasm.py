@@ -134,7 +134,7 @@ def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="is not there; make it first"):
+    with pytest.raises(InputError, match="does not exist; create it first"):
         pages.build_module(tmp_path / "none" / "a.wasm")
 
 
