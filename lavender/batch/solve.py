@@ -49,7 +49,7 @@ __all__ = ["Solutions", "solve_many"]
 
 # Worlds that are not started before the deadline are late: their start is judged.
 # Costs [ns] of such a world: to judge it in the compiled loop if it has J and M (the cost per entry is added), and to
-# store it if it belongs to a list of problems, whose numbers are judged when they are read.
+# store it if it belongs to a list of problems. The numbers of stored worlds are judged when they are read.
 JUDGED_LATE_WORLD_COST, LATE_WORLD_COST = 4e3, 4e4
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
@@ -97,7 +97,7 @@ class Solutions(Many, Sequence[Solution]):
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
-        self._late_worlds: list[int] = []  # Worlds whose start is not judged yet.
+        self._late_worlds: list[int] = []  # Worlds with a start that is not judged yet.
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
         # The loop overwrites the starts of a batch.
         self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()

@@ -78,7 +78,7 @@ SPIN_COEFFICIENT_LABEL = (
 CONTACT_ROWS = {
     CONTACT: (1, 3, "a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
     CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are allowed"),
-    ROUND: (4, 6, "a round cone", "a normal and three to five tangents (two sliding, one spin, two rolling) are allowed"),
+    ROUND: (4, 6, "a round cone", "a normal and three to five tangents (2 sliding, 1 spin, 2 rolling) are allowed"),
     CONTACT_BOX: (3, 3, "a box", "a normal and two tangents are needed"),
     CONTACT_ROLLING: (5, 6, "a contact with rolling",
                       "a normal, two tangents, optionally a spin row, and two rolling rows are needed: 5 or 6"),
@@ -196,8 +196,8 @@ class Cones:
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
-                f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
-                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
+                f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, "
+                f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
             )
         kind = _check_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
