@@ -1,1 +1,1 @@
-"""Problems with a reason, measuring and reporting, and what examines a problem or an answer."""
+"""The built-in problems, measurements and reports, and the examination of problems and answers."""

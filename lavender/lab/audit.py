@@ -61,7 +61,7 @@ from lavender.problem import PRECISIONS, Problem
 AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
 VELOCITY_UNIT = "m/s, rad/s"  # Linear rows have the first unit, angular rows the second.
-WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
+WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # Errors of the worst row [m/s, N s, -, -].
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps or fewer.
@@ -74,8 +74,8 @@ MAX_DEFAULT_WORLDS = (
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
-    "Of the worst row of each step judged. At its floor: rounding explains the error, in the engine's precision. Close "
-    "enough: no row has a larger error than the threshold. Stopped before convergence, or wrong: the rest. Not judged: "
+    "Errors of the worst row of each judged step. At its floor: rounding explains the error, in the engine's "
+    "precision. Close enough: no row has a larger error than the threshold. Stopped before convergence, or wrong: the rest. Not judged: "
     "the engine's answer is not finite, or the world diverged before. The errors are of the engine's forces: the "
     "accelerations by which MuJoCo's Newton and CG move bodies are usually more accurate."
 )
@@ -469,7 +469,7 @@ def audit(
     InputError
         The model cannot be read, the engine is not installed, or a number is out of range.
     CapabilityError
-        The problem of the model's integrator is not one of M.
+        The integrator's constraint problem uses a matrix other than M.
     UnknownName
         The engine is unknown.
     """
@@ -510,7 +510,7 @@ def audit(
         text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
         watch(Event(0, worlds * steps, text, "", remaining=expected_time))
     begin = perf_counter()
-    first: tuple[int, float] | None = None  # (number of steps, time [s]) of the first results
+    first: tuple[int, float] | None = None  # Number of steps and time [s] of the first results.
     try:
         for piece in pieces:
             numbers[:, piece.world, piece.step] = piece.numbers
@@ -538,7 +538,9 @@ def audit(
         if not result.n_processed:
             raise
     if not result.n_processed:
-        raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
+        raise InputError(
+            "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
+        )
     busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
     return replace(result, stopped=result.n_processed < worlds * steps, busy=busy)
 

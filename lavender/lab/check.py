@@ -25,7 +25,10 @@ from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_budget, check_time_limit
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
-CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # for relaxed friction, which is not a QP
+CONE_REFERENCES = (
+    "clarabel_cone",
+    "block_gauss_seidel",
+)  # References for relaxed friction, which is not a QP.
 REFERENCE_MAX_RESIDUAL = (
     1e-9  # A reference must reach this relative residual, or 10 times the round-off floor.
 )
@@ -33,10 +36,8 @@ REFERENCE_MAX_RESIDUAL = (
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
 PROVED = "no solution, proved"
-NEAR_NONE = (
-    "no solution within rounding"  # of the data: if the exact data have a solution, its impulses are huge
-)
-INEXACT = "no exact solution"  # a certificate holds, and other solvers meet the tolerance
+NEAR_NONE = "no solution within rounding"  # If the exact data have a solution, it is huge.
+INEXACT = "no exact solution"  # A certificate holds, and other solvers meet the tolerance.
 NOT_SOLVED = "not solved"
 NOTHING_TO_DO = "nothing to do"
 CLAIM_CONTRADICTED = "claim contradicted"
@@ -237,7 +238,7 @@ def cross_check(
     reasons = known(problem)
     for name in (reference, *names):
         if not isinstance(name, str) or name not in reasons:
-            get(name)  # raises UnknownName with the nearest names
+            get(name)  # Raises UnknownName with similar names.
     with Worker() as worker:
         run_solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
         optimum, reference_solver, note = _solve_reference(problem, reference, reasons, run_solver)
@@ -288,7 +289,11 @@ def _solve_reference(
     if not (problem.has_singular_program or problem.is_symmetric):
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
     if not (problem.has_singular_program or problem.is_semidefinite):
-        return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
+        return (
+            None,
+            None,
+            "A is not positive semidefinite: several solutions with different motions may exist",
+        )
     defaults = CONE_REFERENCES if problem.law == "cone" else REFERENCES
     chain = (first, *(r for r in defaults if r != first))
     failed = []

@@ -197,7 +197,8 @@ class Cones:
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
                 f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, "
-                f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
+                f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
+                f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
             )
         kind = _check_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")

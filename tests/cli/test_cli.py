@@ -190,7 +190,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("phenomena", "stick", "--set", "slope=3"), "0 to 0.99 is needed"),
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
         (("phenomena", "stick", "--steppers", "fast"), "unknown stepper"),
-        (("phenomena", "stick", "--steppers", "none"), "no stepper and no engine"),
+        (("phenomena", "stick", "--steppers", "none"), "neither steppers nor engines are named"),
         (("phenomena", "stick", "--out", "no/such/folder/x.json"), "does not exist; create it first"),
         (("nonsense",), "unknown command 'nonsense'"),
         (("slove", "stack(n=4)"), "did you mean 'solve'"),

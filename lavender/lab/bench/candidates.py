@@ -24,7 +24,7 @@ CANDIDATE_TIME_RATIO = (
     1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
 )
 MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
-# Parts of a time that `time_limit` is set to: set-up and judge take the rest.
+# Fractions of a time to which `time_limit` is set; set-up and judge take the remaining time.
 TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
@@ -43,7 +43,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallS
         near = [c for i, c in enumerate(equal) if i < 2 or c.score <= CANDIDATE_TIME_RATIO * best.score]
         for solver in [c.solver for c in near[:MAX_CANDIDATES]]:
             max_iter = _find_required_max_iter(records, solver, tolerance)
-            # Carrying impulses has its price: if steps are quick, a cold start may be faster.
+            # Carrying impulses takes time: if steps are quick, a cold start may be faster.
             for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
                 call_specs.append(
                     CallSpec(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)

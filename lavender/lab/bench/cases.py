@@ -131,7 +131,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
     if sequences is not None:
         check_bool("sequences", sequences)
     items: list[Item] = []
-    visited: set[Path] = set()  # folders: a link in one of them may lead back to another
+    visited: set[Path] = set()  # Folders: a link in one of them may lead back to another.
     sources = (
         [sources]
         if isinstance(sources, Source)
@@ -231,7 +231,7 @@ def expand_seeds(cases: Iterable[str], n: int, first: int = 0) -> list[str]:
 def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     """Return consecutive problems as the steps of one sequence."""
     if not isinstance(name, str):
-        raise InputError(f"name of a sequence is {name!r:.60}; a string is needed")
+        raise InputError(f"the name of a sequence is {name!r:.60}; a string is needed")
     items = []
     for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
         check_problem(problem)
@@ -279,14 +279,14 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     unlisted = [p.name for p in paths if listed and p.name not in listed]
     if twice or len(series) > 1 or unlisted:
         reason = (
-            f"{unlisted[0]} is not in its {ENGINE}"
+            f"{unlisted[0]} is not listed in its {ENGINE}"
             if unlisted
-            else "two files have one number"
+            else "two files have the same number"
             if twice
             else f"files are named {series[0]}N and {series[1]}N"
         )
         raise InputError(
-            f"{folder} holds steps of more than one recording ({reason}): move each into a folder of its own"
+            f"{folder} holds steps of more than one recording ({reason}): move each recording into a separate folder"
         )
 
 
@@ -556,7 +556,7 @@ def _is_bilateral(problem: Problem) -> bool:
     return bool(2 * free > c.n_blocks)
 
 
-Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # number of nodes, and both ends of each edge
+Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # Number of nodes, and both ends of each edge.
 
 
 def _build_body_graph(problem: Problem) -> Edges:

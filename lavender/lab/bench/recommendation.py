@@ -32,13 +32,13 @@ from lavender.lab.bench.statistics import (
 )
 from lavender.lab.bench.store import Records
 
-SERVED_RESIDUAL = 0.5  # A case is served if at most this part of the start's residual is left.
+SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
 SERVED_QUANTILE = (
     0.9  # Quantile of residuals over the cases that ranks within a time; a mean would hide misses.
 )
 PREFERRED_SOLVER = "auto"  # It comes first among equals: the only name that needs no choice.
 SHORT_TIME_RATIO = (
-    0.5  # A time is worth a sentence of its own if it is below this part of the time to the tolerance.
+    0.5  # A time gets a separate sentence if it is below this fraction of the time to the tolerance.
 )
 
 
@@ -54,10 +54,10 @@ class Choice:
     # 95th percentile over the cases of the values that `score` summarises; inf: not reached.
     p95: float = math.nan
     worst: float = math.nan
-    hardest: str = ""  # the case of `worst`
-    how: str = ""  # the budget, and for a sequence, whether impulses are carried
-    iterations: int = 0  # of that budget, 0 without one
-    overrun: float = math.nan  # 95th percentile of the call's time over its time limit
+    hardest: str = ""  # The case of `worst`.
+    how: str = ""  # The budget, and for a sequence, whether impulses are carried.
+    iterations: int = 0  # Iterations of that budget; 0 without a budget.
+    overrun: float = math.nan  # 95th percentile of the call's time divided by its time limit.
 
     def solves_share(self, share: float) -> bool:
         """Return whether it solves at least this share of the cases, and at least one case."""
@@ -85,9 +85,9 @@ class Advice:
     """Ranking of solvers in a family for one tolerance or time budget."""
 
     family: str
-    target: float  # tolerance [-] or time [s]
+    target: float  # Tolerance [-] or time [s].
     ranking: tuple[Choice, ...]
-    equal: int = 1  # number of solvers at the head that are the best within noise; their order is fixed
+    equal: int = 1  # Number of solvers that are equally good as the first within noise; their order is fixed.
     min_share: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
 
     @property
@@ -123,7 +123,7 @@ class FamilyAdvice:
     name: str
     cases: tuple[str, ...]
     sequence: bool
-    left_out: int  # steps that did not load
+    left_out: int  # Number of steps that did not load.
     by_tolerance: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
     by_sweeps: Mapping[float, Advice]
@@ -184,7 +184,7 @@ class _RunGroup:
         return {"how": f"{middle} sweeps" if middle else "", "iterations": middle}
 
 
-RunGroups = Mapping[tuple[str, str, str], _RunGroup]  # by solver, call and start
+RunGroups = Mapping[tuple[str, str, str], _RunGroup]  # The key is (solver, call, start).
 
 
 def _group_runs(records: Records) -> RunGroups:
@@ -354,11 +354,11 @@ def _keep_best_of_each_solver(choices: Iterable[RankedChoice]) -> list[RankedCho
 class Subject:
     """All single cases together, or all sequences: the subject of a report's first sentence."""
 
-    names: tuple[str, ...]  # cases, or sequences
-    cases: tuple[str, ...]  # cases, or steps of the sequences
+    names: tuple[str, ...]  # Names of cases or sequences.
+    cases: tuple[str, ...]  # Names of cases, or of the steps of the sequences.
     timing_mode: str  # "call" or "steps"
-    best: Advice  # to the middle tolerance
-    quick: tuple[Advice, ...]  # in each time
+    best: Advice  # Ranking to the middle tolerance.
+    quick: tuple[Advice, ...]  # Ranking within each time.
 
 
 def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:

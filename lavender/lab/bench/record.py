@@ -142,7 +142,7 @@ class CaseInfo(_PrintableEntry):
     bodies : int
         0 if only a matrix is known.
     nonzeros : int
-        Of A, or of J if A is not formed.
+        Number of nonzeros of A, or of J if A is not formed.
     mass_ratio : float
         Largest over smallest body mass, or entry of A's diagonal.
     structure : tuple of str

@@ -344,7 +344,7 @@ def _rank_by_resampling(
     """Rank calls by the share of resamplings that they win; `values` are by call, case and repetition."""
     n, _, repeats = values.shape
     blocks = _group_blocks(records, names)
-    single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, calls)
+    single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # Shape (repetitions, calls).
     # Two standard errors of the difference of two scores; the error of a quartile is 1.36 times the error of a mean.
     deviation = float(np.median(np.log(single).std(axis=0)))
     noise = max(MIN_TIME_NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
@@ -352,7 +352,7 @@ def _rank_by_resampling(
     wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
     false_claims = np.array([any(r.status_conflict for r in f.runs.values()) for f in calls])
     for cases, repetitions in _draw_samples(blocks, repeats, max(1, MAX_ARRAY_ENTRIES // values.size)):
-        sampled = score(values[:, cases[:, :, None], repetitions[:, None, :]])  # (calls, samples)
+        sampled = score(values[:, cases[:, :, None], repetitions[:, None, :]])  # Shape (calls, samples).
         # A false claim comes last, then the call that misses more cases.
         behind = missed[:, cases].sum(axis=2) + 1e6 * false_claims[:, None]
         first = behind == behind.min(axis=0)

@@ -40,7 +40,7 @@ from lavender.solving.solve import solve
 
 TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
 STRICT_RESIDUAL = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
-MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # loosest first
+MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # The loosest tolerance comes first.
 N_REPEATS = 20
 BATCH_SIZE = 64  # Number of problems in one call of solve_many.
 

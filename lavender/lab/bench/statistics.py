@@ -19,7 +19,14 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.lab.bench.record import Record, describe_target
 from lavender.lab.bench.store import Records
 
-STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense")  # as tables list structures
+STRUCTURE_ORDER = (
+    "separate",
+    "chain",
+    "mesh",
+    "stack",
+    "pile",
+    "dense",
+)  # Order in which tables list structures.
 DEATH_STATUSES = ("ERROR", "KILLED", "CRASHED")
 EASY_RESIDUAL = 1e-3  # Relative residual to which sweeps are counted as a measure of difficulty.
 TIME_NOISE_FACTOR = (
@@ -103,9 +110,9 @@ class Reach:
     best, roundoff_floor : float
         Smallest relative residual of all runs, and its round-off floor.
     status : str
-        Of the run to the tightest tolerance.
+        Status of the run to the tightest tolerance.
     claim_check : str
-        The worst of all runs.
+        Worst `claim_check` of all runs.
     status_conflict, form : str
     motion_error : float
         Relative motion error of the best run; nan without one.
@@ -403,7 +410,7 @@ class Profile:
     law: str
     tolerance: float
     cases: int
-    curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> steps of (ratio, fraction of cases)
+    curves: Mapping[str, tuple[tuple[float, float], ...]]  # Solver -> steps (ratio, fraction of cases).
     measure: str = "time"
 
 
@@ -429,7 +436,7 @@ def collect_times_to_tolerance(records: Records, tolerance: float) -> dict[str, 
     return out
 
 
-#: Counters of `work` of which each is a pass over the entries of A: a sweep over all blocks, or a product with A.
+#: Counters of `work` that count passes over the entries of A: sweeps over all blocks, or products with A.
 MATRIX_PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
 #: Counters of work that cannot be expressed in passes; solvers with such work are not in a profile by work.
 OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
@@ -614,11 +621,11 @@ class Robustness:
     family: str
     solver: str
     cases: int
-    reached: Mapping[float, int]  # tolerance -> number of cases with a run to a tolerance that reached it
-    wrong: int  # number of contradicted claims
+    reached: Mapping[float, int]  # Tolerance -> number of cases with a run to a tolerance that reached it.
+    wrong: int  # Number of contradicted claims.
     died: int
-    budgets: Mapping[int, tuple[float, float]]  # iterations -> median and 95th percentile of the residual
-    hardest: str  # case with the largest residual of its best run
+    budgets: Mapping[int, tuple[float, float]]  # Iterations -> median and 95th percentile of the residual.
+    hardest: str  # Case with the largest residual of its best run.
 
 
 def compute_robustness(records: Records) -> list[Robustness]:
@@ -670,11 +677,11 @@ class Pass:
     mode: str
     tol: float
     max_iter: int
-    steps: int  # of the sequence; a pass that was stopped has fewer
-    left_out: int  # steps of the sequence that did not load
-    times: Mapping[str, tuple[float, ...]]  # start -> s of each step
+    steps: int  # Number of steps of the sequence; a pass that was stopped has fewer times.
+    left_out: int  # Number of steps of the sequence that did not load.
+    times: Mapping[str, tuple[float, ...]]  # Start -> time [s] of each step.
     iterations: Mapping[str, int]
-    residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
+    residuals: Mapping[str, tuple[float, ...]]  # Start -> relative residual of each step.
 
     @property
     def target(self) -> str:

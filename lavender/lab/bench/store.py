@@ -48,12 +48,12 @@ class Records:
     """Entries of one or more runs."""
 
     runs: dict[str, Run] = field(default_factory=dict)
-    cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
+    cases: dict[str, CaseInfo] = field(default_factory=dict)  # The latest description of each case.
     records: list[Record] = field(default_factory=list)
     source: str = ""
     selected_from: tuple[str, ...] = ()  # All solvers with records, if these are a selection of them.
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
-    # the identity of each, as described last
+    # The identity of each sequence in its latest description.
     _sequences: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
@@ -73,7 +73,7 @@ class Records:
     def add(self, entry: Entry) -> None:
         """Add one entry. A description, note or run replaces the earlier one."""
         if isinstance(entry, Run):
-            self.runs.pop(entry.run, None)  # the newest is the last
+            self.runs.pop(entry.run, None)  # The newest run becomes the last one.
             self.runs[entry.run] = entry
         elif isinstance(entry, CaseInfo):
             if (
@@ -84,7 +84,7 @@ class Records:
                 self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
                 self._sequences[entry.sequence] = entry.identity
             self.cases[entry.case] = entry
-            self._skips.pop((entry.run, entry.case, ""), None)  # it loads now
+            self._skips.pop((entry.run, entry.case, ""), None)  # The case loads now.
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
         else:
@@ -108,7 +108,7 @@ class Records:
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
         ]
-        # lines that were timed alternately
+        # Calls that were timed alternately.
         newest = next((r.interleave_group for r in reversed(mine) if r.interleave_group), "")
         mine = [r for r in mine if r.interleave_group in ("", newest)]
         cases = {r.case for r in mine}
@@ -246,13 +246,13 @@ class Store:
                 self._synced = time.monotonic()
                 if not self._real.exists():
                     raise InputError(
-                        f"{self.path} was removed while it was being written, with what it held: run the command "
-                        "again, in a folder that stays"
+                        f"{self.path} was removed, with its contents, while it was being written: run the "
+                        "command again in another folder"
                     )
         except OSError as error:
             raise InputError(
-                f"cannot write {self.path} ({error.strerror or error}): make room and run the same command again; "
-                "it goes on from the last record"
+                f"cannot write {self.path} ({error.strerror or error}): free disk space and run the same command "
+                "again; it continues after the last record"
             ) from None
         self.records.add(entry)
 
@@ -316,8 +316,8 @@ def read_records(path: str | Path) -> Records:
         if isinstance(entry, Record) and not (entry.case in found.cases and entry.run in found.runs):
             what = "case" if entry.run in found.runs else "run"
             raise InputError(
-                f"{path}, line {number}: a record of a {what} that no line before it describes; "
-                "a records.jsonl is needed, whole"
+                f"{path}, line {number}: a record of a {what} that no earlier line describes; "
+                "a complete records.jsonl is needed"
             )
         found.add(entry)
     # A repeated measurement replaces the earlier one, in its place.
@@ -332,7 +332,7 @@ def _read_lines(path: Path) -> Iterator[str]:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise InputError(
-                f"{path} holds {size} bytes, more than {MAX_BYTES}; a records.jsonl is needed, of fewer cases"
+                f"{path} holds {size} bytes, more than {MAX_BYTES}; a records.jsonl of fewer cases is needed"
             )
         with path.open("rb") as f:
             while line := f.readline(MAX_LINE_BYTES):

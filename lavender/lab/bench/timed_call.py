@@ -7,7 +7,7 @@ from typing import Any
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.solvers import registry
 
-COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # removes the guess of a problem
+COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # Removes the guess of a problem.
 CARRIED_START = (
     "before, impulse = problems[0], None",
     "for problem in problems:",

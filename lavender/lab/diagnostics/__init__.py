@@ -77,7 +77,7 @@ def diagnose(
     check_problem(problem)
     state = motion.check_state_arguments(problem, velocity, gap, dt)
     solution = problem.guess if impulse is None else problem.impulse_array(impulse)
-    with np.errstate(all="ignore"):  # comparisons with numbers beyond float64 are false
+    with np.errstate(all="ignore"):  # Comparisons with numbers beyond float64 are false.
         cached = problem.derived.cache.get(__name__)
         if cached is None:
             cached = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))

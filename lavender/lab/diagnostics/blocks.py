@@ -103,7 +103,7 @@ def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
         seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
         if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
             opposed += [other, i]
-    if len(again) > max(2, 0.3 * len(contacts)):  # collision detection occasionally repeats a point
+    if len(again) > max(2, 0.3 * len(contacts)):  # Collision detection occasionally repeats a point.
         yield make_diagnostic(
             p, "duplicate rows", f"{len(again)} contacts have the same rows as an earlier one", again
         )
@@ -133,7 +133,7 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
         yield make_diagnostic(
             p,
             "impulses",
-            reason + f"{b:.3g} m/s: far beyond the momentum that is present",
+            reason + f"{b:.3g} m/s: far more than the momentum of the problem",
             [p.block_of(i)],
             velocity=float(row_velocity[i]),
         )

@@ -15,13 +15,13 @@ from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-MAX_DENSE_VELOCITIES = 600  # M is converted to a dense matrix and inverted up to this many velocities
-MISTAKEN_READINGS = (  # possible mistakes for problems of bodies, and of J and M
+MAX_DENSE_VELOCITIES = 600  # M of up to this many velocities is converted to a dense matrix and inverted.
+MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problems of J and M.
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
     ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
 )
 MAX_CENTRE_DISTANCE = (
-    0.25  # -, share of the arms by which the centres may differ between contacts of one pair
+    0.25  # [-] The centres of one pair of bodies may differ between contacts by this fraction of the arms.
 )
 
 
@@ -42,14 +42,16 @@ def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) ->
         rows = c.ptr[:-1][contact][:, None] + np.arange(3)
     mass, part = g.mass.toarray(), g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
-    for j in find_free_bodies(mass):  # the angular velocity of a ball has equal masses, too
+    for j in find_free_bodies(mass):  # The angular velocity of a ball has equal inertias, too.
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
             six.append(np.arange(j, j + 6))
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
         return None
     at = np.array(six)
-    push, turn = part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)  # (bodies, c, 3, 3)
-    moment = push.swapaxes(2, 3) @ turn  # sum of d (r x d)^T = [r]^T
+    push, turn = (
+        part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)
+    )  # Shape (bodies, c, 3, 3).
+    moment = push.swapaxes(2, 3) @ turn  # The sum of d (r x d)^T is [r]^T.
     on = push.any(axis=(2, 3))
     k, count, first, last = (
         np.arange(len(part)),
@@ -133,7 +135,7 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(
             p,
             "bodies",
-            reason + "contacts do: does it name a wrong body?",
+            reason + "contacts do: is a wrong body given?",
             blocks[wrong],
             off=float(off.max()),
         )

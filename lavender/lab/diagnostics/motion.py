@@ -15,15 +15,15 @@ from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-G = 9.81  # m/s^2
+G = 9.81  # [m/s^2]
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
 MAX_SEPARATION_TARGET = 30.0
 MAX_APPROACH_TARGET = (
-    1000.0  # m/s, a larger target would allow an approach of more than 2 m in a step of 2 ms
+    1000.0  # [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
 )
 MIN_RESTITUTION = 0.05  # [-] Smaller ratios are not a bounce but targets with a factor dt too many.
 RESTITUTION_ROUNDING = (
-    1e-6  # -, equal coefficients of restitution differ by less when computed from velocities
+    1e-6  # [-] Equal coefficients of restitution, computed from velocities, differ by less.
 )
 # [m/s] Approach speeds in this range suggest a target without dt; larger speeds are in other units.
 SUSPICIOUS_APPROACH = 30.0, 1e4
@@ -40,7 +40,7 @@ def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, 
     else:
         return None
     target = p.b + u
-    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0  # rounding of b and J v*
+    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0  # This is rounding of b and J v*.
     return u, target, v
 
 
@@ -100,7 +100,8 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     wild = (tn > limit) | (tn < -MAX_APPROACH_TARGET)
     if wild.any():
         largest = float(tn[np.argmax(np.abs(tn) * wild)])
-        reason = f"{np.count_nonzero(wild)} contacts have targets up to {largest:.3g} m/s, faster than bodies there; "
+        reason = f"{np.count_nonzero(wild)} contacts have targets up to {largest:.3g} m/s, "
+        reason += "more than the speeds of the bodies; "
         reason += "divide a penetration depth or a gap in m by dt once, and count a gap as negative"
         yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
         return
@@ -209,7 +210,7 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
             push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
         # Use free bodies if there are any: the light links of a robot are accelerated more.
         fall = np.linalg.norm(push, axis=1) if len(push) else change
-        fall = fall[fall > 0.01 * fall.max()]  # ignore bodies on which no force acts
+        fall = fall[fall > 0.01 * fall.max()]  # Ignore bodies on which no force acts.
         typical = float(np.median(fall)) if len(fall) else 0.0
         if not step.any():
             yield make_diagnostic(

@@ -119,7 +119,7 @@ class Redundancy:
         if self.blocks:
             more = ", ..." if len(self.blocks) > 8 else ""
             lines.append(f"all rows of: {', '.join(self.block_names[:8])}{more}")
-        lines.append(f"unique: {', '.join(self.unique) or 'nothing is certain to be'}")
+        lines.append(f"unique: {', '.join(self.unique) or 'no quantity is certain'}")
         return "\n".join(lines)
 
 
@@ -179,7 +179,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
             used = max(used, limit)
             if len(dependent_rows):
                 basis = _compute_null_basis(a.toarray(), dependent_rows)
-                if unit is not scale:  # to the metric of d
+                if unit is not scale:  # Convert to the metric of d.
                     basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
                 unique[island] = np.abs(basis).max(axis=1) <= NULL_VECTOR_TOL
         else:

@@ -19,7 +19,7 @@ from lavender.problem import Problem
 # moves by up to 1e-7 of it on the worst conditioned piles of the suite.
 SAME_MOTION_FRACTION = 1e-6
 
-# Fmt: skip.
+# Fields that become None if their numbers are not finite.
 MOTION_ERROR_FIELDS = (
     "kinetic",
     "energy",
@@ -40,7 +40,7 @@ class MotionError:
     Parameters
     ----------
     kinetic : float or None, sqrt J
-        Of the difference of body velocities; None if M is not known.
+        Energy norm of the difference of body velocities; None if M is not known.
     energy : float or None, sqrt J
         The same plus the energy stored in compliance.
     relative : float or None
@@ -154,7 +154,9 @@ def measure_distance(problem: Problem, x: FloatArray, reference: Reference) -> M
     """Compute the distance of an impulse x (m,) [N s] from one reference; numbers beyond float64 are None."""
     error = drop_non_finite(_compute_error(problem, x, reference), MOTION_ERROR_FIELDS)
     if error.relative == math.inf:
-        explanation = "relative to next to nothing, as the solution moves no more"
+        explanation = (
+            "the relative error has a tiny reference, because the constraints cause almost no motion"
+        )
         return replace(error, note="; ".join(n for n in (error.note, explanation) if n))
     return error
 
@@ -176,7 +178,7 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
     notes = [reference.refusal and f"{reference.refusal}: no energies"]
     energies = reference.is_accepted and not reference.refusal
     if not reference.is_accepted:
-        notes.append("nothing reached the floor: no estimate")
+        notes.append("no solver reached the floor, so there is no estimate")
     values: dict[str, Any] = dict.fromkeys((*MOTION_ERROR_FIELDS, "relative"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
     velocity = operator.compute_velocity(delta, U * np.abs(delta))

@@ -78,7 +78,9 @@ def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
         scale = 1.0 / np.sqrt(problem.d)
         a = scale[:, None] * problem.dense() * scale
         b = scale * problem.b
-        unit = float(np.abs(b).max(initial=0.0)) or 1.0  # [sqrt J] scales the largest number of a system to 1
+        unit = (
+            float(np.abs(b).max(initial=0.0)) or 1.0
+        )  # [sqrt J] Unit in which the largest number of a system is 1.
         b, scale = b / unit, unit * scale
         block_modes = [w for i in range(c.n_blocks) for w in _list_block_modes(problem, i, a, b, scale)]
     if not all(np.isfinite(field).all() for modes in block_modes for field in modes):
@@ -143,7 +145,7 @@ def _list_block_modes(
         yield _to_arrays([open_mode, ([(a[n], b[n]), *no_friction], [(unit_row[n], zero)])], problem.m)
         return
     t = start + 1
-    tangent_bound = mu * scale[n] / scale[t] * unit_row[n]  # the bound of the scaled tangent
+    tangent_bound = mu * scale[n] / scale[t] * unit_row[n]  # Bound of the scaled tangent.
     stuck_mode = (
         [(a[n], b[n]), (a[t], b[t])],
         [(unit_row[n], zero), (tangent_bound - unit_row[t], zero), (tangent_bound + unit_row[t], zero)],

@@ -199,7 +199,7 @@ class SolutionSet:
         """
         choice = check_choice("choice", choice, SELECTION_RULES)
         if not self.motions:
-            raise InputError("no run ended at a solution; there is nothing to choose from")
+            raise InputError("no run ended at a solution, so none can be selected")
         if choice == "dissipation":
             return max(self.motions, key=lambda motion: motion.dissipation)
         p = self.problem
@@ -251,7 +251,7 @@ class SolutionSet:
             return f"{name}: none of {self.failed} runs ended at a solution"
         energy = "" if self.spread_energy is None else f", {self.spread_energy:.2e} sqrt(J)"
         many = "one motion" if len(self) == 1 else f"{len(self)} motions"
-        kind = f"one motion, unique: {self.unique}" if self.unique else f"{many}, all that there are"
+        kind = f"one motion, unique: {self.unique}" if self.unique else f"{many}, no others exist"
         kind = kind if self.all else f"at least {many}"
         spread = f", up to {self.spread:.2g} m/s{energy} apart" if len(self) > 1 else ""
         failed = f", {self.failed} did not end at one" if self.failed else ""

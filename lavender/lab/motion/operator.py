@@ -141,7 +141,7 @@ class _Factored(Operator):
     def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
         g = self.jac_t @ x
         h = np.abs(g)
-        off = self.abs_jac_t @ (self.wrench_gamma * np.abs(x) + 1.01 * uncertainty)  # of g
+        off = self.abs_jac_t @ (self.wrench_gamma * np.abs(x) + 1.01 * uncertainty)  # Error bound of g.
         square = max(float(g @ (self.minv @ g)), 0.0)
         rounding = _bound_sum_rounding(self.nv + 4) * float(h @ (self.abs_minv @ h))
         if self.off is not None:

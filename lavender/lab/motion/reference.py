@@ -175,7 +175,7 @@ def save_reference(
         get_motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
     best = get_reference(problem.disk)
     if not best.is_accepted:
-        raise InputError(f"{path}: nothing reached the floor ({best}); there is no reference to write")
+        raise InputError(f"{path}: no solver reached the floor ({best}); there is no reference to write")
     buffer = BytesIO()
     np.savez(buffer, impulse=best.impulse, solver=np.array(best.solver))
     write_bytes(out, buffer.getvalue())

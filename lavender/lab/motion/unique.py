@@ -6,8 +6,7 @@ unique if one of these holds:
     the law is convex    A symmetric positive semidefinite, no friction in it or the law `cone`:
                          w and the velocities are those of a convex program
     normals feel no      A_tn = 0 between its friction rows and all others, A positive definite on the
-    friction             others: these are a boxed LCP of their own, whose lambda_n is unique; it fixes every
-    friction             others: these are a boxed LCP of their own, whose lambda_n is unique; it fixes every
+    friction             others: these are a separate boxed LCP with a unique lambda_n, which determines every
                          disk, and the remaining problem is convex. Example: one contact on a body, its normal through
                          the centre
     friction is small    kappa < 1, below: a contraction has one fixed point
@@ -163,9 +162,9 @@ def _proves_no_contact_slides(
             float(np.linalg.norm(x[rows_of_component])) / c.friction_coefficient[rows_of_component[0]]
             for rows_of_component in components[i]
         )
-        unused_friction.append(x[c.ptr[i]] - friction_used)  # (1 - sigma) lambda_n
+        unused_friction.append(x[c.ptr[i]] - friction_used)  # This is (1 - sigma) lambda_n.
     h = float(np.min(np.array(unused_friction) / np.sqrt(inverse_diagonal)))
-    size = float(np.sqrt(max(x[rows] @ (w + problem.b[rows]), 0.0)))  # |lambda|_A of the island
+    size = float(np.sqrt(max(x[rows] @ (w + problem.b[rows]), 0.0)))  # This is |lambda|_A of the island.
     return h > 0.0 and (
         size <= h * (1.0 - CRITERION_MARGIN) or (kappa - 1.0) * size < kappa * h * (1.0 - CRITERION_MARGIN)
     )

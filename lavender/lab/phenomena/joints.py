@@ -14,8 +14,8 @@ from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantit
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import make_quaternion
 
-ROD_SIZE = (0.1, 0.1, 1.0)  # m
-FREE_BODY_SIZE = (0.2, 0.6, 1.0)  # m
+ROD_SIZE = (0.1, 0.1, 1.0)  # [m]
+FREE_BODY_SIZE = (0.2, 0.6, 1.0)  # [m]
 FREE_ROTATION_PERIODS = 3  # The free rotation is simulated for this many periods of the flip.
 
 
@@ -83,7 +83,7 @@ def compute_flip_period(p: Values) -> float:
 
 def _measure_free_rotation_errors(p: Values, track: Track) -> dict[str, float]:
     """Measure the errors of momentum, energy and period of the free rotation."""
-    axes = np.stack([track.compute_body_axis(0, i) for i in range(3)], axis=1)  # (k, axis, world)
+    axes = np.stack([track.compute_body_axis(0, i) for i in range(3)], axis=1)  # Shape (k, axis, world).
     omega = np.einsum("kaw,kw->ka", axes, track.velocities[:, 0, 3:])
     energy = 0.5 * omega**2 @ get_moments_of_inertia()
     momentum = np.einsum("ka,kaw->kw", omega * get_moments_of_inertia(), axes)

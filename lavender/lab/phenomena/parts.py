@@ -12,7 +12,7 @@ from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.errors import InputError, UnknownName
 from lavender.sim.scene import Scene
 
-GRAVITY = 9.81  # m/s^2
+GRAVITY = 9.81  # [m/s^2]
 Values = Mapping[str, float]
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class PhenomenonExceeded(Exception):
-    """A quantity of a phenomenon exceeds its bound; the text names them."""
+    """Quantities of a phenomenon exceed their bounds; the text names them."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

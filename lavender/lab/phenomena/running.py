@@ -153,7 +153,7 @@ def run(
     UnknownName
         A phenomenon, stepper, engine or parameter is not known.
     InputError
-        A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
+        A parameter or limit is outside its range, or neither a stepper nor an engine is named; nothing has run.
     """
     if limit != math.inf:
         limit = check_float("limit", limit, above=0.0)
@@ -164,7 +164,9 @@ def run(
     ]
     selected = select_variants(steppers, engines)
     if not selected:
-        raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
+        raise InputError(
+            "neither steppers nor engines are named: name at least one, or leave steppers at its default"
+        )
     found = []
     process = EngineProcess(limit)
     try:

@@ -94,7 +94,7 @@ def _build_arch(p: Values, more: Mapping[str, Any]) -> Scene:
     scene = Scene(**{"gravity": GRAVITY, "friction": 1.0, **more})
     scene.add_plane((s, 0.0, c))
     scene.add_plane((-s, 0.0, c))
-    foot = half * s + 0.5 * thick * c  # horizontal distance from the apex to the centre of a foot
+    foot = half * s + 0.5 * thick * c  # Horizontal distance from the apex to the centre of a foot.
     for side in (-1.0, 1.0):
         for i in range(half):
             # The centre of the foot is on its skewback, at a height of the horizontal distance times tan(lean).

@@ -101,7 +101,7 @@ class Island:
             at = [
                 (index[r], number(c) * number(c)) for r, c in zip(part.rows, part.coefficients, strict=True)
             ]
-            gradient = [c2 * w[k] / s for k, c2 in at]  # ds = gradient . dw
+            gradient = [c2 * w[k] / s for k, c2 in at]  # This gives ds = gradient . dw.
             normal = x[index[first]] if first in index else self.lam[first]
             for k, c2 in at:
                 for (q, _), ds in zip(at, gradient, strict=True):

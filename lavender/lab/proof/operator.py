@@ -132,8 +132,8 @@ class Operator:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
         self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
         self.target, self.v = self._split_rhs()
-        self._mass: dict[Any, Any] = {}  # M^-1 for balls and for rationals
-        self._bias: dict[Any, list[Any]] = {}  # b for balls and for rationals
+        self._mass: dict[Any, Any] = {}  # M^-1 in balls and in rationals.
+        self._bias: dict[Any, list[Any]] = {}  # b in balls and in rationals.
 
     def _split_rhs(self) -> tuple[FloatArray, FloatArray | None]:
         """Split b = target - J v*: return (target, v*), rounding noise of a target set to 0; (b, None) for a matrix."""

@@ -83,7 +83,7 @@ class _FrictionComponent:
     """A friction component: its rows and case."""
 
     rows: list[int]
-    coefficients: list[float]  # c of each row
+    coefficients: list[float]  # The coefficient c of each row.
     slides: bool = False
 
 
@@ -193,7 +193,7 @@ class Search:
                     alternating = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
                     ]
-                    raise self._make_undecided_error(alternating, "between two cases, which change in turns")
+                    raise self._make_undecided_error(alternating, "between two cases, which alternate")
                 tried.add(key)
                 before = key
                 try:
@@ -209,7 +209,8 @@ class Search:
                     return self.make_enclosure(lam, w)
                 if boundary:
                     raise self._make_undecided_error(
-                        boundary, f"on the boundary of two cases, closer than {self.flint.ctx.prec} bits tell"
+                        boundary,
+                        f"on the boundary of two cases, closer than {self.flint.ctx.prec} bits can distinguish",
                     )
             raise _Undecided(
                 f"cases still change after {MAX_CASE_CHANGES} rounds; a more accurate answer is needed"
@@ -347,7 +348,7 @@ class Search:
     def _make_dependent_rows_error(self, rows: Any, explanation: str) -> _Undecided:
         """Create the exception for rows that depend on each other to rounding."""
         names = tuple(self.problem.row_name(int(r)) for r in rows)
-        explanation += "; which carry load hangs on these (a compliance on them decides it)"
+        explanation += "; the distribution of the load depends on these (a compliance on them determines it)"
         return _Undecided(f"{_join_names(names)}: {explanation}", names)
 
     def _enclose_island(self, which: Any, lam: list[Any], base: list[Any]) -> None:
@@ -389,7 +390,8 @@ class Search:
         explanation = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
         if len(rows):
             explanation = (
-                "their equations are singular to rounding; a family of solutions, or one between two cases"
+                "their equations are singular to rounding: there is a family of solutions, or a solution between two "
+                "cases"
             )
         first = self.problem.cones.ptr[np.searchsorted(self.problem.cones.ptr, rows, side="right") - 1]
         names = tuple(dict.fromkeys(self.problem.row_name(int(r)) for r in first))

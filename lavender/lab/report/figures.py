@@ -140,8 +140,8 @@ def _build_case_figure(name: str, x_title: str, records: Records, case: str, cur
 
 
 FLAT_LINES_NOTE = (
-    "A curve is flat after its solver has stopped: it met a tolerance (grey lines) and did not go on, so the residual "
-    "of its last run remains."
+    "A curve is flat after its solver has stopped: it met a tolerance (grey lines), and the curve keeps the "
+    "residual of its last run."
 )
 PASSES_NOTE = (
     "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "

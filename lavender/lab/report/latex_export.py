@@ -60,7 +60,7 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     report : Report
         Nothing is solved.
     folder : path
-        Made if it does not exist.
+        Created if it does not exist.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def _make_figure_file_name(figure: Figure) -> str:
 def _describe_unloaded_cases(records: Records) -> str:
     """Return a sentence on problems that did not load; empty if all did."""
     lost = sum(map(len, records.left_out.values()))
-    return f" Left out, for it did not load: {format_count(lost, 'problem')}." if lost else ""
+    return f" Left out, because they did not load: {format_count(lost, 'problem')}." if lost else ""
 
 
 def _describe_times(report: Report, solvers: set[str], sequences: bool = False) -> str:

@@ -36,7 +36,7 @@ def summarise_report(report: Report) -> str:
         code = ["```python", *statement.code, "```", ""] if statement.code else []
         lines += [escape_markdown(statement.text), "", *code]
     for what, reason in list_cases_not_loaded(records):
-        lines += [escape_markdown(f"Left out, and in no number here: {what}: {reason}"), ""]
+        lines += [escape_markdown(f"Left out of all numbers: {what}: {reason}"), ""]
     for section in list_sections(report):
         lines += [f"**{escape_markdown(section.title)}** ({escape_markdown(section.note)})", ""]
         lines += [*(format_markdown(section.table) if section.table.rows else [section.empty]), ""]

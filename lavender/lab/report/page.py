@@ -107,7 +107,7 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
     own = [f.name for some in figures.cases.values() for f in some]
     titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
-        "drawings": {  # their texts are escaped
+        "drawings": {  # The texts of the drawings are escaped.
             make_file_name(figure.name): plot_for_page(figure, number, named, titles.get(figure.name))
             for figure in figures
         },

@@ -38,7 +38,7 @@ CASES_IN_MEMORY = 32  # Number of cases that are loaded at the same time.
 # Problems are timed as one batch if the largest has up to this multiple of the smallest's rows.
 MAX_SIZE_RATIO = 10
 
-RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement, one of each repetition
+RecordsByKey = dict[tuple[Any, ...], list[Record]]  # Records by measurement, one record for each repetition.
 Cases = Sequence[tuple[Item, CaseInfo]]
 
 

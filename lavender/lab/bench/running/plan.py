@@ -43,10 +43,10 @@ class Plan:
         Number of solves of each kind, of which minimum and median are recorded. Repeats end when they have taken
         `time_limit` together. Steps of sequences of more than twenty steps are solved once.
     time_limit : float, s
-        Of one solve.
+        Limit of one solve.
     sequence_time_limit : float, s
-        Of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not solved, and a
-        note says so.
+        Limit of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not
+        solved, and a note is recorded.
     warm : bool
         Also start from the problem's guess, unless it is an answer.
     orders : sequence of str
@@ -123,7 +123,7 @@ class Plan:
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
         object.__setattr__(self, "motion", self.motion or self.prove or bool(self.velocity_tolerances))
 
-    timing_mode = "call"  # value of `Record.timing_mode` for single problems
+    timing_mode = "call"  # Value of `Record.timing_mode` for single problems.
 
     def get_max_iterations(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""

@@ -576,11 +576,11 @@ class Pair:
 
     index: int
     case: str
-    source: str | Problem  # a name or path that the worker resolves itself, or the problem
+    source: str | Problem  # A name or path that the worker resolves itself, or the problem.
     reason: str
     solver: str
-    info: CaseInfo | None  # stored description of the case
-    known: tuple[Record, ...]  # stored records of the pair
+    info: CaseInfo | None  # Stored description of the case.
+    known: tuple[Record, ...]  # Stored records of the pair.
 
 
 @dataclass(frozen=True)
@@ -589,8 +589,8 @@ class Order:
 
     plan: Plan
     run: Run
-    memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
-    local: tuple[SolverSpec, ...] = ()  # solvers that are registered only in the parent
+    memory: int | None  # [bytes] Memory of each backend's process; None: a share of its machine's memory.
+    local: tuple[SolverSpec, ...] = ()  # Solvers that are registered only in the parent.
 
 
 @cache

@@ -51,7 +51,7 @@ class CallSpec:
     max_iter : int
         0 means the solver's default.
     time_limit : float, s
-        Of one solve; 0 means the plan's.
+        Limit of one solve; 0 means the plan's limit.
     timing_mode : str
         See `Record.timing_mode`.
     start : {"cold", "warm", "carried"}
@@ -227,7 +227,7 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Rec
 
 def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
-    runs: list[tuple[Solution, float]] = []  # (solution, time of the call)
+    runs: list[tuple[Solution, float]] = []  # Solution and time of each call.
     calibration_times: list[float] = []
     backend_times: list[float] = []
     guard: Solution | None = None
@@ -270,7 +270,7 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
-    assert solution is not None  # there is at least one repeat
+    assert solution is not None  # At least one repeat was made.
     repeats = [s for s, _ in runs] or [solution]
     outcome = make_outcome(
         solution, repeats, [t for _, t in runs], min(calibration_times, default=None), task.mode == "time"

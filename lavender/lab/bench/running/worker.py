@@ -35,8 +35,8 @@ from lavender.solving.solve import solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN_CPU_TIME = 60.0  # [s] A worker without a parent is killed this CPU time after its task's limit.
-OUTCOME_ARRAYS = ("impulse", "certificate")  # fields of `Outcome`, in the order in which they are sent
-DIED_MESSAGE = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
+OUTCOME_ARRAYS = ("impulse", "certificate")  # Fields of `Outcome`, in the order in which they are sent.
+DIED_MESSAGE = "its code ended its process; report this to its authors, and leave it out (--solvers)"
 GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limits, before a worker is killed.
 
 
@@ -60,7 +60,7 @@ class Worker:
     def __init__(self, memory: int | None = None) -> None:
         self.memory = get_memory_per_process() if memory is None else memory
         self._process = ProcessBackend(run_task, memory=self.memory or 0, environment=ONE_THREAD)
-        self._problem_hash = ""  # of the problem that the process holds
+        self._problem_hash = ""  # Hash of the problem that the process holds.
 
     def measure_task(
         self, problem: Problem, task: Task, impulse: Any = None
@@ -148,9 +148,11 @@ def solve_isolated(
     """
     spec = registry.get(name)
     if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
-        import_numerics(*spec.requires)  # otherwise a part of the time of a first solve
+        import_numerics(*spec.requires)  # Otherwise this would be a part of the time of the first solve.
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
-    Prepared(problem, spec, options, begin=False)  # raises if the solver rejects the problem or an option
+    Prepared(
+        problem, spec, options, begin=False
+    )  # Raises an error if the solver rejects the problem or an option.
     task = Task(
         run="",
         case=problem.name,
@@ -166,7 +168,7 @@ def solve_isolated(
     return worker.solve(problem, task)
 
 
-_problem: Problem | None = None  # in the worker process: the problem of the last task
+_problem: Problem | None = None  # Used in the worker process: the problem of the last task.
 
 
 def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.Answer:
@@ -215,13 +217,13 @@ def parse_outcome(
     parts = (*outcome.setups, *outcome.solves)
     if not parts or len(outcome.setups) != len(outcome.solves):
         raise ValueError(
-            f"the worker returned {len(outcome.setups)} setup and {len(outcome.solves)} solve times; equally many, at "
-            "least one, are needed"
+            f"the worker returned {len(outcome.setups)} setup and {len(outcome.solves)} solve times; equal "
+            "numbers of at least 1 are needed"
         )
     times = [t - lead for t in outcome.times]
     valid = all(t >= 0.0 for t in (*parts, *times))
     if not valid or not max(math.fsum(parts), math.fsum(times)) <= elapsed:
-        raise ValueError("times that did not pass")
+        raise ValueError("times longer than the call")
     if not all(t is None or t <= elapsed for t in (outcome.calibration_time, outcome.backend_time)):
         raise ValueError("calibration_time or backend_time is longer than the call")
     return outcome

@@ -1,4 +1,4 @@
-"""Engines, one file each: `Engine(scene, **options)` steps a scene. A `EngineVariant` is an engine with settings."""
+"""Engines, one file each: `Engine(scene, **options)` steps a scene. An `EngineVariant` is an engine with settings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lavender.lab.phenomena.parts import Track
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import STEPPERS
 
-PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> npm package
+PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # Engine -> npm package.
 NO_TORSION = {"spin": "it has no torsional friction"}
 NO_PATCH_RADIUS = "its torsional friction has no radius parameter"
 NO_ROLLING = "it has no rolling friction"

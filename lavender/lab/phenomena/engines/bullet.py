@@ -47,7 +47,7 @@ class Engine(Stepping):
             fixedTimeStep=self.dt, numSolverIterations=sweeps, numSubSteps=substeps,
             **({"solverResidualThreshold": 0.0} if bodies else {}), **self.client_arguments,
         )  # fmt: skip
-        self.ids: dict[int, tuple[int, int]] = {}  # body -> (multibody, link); link -1 is its base
+        self.ids: dict[int, tuple[int, int]] = {}  # Body -> (multibody, link); link -1 is its base.
         for i in range(scene.n_bodies):
             if i not in self.up:
                 self._add_single_body(i)
@@ -169,7 +169,7 @@ class Engine(Stepping):
         pybullet.stepSimulation(**self.client_arguments)
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`."""
+        """See `Stepping.get_state`."""
         x, q, v = self.make_initial_state()
         for i, (body, link) in self.ids.items():
             if link < 0:

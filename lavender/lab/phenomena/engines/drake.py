@@ -138,7 +138,7 @@ class Engine(Stepping):
         self.simulator.AdvanceTo(self.steps * self.dt)
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`."""
+        """See `Stepping.get_state`."""
         x, q, v = self.make_initial_state()
         for i, body in enumerate(self.bodies):
             if body is None:

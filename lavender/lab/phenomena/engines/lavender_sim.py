@@ -91,7 +91,7 @@ class Engine(Stepping):
         return engine_scene.box(f"b{i}", size=shape.size, **body_options)
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`."""
+        """See `Stepping.get_state`."""
         s = np.asarray(self.env.body_state()[self.first :], float)
         inverse_frame = self.frame.T
         q = np.array(

@@ -68,7 +68,7 @@ class Engine(Stepping):
         solver = f' solver="PGS" iterations="{sweeps}" tolerance="0"' if sweeps else ""
         gravity = _format_numbers(p.gravity)
         option = f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{gravity}"{step}{solver}/>'
-        memory = "64M" if tree else "1G"  # for contacts and constraint rows
+        memory = "64M" if tree else "1G"  # Memory for contacts and constraint rows.
         self.no_collision = ' contype="0" conaffinity="0"' if scene.joints else ""
         trees = "".join(
             self._make_body_element(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0
@@ -138,7 +138,7 @@ class Engine(Stepping):
         return int(d.ncon), depth, residual(self.read_last_problem(), impulse(self.model, d)).relative
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`; velocities are computed for the time of the poses."""
+        """See `Stepping.get_state`; velocities are computed for the time of the poses."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_comVel(self.model, self.data)

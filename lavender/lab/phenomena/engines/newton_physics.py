@@ -97,7 +97,7 @@ class Engine(Stepping):
             self.now, self.next = self.next, self.now
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`; the engine computes in float32."""
+        """See `Stepping.get_state`; the engine computes in float32."""
         poses, velocities = self.now.body_q.numpy().astype(float), self.now.body_qd.numpy().astype(float)
         x, q, v = self.make_initial_state()
         for i, k in enumerate(self.bodies):

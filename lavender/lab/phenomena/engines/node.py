@@ -60,7 +60,7 @@ class Engine(Stepping):
     """An engine under Node, which returns its state with each answer."""
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
-        map_bodies_to_parent_joints(scene, engine)  # raises if the scene is not a tree
+        map_bodies_to_parent_joints(scene, engine)  # Raises CapabilityError if the scene is not a tree.
         self.dt, self.cpu_time = dt, 0.0
         self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
@@ -103,11 +103,11 @@ class Engine(Stepping):
         self._request_answer({"steps": steps})
 
     def get_cpu_time(self) -> float:
-        """See `Stepping.clock`; it is the time of the other process."""
+        """See `Stepping.get_cpu_time`; it is the time of the other process."""
         return self.cpu_time
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`; the engines compute in float32."""
+        """See `Stepping.get_state`; the engines compute in float32."""
         return self.states[:, :3], self.states[:, 3:7], self.states[:, 7:]
 
     def close(self) -> None:
@@ -133,5 +133,5 @@ def _describe_body(body: Body, engine: str) -> dict[str, Any]:
         "quaternion": quaternion,
         "velocity": body.velocity.tolist(),
         "spin": body.angular_velocity.tolist(),
-        "still": [*position, *quaternion, *[0.0] * 6],  # the state of a body that does not move
+        "still": [*position, *quaternion, *[0.0] * 6],  # The state of a body that does not move.
     }

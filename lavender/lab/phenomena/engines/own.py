@@ -28,7 +28,7 @@ class Engine(Stepping):
             self.observation, _, self.has_ended, _, _ = self.sim.step()
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`."""
+        """See `Stepping.get_state`."""
         return self.observation["positions"], self.observation["quaternions"], self.observation["velocities"]
 
     def measure_last_step(self) -> tuple[int, float, float]:
@@ -38,6 +38,6 @@ class Engine(Stepping):
         return int(self.observation["solver"][2]), float(depth), float(self.sim.residual()["relative"])
 
     def get_joint_force(self) -> float:
-        """See `Stepping.force`; the first joint must be a ball joint with three rows."""
+        """See `Stepping.get_joint_force`; the first joint must be a ball joint with three rows."""
         rows = self.observation["joint_impulses"][:3]
         return float(np.linalg.norm(rows)) / self.substep if len(rows) == 3 else float("nan")

@@ -16,7 +16,7 @@ def map_bodies_to_parent_joints(scene: Scene, engine: str) -> dict[int, Joint]:
     Raises
     ------
     CapabilityError
-        The scene has a loop, a soft joint, a motor or a distance joint; restitution or friction of single bodies.
+        The scene has a loop, a soft joint, a motor or a distance joint; restitution, or different friction of bodies.
     """
     joint_of: dict[int, Joint] = {}
     for joint in scene.joints:
@@ -37,7 +37,7 @@ def get_collision_shape(body: Body, engine: str, static: bool = True) -> Plane |
     """
     shape = body.shape
     if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
-        raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
+        raise CapabilityError(f"{body.name} has no shape that {engine} supports")
     return shape
 
 
