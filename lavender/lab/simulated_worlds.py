@@ -30,7 +30,7 @@ from lavender.lab.report.table import Table
 from lavender.lab.report.text import format_count, format_percent
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
-# MJX and Warp start from these.
+# Arrays of the state from which MJX and Warp start.
 START_FIELDS = (
     "qpos",
     "qvel",
@@ -39,7 +39,7 @@ START_FIELDS = (
     "mocap_pos",
     "mocap_quat",
 )
-STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # A step depends on these.
+STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
 # mjtConstraint -> name of a block that is not a contact.
 BLOCK_KINDS = {
     0: "equality",
@@ -48,7 +48,7 @@ BLOCK_KINDS = {
     3: "limit of a joint",
     4: "limit of a tendon",
 }
-PYRAMIDAL_CONTACT = 6  # mjtConstraint of an edge of a pyramidal contact
+PYRAMIDAL_CONTACT = 6  # Value of mjtConstraint of an edge of a pyramidal contact.
 MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
 # If a smaller fraction of the judged steps has contact, no setting is recommended, and an audit warns that its results
 # hardly concern contact: mean times and the error that 1 % of the steps exceed then describe steps without contact.
@@ -209,7 +209,7 @@ def can_any_geoms_collide(mj: Any, model: Any) -> bool:
 
 
 class Divergence(NamedTuple):
-    """The step in which a world diverged: MuJoCo resets the simulation, or ends in an error.
+    """The step in which a world diverged: MuJoCo resets the simulation, or raises an error.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ class Frame(NamedTuple):
     batch : Batch
     impulse : array, N s
     state : dict of (worlds, ...)
-        By the names of MjData.
+        State before the step, by the names of MjData.
     rows : (worlds,) int
         Number of rows that are not padding.
     contacts : (worlds,) int
@@ -255,7 +255,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
     -------
     states : (steps, size)
         Before each step, with controls and warm start (mjSTATE_INTEGRATION); NaN after the step in which the world
-        diverged, and in it if MuJoCo ended in an error.
+        diverged, and in that step if MuJoCo raised an error.
     divergence : Divergence or None
     """
     kind = mj.mjtState.mjSTATE_INTEGRATION
@@ -268,7 +268,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
             mj.mj_step(model, data)
         except mj.FatalError as error:  # MuJoCo is out of memory.
             states[step:] = np.nan
-            return states, Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
+            return states, Divergence(world, step, f"MuJoCo raised an error: {error}", False)
         if has_diverged(mj, data):
             states[step + 1 :] = np.nan
             return states, _find_cause_of_reset(mj, model, data, states[step], world, step)
@@ -297,7 +297,7 @@ def _find_cause_of_reset(
     try:
         mj.mj_forward(model, repeated)
     except mj.FatalError as error:
-        return Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
+        return Divergence(world, step, f"MuJoCo raised an error: {error}", False)
     smooth = np.abs(repeated.qacc_smooth).max(initial=0.0)
     if not smooth <= mj.mjMAXVAL:
         return Divergence(world, step, "acceleration without constraints", True)

@@ -1,4 +1,4 @@
-"""Explain why contacts slip: solve the step of an engine again with one property of its model replaced after the other.
+"""Explain why contacts slip: solve the step of an engine again, replacing one property of its model after the other.
 
     explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
     print(explanation.table); print(explanation.sentence)
@@ -13,9 +13,9 @@ computed from these impulses, each with the replacements of the ones before it:
     coulomb     Coulomb's law in place of the convex relaxation
 
 The difference of two neighbours is the part of the slip that the replaced property causes: unfinished iterations, the
-shape of the cone, softness, the relaxation. The rest is sliding that Coulomb friction cannot prevent, because the load
-along the surface exceeds mu times the normal force. Differences are of vectors, so the parts of one contact can add up
-to more than its speed. If the last problem has several solutions, the range of the speed over the solutions that were
+shape of the cone, compliance, the relaxation. The rest is sliding that Coulomb friction cannot prevent, because the
+load along the surface exceeds mu times the normal force. The parts are norms of vector differences, so the parts of one
+contact can add up to more than its speed. If the last problem has several solutions, the range of the speed over the solutions that were
 found is given.
 """
 
@@ -257,7 +257,7 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
     sliding = np.flatnonzero(problem.cones.n_tangents > 0).tolist()
     if not sliding:
         raise InputError(
-            "the problem has no contact with tangents: nothing can slide (give disk= for pyramids)"
+            "the problem has no contact with tangents: no contact can slide (give disk= for pyramids)"
         )
     if contacts is None:
         return sliding
@@ -407,7 +407,9 @@ def average_slip(explanations: Iterable[SlipExplanation]) -> list[AverageSlip]:
     parts: dict[str, dict[str, float]] = {}
     for explanation in explanations:
         for i, contact in enumerate(explanation.contacts):
-            key = contact.partition(" (")[2].rstrip(")") or contact  # the geoms, without the contact's number
+            key = (
+                contact.partition(" (")[2].rstrip(")") or contact
+            )  # The geoms, without the contact's number.
             speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
             sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
             for cause, sizes in explanation.parts.items():
@@ -424,7 +426,7 @@ def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
     """Return the mean sliding speed of each contact [m/s] in each variant over several steps, and its main cause."""
     explanations = list(explanations)
     names = [variant.name for variant in explanations[0].variants] if explanations else []
-    undefined = {  # variants without values in one of the steps
+    undefined = {  # Variants without values in one of the steps.
         k for e in explanations for k, variant in enumerate(e.variants) if variant.note == UNDEFINED_LAW
     }
     rows = []

@@ -16,10 +16,10 @@ from lavender.lab.slip import CAUSES, SlipExplanation, average_slip
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Colours of Okabe and Ito, which readers with colour-blindness can tell apart, in the order of `CAUSES`.
+# Colours of Okabe and Ito, which colour-blind readers can distinguish, in the order of `CAUSES`.
 CAUSE_COLORS = ("#D55E00", "#CC79A7", "#56B4E9", "#E69F00", "#999999")
 MAX_DRAWN_CONTACTS = 20  # The contacts that slide fastest are drawn.
-WIDTH, BAR_HEIGHT, MARGIN_HEIGHT = 8.0, 0.45, 1.7  # in
+WIDTH, BAR_HEIGHT, MARGIN_HEIGHT = 8.0, 0.45, 1.7  # [inches]
 
 
 def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:

@@ -184,7 +184,7 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     replacements = Counter(pair for pair in skipped if " → " in pair)
     for pair, n in replacements.items():
         cases = format_count(n, "case")
-        yield f"{pair} on {cases} with bounds: the same method; the first takes free rows alone", ""
+        yield f"{pair} on {cases} with bounds: the same method; the first accepts only free rows", ""
     refused = len(skipped) - replacements.total()
     if refused:
         pairs = format_count(refused, "pair")

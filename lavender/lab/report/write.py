@@ -29,7 +29,7 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     Returns
     -------
     Path
-        Of index.html.
+        Path of index.html.
 
     Raises
     ------

@@ -13,8 +13,8 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-GRAVITY = 9.81  # m/s^2, along -z
-STEP_SIZE = 0.01  # s
+GRAVITY = 9.81  # [m/s^2] Along -z.
+STEP_SIZE = 0.01  # [s]
 FALL_SPEED = GRAVITY * STEP_SIZE  # [m/s] Speed that gravity adds in one step.
 
 CONTACT_FRICTION_LAWS = ("none", "coulomb", "cone")
@@ -85,7 +85,7 @@ def build_contact_problem(
         `friction` has another value.
     """
     if friction not in CONTACT_FRICTION_LAWS:
-        raise InputError(f"friction is {friction!r}; {', '.join(CONTACT_FRICTION_LAWS)} are known")
+        raise InputError(f"friction is {friction!r}; {' or '.join(CONTACT_FRICTION_LAWS)} is needed")
     rows = bodies.make_rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)
@@ -127,7 +127,7 @@ def add_horizontal_velocity(bodies: Bodies, speed: float, seed: int = 5) -> None
 
 def guess_static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:
     """Guess the normal impulses (c,) [N s]: the contacts below a body carry equal parts of its load."""
-    z = np.append(bodies.position[:, 2], -np.inf)  # the ground is index -1
+    z = np.append(bodies.position[:, 2], -np.inf)  # The ground has the index -1.
     a, b = contacts.body.T
     upper = np.where(z[b] > z[a], b, a)
     lower = np.where(z[b] > z[a], a, b)

@@ -49,7 +49,7 @@ class Case:
     Parameters
     ----------
     name : str
-        Such as "pyramid(k=10, mass_ratio=1e6)"; `case(name)` builds the case again.
+        A name such as "pyramid(k=10, mass_ratio=1e6)"; `case(name)` builds the case again.
     problem : Problem
     reason : str
         The property that it tests, in one line.
@@ -178,7 +178,7 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
     prefix = f"{name}: {parameter.name} is {value!r}"
     if expected_type is str:
         if not isinstance(value, str):
-            raise InputError(f"{prefix}; a text is needed, such as kind=zero")
+            raise InputError(f"{prefix}; a word is needed, such as kind=zero")
         return value
     converted = check_float(f"{name}: {parameter.name}", value)
     if expected_type is int:

@@ -99,7 +99,7 @@ def solve_linear(problem: Problem) -> FloatArray:
     Raises
     ------
     InputError
-        The refinement does not settle (A is conditioned beyond 1e15), or b is outside the range of A.
+        The refinement does not converge (the condition number of A is above 1e15), or b is outside the range of A.
     """
     operator = ExtendedOperator(problem)
     hi, lo = _solve_rows(problem, operator, np.ones(problem.m, bool), np.zeros(problem.m))
@@ -171,7 +171,7 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
             np.abs(operator.compute_slack(hi, lo)) <= 2.0**-49 * operator.sum_term_magnitudes(hi)
         ) and _is_in_cones(problem, hi):
             return hi
-    raise InputError("no impulses with room for rounding hold the bodies at rest")
+    raise InputError("no impulses with a margin for rounding keep the bodies at rest")
 
 
 def _propose_rest_impulse(problem: Problem, momentum: FloatArray, scale: FloatArray) -> FloatArray | None:
@@ -227,7 +227,7 @@ def _solve_rows(problem: Problem, operator: ExtendedOperator, rows: np.ndarray, 
         result = _refine_to_last_bit(operator, index, start, solve)
         if result is not None:
             return result
-    raise InputError("the refinement does not settle: the rows are singular to float64")
+    raise InputError("the refinement does not converge: the rows are singular to float64")
 
 
 def _refine_to_last_bit(

@@ -158,7 +158,7 @@ def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) ->
     check_min_sizes(1, k=k)
     check_positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
     row = np.repeat(np.arange(k), k - np.arange(k))
-    first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # first box of each row
+    first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # First box of each row.
     column = np.arange(len(row)) - first[row]
     x = 1.1 * (column + 0.5 * row)
     mass = np.ones(len(row))
@@ -235,8 +235,8 @@ def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     ground[:, 3] &= ~ground[:, 2]
     axes = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])
     body: list[tuple[int, int]] = []
-    wall: list[int] = []  # index of the wall, -1 between pebbles
-    draws: list[FloatArray] = []  # 6 random numbers between pebbles, 3 at a wall
+    wall: list[int] = []  # Index of the wall, -1 between pebbles.
+    draws: list[FloatArray] = []  # 6 random numbers between pebbles, 3 at a wall.
     walls_of = [np.flatnonzero(g).tolist() for g in ground]
     random, normal = rng.random, rng.standard_normal
     for a, (face, edge) in enumerate(zip(neighbours(faces), neighbours(edges), strict=True)):
@@ -376,7 +376,7 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
     x = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
     bodies = Bodies(x, [m1, m2], 0.0)
     bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL_SPEED], [0.0, 0.1, -FALL_SPEED]
-    n = x[1] - x[0]  # its length is 1: 0.36 + 0.64
+    n = x[1] - x[0]  # Its length is 1: 0.36 + 0.64 = 1.
     jac = np.concatenate([-n, np.zeros(3), n, np.zeros(3)])[None]
     problem = build_joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
     closing = -drift / 0.01 - n @ (bodies.v_free[1, :3] - bodies.v_free[0, :3])
@@ -400,9 +400,9 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
     """
     n = 8
     if kick < 0.0:
-        raise InputError(f"kick is {kick}; upwards (0 or more) is needed")
+        raise InputError(f"kick is {kick}; 0 (no kick) or more (upwards) is needed")
     if friction not in ("none", "box"):
-        raise InputError(f"friction is {friction!r}; none, box are known")
+        raise InputError(f"friction is {friction!r}; 'none' or 'box' is needed")
     position, pairs, contact_point = place_tower(n)
     bodies = Bodies(position, 1.0, SPHERE)
     bodies.v_free[4, 2] += kick
@@ -427,7 +427,7 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
     # Each eigenvalue has twelve digits, so that the last bits of a library's power function do not matter.
-    a = np.zeros((n, n))  # allocated before the eigenvalues are computed: it may not fit into memory
+    a = np.zeros((n, n))  # Allocated before the eigenvalues are computed, because it may not fit into memory.
     np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
     # Rotate in random planes until every vector has a component along every other.
     for _ in range(4 * n.bit_length()):
@@ -464,7 +464,7 @@ def boxed_friction(
         check_min_sizes(1, n=n)
         bodies, contacts = _build_pile(n, 7)
     else:
-        raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
+        raise InputError(f"scene is {scene!r}; box_stack, pyramid or granular is needed")
     add_horizontal_velocity(bodies, sliding)
     problem = _build_boxed_friction_problem(bodies, contacts)
     return Draft(
@@ -478,7 +478,7 @@ def _build_boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem
     """Build rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
     arm_a, arm_b = contacts.compute_arms(bodies.position)
     n, t = contacts.normal, contacts.compute_tangents()
-    axes = np.stack([n, t, np.cross(n, t)], 1)  # (c, 3, 3)
+    axes = np.stack([n, t, np.cross(n, t)], 1)  # Shape (c, 3, 3).
     moving = (contacts.body >= 0).astype(float)[:, :, None, None]
     jac = np.concatenate([
         -axes * moving[:, 0], -np.cross(arm_a[:, None], axes) * moving[:, 0],

@@ -141,7 +141,9 @@ def four_bar(tilt: float = 0.3) -> Draft:
     """
     anchor = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 1.0], [1.4, 0.0, 1.3], [1.5, 0.0, 0.0]])
     c, s = math.cos(tilt), math.sin(tilt)
-    rotation = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])  # about z, then about x
+    rotation = np.array(
+        [[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]]
+    )  # Rotation about z, then about x.
     anchor = multiply_in_index_order(anchor, rotation.T)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), [1.0, 2.0, 1.0], 0.1)
     body = np.array([[-1, 0], [0, 1], [1, 2], [2, -1]])
@@ -238,7 +240,7 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
     check_min_sizes(2, n=n)
     value = {"zero": 0.0, "negative": -1.0, "negligible": 2.0**-60}.get(kind)
     if value is None:
-        raise InputError(f"kind is {kind!r}; zero, negative, negligible are known")
+        raise InputError(f"kind is {kind!r}; zero, negative or negligible is needed")
     rng = np.random.default_rng(2)
     a = rng.integers(-3, 4, (n, n)).astype(float)
     # The off-diagonal part is skew: A is monotone except for the diagonal.
@@ -313,7 +315,7 @@ def degenerate_lcp(n: int = 40, seed: int = 0, asymmetric: int = 0) -> Draft:
     if asymmetric:
         skew = np.triu(rng.integers(-3, 4, (n, n)), 1).astype(float)
         a += skew - skew.T
-    state = rng.integers(0, 3, n)  # 0: impulse, 1: separating, 2: touching without an impulse
+    state = rng.integers(0, 3, n)  # 0: with an impulse, 1: separating, 2: touching without an impulse.
     impulse = np.where(state == 0, rng.integers(1, 9, n), 0).astype(float)
     slack = np.where(state == 1, rng.integers(1, 9, n), 0).astype(float)
     problem = Problem.lcp(a, a @ impulse - slack)
@@ -343,7 +345,7 @@ def infeasible(kind: str = "squeeze") -> Draft:
         )
         proof = np.array([1.0, -1.0])
     else:
-        raise InputError(f"kind is {kind!r}; squeeze, joints are known")
+        raise InputError(f"kind is {kind!r}; squeeze or joints is needed")
     return Draft(
         problem,
         "no impulse satisfies it: CONVERGED would be wrong, INFEASIBLE needs a proof",

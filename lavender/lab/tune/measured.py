@@ -68,7 +68,7 @@ class Measured:
     error : (steps,) m/s
     motion : (stretches,) m
     times : (steps,) s
-        Each the minimum of all repeats, which removes interruptions.
+        Each time is the minimum of all repeats, which removes interruptions.
     rows, contacts : (steps,) int
     """
 
@@ -108,7 +108,7 @@ class Schedule:
     def __init__(self, watch: Callable[[Event], None] | None) -> None:
         self.watch = watch
         self.done = 0
-        self.loads: list[float | None] = []  # number of runnable processes at each timing
+        self.loads: list[float | None] = []  # Number of runnable processes at each timing.
         self._expected = dict.fromkeys(MEASUREMENTS, 0)
         self._reserved = dict.fromkeys(MEASUREMENTS, 0)
         self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}

@@ -114,9 +114,7 @@ class Tuning:
         if self.sizes is None or self.sizes.has_enough_contact:
             return ""
         if not self.sizes.can_touch:
-            return (
-                f"No setting is recommended: {self.sizes.contact_phrase}, and settings do not matter without."
-            )
+            return f"No setting is recommended: {self.sizes.contact_phrase}, and settings have no effect without contact."
         return (
             f"No setting is recommended: {self.sizes.contact_phrase}. A setting that is fast and accurate without "
             "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
@@ -247,11 +245,13 @@ class Tuning:
             [
                 PageSection("Provisional lines" if self.reason_provisional else "Lines to copy", code=self.lines,
                      note=self._lines_note),
-                PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
+                PageSection("Rows and contacts", sizes, short=2,
+                     note="Rows and contacts of the steps with the model's own setting."),
                 PageSection("The front of time and error", [self._table(shown)], figures, short=5),
                 PageSection("Other problems", [self._table(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
-                PageSection("Every setting", [self._table(every)], note="Without those with which a world diverges."),
+                PageSection("Every setting", [self._table(every)],
+                     note="Settings with which a world diverges are left out."),
             ],
             {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
              **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,

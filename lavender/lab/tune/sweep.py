@@ -88,7 +88,8 @@ def tune(
         The model cannot be read, the engine is not installed, there are fewer than two worlds, or `horizon` does not
         divide `steps`.
     CapabilityError
-        The problem of the model's integrator is not one of M, or a world has more rows than the engine has memory for.
+        The integrator's constraint problem uses a matrix other than M, or a world has more rows than the engine has
+        memory for.
     UnknownName
         The engine is unknown.
     """
