@@ -72,7 +72,7 @@ def audit(
     if options["engine"] in CLAIM_ENGINES:
         if is_option_set(context, "control"):
             raise InputError(
-                f"--controls is for models of MuJoCo; the scene of {options['engine']} sets its own"
+                f"--controls needs a model of MuJoCo; the scene of {options['engine']} sets its own controls"
             )
         _audit_claims(context, model, out, max_velocity_error, options)
         return

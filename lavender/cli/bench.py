@@ -76,7 +76,7 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         lines += [json.dumps(asdict(w)) for w in consecutive]
         write_text(out, "\n".join(lines) + "\n")
     if not measured and not consecutive:
-        raise InputError("no step of these models had a problem to solve: more steps, or other models")
+        raise InputError("no step of these models had a problem to solve: give more steps, or other models")
     if measured:
         print_escaped(format_time_ratio_table(measured))
     if consecutive:

@@ -23,7 +23,10 @@ from lavender.cli.options import (
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @click.option("--solvers", type=ListType(str), help="Solvers by name; default: all that accept the problem.")
 @click.option(
-    "--reference", default="osqp", show_default=True, help="Solver with whose result the others are compared."
+    "--reference",
+    default="osqp",
+    show_default=True,
+    help="Reference solver, with which the others are compared.",
 )
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
@@ -59,7 +62,7 @@ def check(
     for name in files:
         if name.endswith(".jsonl"):
             raise InputError(
-                f"{name}: problems are checked, not records; `lavender report {name}` shows them again"
+                f"{name} holds records; only problems can be checked. `lavender report {name}` shows them again"
             )
     contradicted = unaccepted = solutions = above = unmet = 0
     errors = ErrorReporter(partial(print_escaped, style="yellow"))
@@ -86,7 +89,7 @@ def check(
     if contradicted:
         print_escaped(f"{contradicted} claims are contradicted", style="bold red")
     if unaccepted:
-        print_escaped(f"{unaccepted} problems are accepted by none of these solvers", style="bold red")
+        print_escaped(f"{unaccepted} problems are not accepted by any of these solvers", style="bold red")
     if judges_stored and not solutions:
         raise InputError("--precision, --threshold: no file has a solution to judge (an entry `impulse`)")
     if solutions:

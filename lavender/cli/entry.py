@@ -48,7 +48,7 @@ class Commands(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Reject an empty argument, which would mean the current folder, then parse as click does."""
         if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
-            raise click.UsageError("an empty argument: is a variable of the shell not set?", ctx)
+            raise click.UsageError("an argument is empty: is a variable of the shell not set?", ctx)
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -183,5 +183,5 @@ def _explain_os_error() -> str:
     try:
         os.getcwd()
     except OSError:
-        return " (the working directory is gone: change to a folder that is there)"
+        return " (the working directory no longer exists: change to another folder)"
     return ""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from lavender.lab.bench import Item
 
-    _ParamType = click.ParamType[Any]  # generic for type checkers since click 8.2, never for click 8.1
+    _ParamType = click.ParamType[Any]  # Generic for type checkers since click 8.2, but not in click 8.1.
 else:
     _ParamType = click.ParamType
 
@@ -265,7 +265,7 @@ def reject_options_without_effect(context: click.Context, solvers: Sequence[str]
 #: Option of commands that judge solutions of an engine.
 precision_option = click.option(
     "--precision", type=click.Choice(["float64", "float32"]),
-    help="Precision in which the engine computed its solutions; default: that of the problem, or float64.",
+    help="Precision in which the engine computed its solutions; default: the precision of the problem, or float64.",
 )  # fmt: skip
 THRESHOLD: Option = (("--threshold",), {
     "type": float, "default": 1e-6, "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
@@ -281,7 +281,7 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--states",), {"default": None, "metavar": "FILE|keyframes",
                      "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
                      "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
-                     "arrays of MjData, such as `lavender audit` writes. keyframes: those of the model."}),
+                     "arrays of MjData, such as `lavender audit` writes. keyframes: the keyframes of the model."}),
 )  # fmt: skip
 RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")  # Parameter names.
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
@@ -350,7 +350,7 @@ def print_escaped(text: str, err: bool = False, style: str = "") -> None:
 
 def exit_after_interrupt() -> NoReturn:
     """Exit a command after Ctrl-C, once the completed part is written."""
-    print_escaped("Stopped: the results are those of the completed part.", style="yellow")
+    print_escaped("Stopped: the results contain only the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 

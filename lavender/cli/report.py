@@ -118,7 +118,9 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
     records_files = [f for f in files if f.endswith(".jsonl")]
     if records_files:
         if len(files) > 1:
-            raise InputError("a records.jsonl is shown alone: give one file, without problems")
+            raise InputError(
+                "a records.jsonl cannot be combined with problems or other records: give one file"
+            )
         measured = Measured(bench.read_records(records_files[0]), False)
         if not (measured.records.records or measured.records.skips):
             raise InputError(f"{records_files[0]} has no records")

@@ -106,7 +106,7 @@ def run(
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({resolve_destination(path) for path in files.values()}) < len(files):
-        raise InputError(f"{', '.join(map(str, files.values()))}: each needs a file of its own")
+        raise InputError(f"{', '.join(map(str, files.values()))}: each needs a different file")
     for path in files.values():
         check_writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES

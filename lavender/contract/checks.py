@@ -523,9 +523,9 @@ def require_a_solution_as_start_is_kept(spec: SolverSpec) -> None:
 def require_a_normal_without_inverse_mass_bears_friction(spec: SolverSpec) -> None:
     """Require that a normal with a zero row of A may bear the friction of the relaxed law.
 
-    There w_n = mu |w_t| > 0 beside lambda_n > 0.
+    The solution then has w_n = mu |w_t| > 0 and lambda_n > 0.
     """
-    b, impulse = np.array([-0.5, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])  # w = (0.5, -1, 0) m/s
+    b, impulse = np.array([-0.5, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])  # The slack is w = (0.5, -1, 0) m/s.
     problems = [
         Problem.contact(np.diag([0.0, 1.0, 1.0]), b, [0.5], friction="cone"),
         Problem.from_jacobian(

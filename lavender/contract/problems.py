@@ -75,7 +75,7 @@ def random_bodies_and_contacts(
     joint_body = np.array([draw_pair() for _ in range(joints)], np.int32).reshape(-1, 2)
     jac = rng.normal(size=(ptr[-1], 12))
     if joints:
-        jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0  # angular rows
+        jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0  # The other half of the rows are angular.
     jac[np.repeat(joint_body[:, 0], sizes) < 0, :6] = 0.0
     normal = np.array([random_unit_vector(rng) for _ in range(contacts)]).reshape(-1, 3)
     tangent = np.array([np.cross(n, random_unit_vector(rng)) for n in normal]).reshape(-1, 3)

@@ -206,7 +206,9 @@ def _load_problem(records: Records, record: Record) -> lv.Problem:
     problem = bench.resolve_sources([source])[0].problem
     present_hash = hash_problem(problem)
     if present_hash != record.sha:
-        raise InputError(f"{source} is another problem here, hash {present_hash}; measured was {record.sha}")
+        raise InputError(
+            f"{source} now holds another problem, with the hash {present_hash}; the measured one has {record.sha}"
+        )
     return problem
 
 
@@ -243,7 +245,7 @@ def make_test_vector(
     packed_problem = pack_problem(problem)
     if not steps:
         raise NotSupported(
-            f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
+            f"{solver} of the library does not accept {problem.name or 'this problem'}: see lav_takes"
         )
     impulse, relative = solution.impulse, solution.residual.relative
     if solver == "newton" and (problem.generalized is None or form == "velocity"):
@@ -271,7 +273,7 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[F
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
     driver, outcome = Driver(problem.metric), OUTCOMES["more"]
     if not driver.fits:
-        raise NotSupported("the compiled driver of newton does not take this problem")
+        raise NotSupported("the compiled driver of newton does not accept this problem")
     driver.start(impulse, tol, budget)
     while outcome in (OUTCOMES["more"], OUTCOMES["certificate"]):
         outcome = driver.step(10**6, impulse)

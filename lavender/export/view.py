@@ -69,7 +69,9 @@ def make_problem_view(problem: Problem) -> ProblemView:
     """
     c = problem.cones
     if c.has_ellipse:
-        raise NotSupported("the library has no ellipses: give it the same in longer rows, `problem.disk`")
+        raise NotSupported(
+            "the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents"
+        )
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}

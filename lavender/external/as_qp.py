@@ -53,13 +53,15 @@ from lavender.problem import Problem
 
 PROGRAM_FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
-MAX_BACKEND_NUMBER = 1e20  # Backends treat numbers from here on as infinite, or fail.
+MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
 # A row with a larger scaled |b| is assumed to stay at its bound: backends lose as many digits as the largest b has,
 # and active rows have b near 1. If the assumption fails, the backend is called once more with all rows.
 MAX_SCALED_RHS = 1e2
 # [-] As MAX_SCALED_RHS, for the program form. It is larger, because |x| often exceeds the active bounds.
 MAX_SCALED_PROGRAM_RHS = 1e6
-VELOCITY_FORM_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is more accurate at all sizes.
+VELOCITY_FORM_MASS_RATIO = (
+    1e3  # At and above this mass ratio, the velocity form is more accurate at all sizes.
+)
 
 
 @dataclass(frozen=True)
@@ -471,7 +473,7 @@ def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
     velocity_map = sp.csr_matrix(sp.hstack([jac[unknown], root_theta]))
     ny = velocity_map.shape[1]
     g = form.rhs[unknown] / sigma
-    # kinds of bounded rows
+    # Kinds of bounded rows.
     low, high = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
     rows = scaled.map_friction_rows()
     is_bounded_row = np.ones(k, bool)
@@ -483,7 +485,7 @@ def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
     upper = np.flatnonzero(is_bounded_row & ~has_low & has_high)
     shift = np.zeros(k)
     shift[lower], shift[upper] = low[lower], high[upper]
-    # rows A = -T^T K~ and entries of t
+    # Rows A = -T^T K~, and entries of t.
     columns_of_t, t_entries, n, n_normals = _build_velocity_rows(rows, free, lower, both, upper, ny)
     multiplier_map = sp.csr_matrix(columns_of_t.build_matrix(k).T)
     velocities = sp.hstack(
@@ -602,7 +604,7 @@ def build_program_form(problem: Problem, *, fix_far_rows: bool = False) -> Progr
     # and columns balanced twice, piqp 0.7 reported that a feasible public program is infeasible.
     row_size = abs(problem.csr[unknown]).max(axis=1).toarray().ravel()
     root = 1.0 / np.sqrt(row_size)
-    # violation of the rows at x = 0
+    # Violation of the rows at x = 0.
     violation = np.where(
         unknown < n + qp.free, np.abs(problem.b[unknown]), np.maximum(problem.b[unknown], 0.0)
     )
@@ -682,7 +684,7 @@ def _build_velocity_rows(
         Number of normals that are bounded by a sum of t only.
     """
     columns, t_entries = _RowBuilder(), _RowBuilder()
-    # bounded rows; those with both bounds have a t
+    # Bounded rows; a row with both bounds has an unknown t.
     t_of_row = {int(i): ny + j for j, i in enumerate(both)}
     n = ny + len(both)
     for i in free:
@@ -694,7 +696,7 @@ def _build_velocity_rows(
     for i in upper:
         columns.add_row([(int(i), -1.0)])
         t_entries.add_row([])
-    # friction rows with a bound of their own: t >= |w_t|
+    # Friction rows with a separate bound: t >= |w_t|.
     t_of_normal: dict[int, list[tuple[int, float]]] = {}
     for normal, tangent, ratio in rows.pairs:
         t_of_normal.setdefault(normal, []).append((n, ratio))
@@ -702,19 +704,19 @@ def _build_velocity_rows(
             columns.add_row([(tangent, sign)])
             t_entries.add_row([(n, -1.0)])
         n += 1
-    # second disk of a contact: t >= |w|
+    # Second disk of a contact: t >= |w|.
     t_of_disk: dict[int, int] = {}
     for k_disk, disk in enumerate(rows.disks):
         if any(d.normal == disk.normal for d in rows.disks[:k_disk][-1:]):
             t_of_normal.setdefault(disk.normal, []).append((n, 1.0))
             t_of_disk[k_disk] = n
             n += 1
-    # normals without a disk: w_n >= sum of t
+    # Normals without a disk: w_n >= sum of t.
     normals = [normal for normal in t_of_normal if normal not in {d.normal for d in rows.disks}]
     for normal in normals:
         columns.add_row([(normal, 1.0)])
         t_entries.add_row(t_of_normal[normal])
-    # disks, as second-order cones
+    # Disks, as second-order cones.
     for k_disk, disk in enumerate(rows.disks):
         t = t_of_disk.get(k_disk)
         columns.add_row([(disk.normal, 1.0)] if t is None else [])
@@ -779,7 +781,7 @@ def make_bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]
     Returns
     -------
     list of (sign, rows of the identity, h, indices)
-        For upper bounds, then for lower bounds; else empty.
+        One entry for the upper and one for the lower bounds, if there are any.
     """
     if qp.lb is None or qp.ub is None:
         return []

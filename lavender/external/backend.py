@@ -103,7 +103,7 @@ def _call_through_qpsolvers(
     if backend.warm:
         settings.update(_make_warm_start_settings(backend.name, qp, impulse))
     settings.update(extra)
-    # equality rows, then inequality rows
+    # Equality rows, then inequality rows.
     z = qp.n_zero
     dense = backend.dense
     p = qp.P.toarray() if dense else qp.P
@@ -129,7 +129,7 @@ def _call_through_qpsolvers(
         return Answer(
             Status.NUMERICAL_ERROR, f"qpsolvers ran LSQR in place of {backend.name}; its answer is not used"
         )
-    # iterate and multipliers
+    # The iterate and the multipliers.
     extras = solution.extras or {}
     status, status_text = _get_status(solution, extras)
     zeta = np.zeros(len(qp.b))

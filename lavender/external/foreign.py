@@ -95,7 +95,7 @@ class Foreign(Solver):
         error = (
             ""
             if is_valid
-            else f"made of the impulse an array of shape {iterate.shape} and dtype {iterate.dtype}"
+            else f"changed the impulse to an array of shape {iterate.shape} and dtype {iterate.dtype}"
         )
         return self._check_claim(claim, error, len(impulse), max_iter)
 
@@ -115,7 +115,9 @@ class Foreign(Solver):
                 or "claims the status INVALID_PROBLEM, which only `solve_many` returns, for invalid data"
             )
         elif not _is_count(claim.iterations):
-            error = error or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
+            error = (
+                error or f"claims {claim.iterations!r:.60} iterations; a whole number of at least 0 is needed"
+            )
         elif iterations > max_iter:
             error = error or f"claims {iterations} iterations, more than the limit of {max_iter}"
         elif not isinstance(work, Mapping) or not all(

@@ -28,7 +28,7 @@ from lavender.problem import Problem
 ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
 MAX_BACKEND_MESSAGE_LENGTH = 500  # [characters] Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
-ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
+ENTRY_SIZE = 12.0  # [bytes] Size of one matrix entry of a program in a request.
 TRANSFER_RATE = 3e8  # [bytes/s] Programs that would take longer to send than the limit time out.
 
 #: Running processes that have no call. A thread that takes one is its only user.
@@ -56,7 +56,7 @@ class IsolatedBackend:
         answer = call_backend(self.backend, qp, impulse, limit, settings)
         if answer is None:
             return self.backend.run(qp, impulse, limit, settings)
-        self.manner = "in a process of its own"
+        self.manner = "in a separate process"
         return answer
 
 
@@ -75,7 +75,7 @@ def call_backend(
     assert limit.time_limit is not None
     if qp.nbytes > TRANSFER_RATE * limit.time_limit:
         return Answer(
-            Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
+            Status.TIME_LIMIT, "ended at the time limit: sending the program to the process would take longer"
         )
     process = _take_idle_process()
     if process is None:
@@ -139,7 +139,7 @@ if hasattr(os, "register_at_fork"):  # Windows has none. A forked process must n
 
 # -- in the other process -----------------------------------------------------------------------------
 
-_warmed_up: set[str] = set()  # names of the backends that were warmed up
+_warmed_up: set[str] = set()  # Names of the backends that were warmed up.
 
 
 def run_backend(

@@ -79,7 +79,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     xi = merge_bound_multipliers(qp, z[first:])
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     if almost and any(part is not None for part in keep_if_infeasibility_certificate(qp, x, zeta)):
-        status = Status.INFEASIBLE  # its own test is stricter than the certificate needs
+        status = Status.INFEASIBLE  # The solver's own test is stricter than the certificate needs.
     # One factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
     return Answer(
@@ -192,7 +192,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         settings["time_limit"] = limit.time_limit
     for key, value in {**settings, **extra}.items():
         if solver.setOptionValue(key, value) != highspy.HighsStatus.kOk:
-            raise InputError(f"highs does not take the setting {key}={value!r}")
+            raise InputError(f"highs does not accept the setting {key}={value!r}")
     solver.passModel(model)
     solver.run()
     status = solver.getModelStatus()
@@ -251,7 +251,7 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         "check_dualgap": False,  # OSQP's multipliers are complementary by construction.
         "check_termination": 25,
         "adaptive_rho": True,
-        "adaptive_rho_interval": 50,  # in iterations; an interval in time would make results irreproducible
+        "adaptive_rho_interval": 50,  # [iterations] An interval in time would make results irreproducible.
         "verbose": False,
     }
     if limit.time_limit is not None:

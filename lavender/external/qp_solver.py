@@ -32,7 +32,7 @@ FORM_COST = 1e6  # [ns] Forming any program costs up to this, 1.5 times the meas
 FORM_ENTRY_COST = 120.0  # [ns] Additional cost for each entry of A, 1.5 times the measured time.
 OPTION_HELP = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
-    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend; not of programs",
+    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default: by size, mass ratio and backend); not for programs",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping of the backend's options; they override the options that tol determines",
 }
@@ -83,12 +83,12 @@ class QPSolver(Solver):
             )
         if len(qp.unknown_rows) and qp.is_bounds_only and not b.linear:
             raise CapabilityError(
-                f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
-                "use direct or another backend"
+                f"solver {b.name!r} does not accept problems without inequalities, because qpsolvers "
+                "passes them to LSQR; use direct or another backend"
             )
         if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > MAX_DENSE_SIZE:
             raise CapabilityError(
-                f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
+                f"solver {b.name!r} accepts dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
                 f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
         return qp
@@ -130,7 +130,7 @@ class QPSolver(Solver):
         if time_limit is None or b.stoppable:
             return claim
         manner = "to its end" if isolated is None else isolated.manner
-        return replace(claim, message=f"{claim.message}; takes no time limit and ran {manner}")
+        return replace(claim, message=f"{claim.message}; the backend accepts no time limit and ran {manner}")
 
     def start_workers(self, qp: QP, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""

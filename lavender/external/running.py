@@ -330,7 +330,7 @@ class _SharedContext:
 
     def __init__(self, make_context: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
         self._make_context, self._lock, self._n_threads = make_context, threading.Lock(), 0
-        if hasattr(os, "register_at_fork"):  # not on Windows
+        if hasattr(os, "register_at_fork"):  # Windows cannot fork.
             os.register_at_fork(
                 before=self._lock.acquire, after_in_parent=self._lock.release, after_in_child=self._reset
             )

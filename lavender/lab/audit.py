@@ -76,8 +76,8 @@ MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
     "Errors of the worst row of each judged step. At its floor: rounding explains the error, in the engine's "
     "precision. Close enough: no row has a larger error than the threshold. Stopped before convergence, or wrong: all "
-    "others. Not judged: the engine's answer is not finite, or the world diverged before. The errors are of the engine's "
-    "forces: the accelerations by which MuJoCo's Newton and CG move bodies are usually more accurate."
+    "others. Not judged: the engine's answer is not finite, or the world diverged before. The errors are of the "
+    "engine's forces: the accelerations by which MuJoCo's Newton and CG move bodies are usually more accurate."
 )
 SIZES_NOTE = "Rows and contacts of the steps judged."
 FILES_NOTE = (

@@ -15,8 +15,8 @@ computed from these impulses, each with the replacements of the ones before it:
 The difference of two neighbours is the part of the slip that the replaced property causes: unfinished iterations, the
 shape of the cone, compliance, the relaxation. The rest is sliding that Coulomb friction cannot prevent, because the
 load along the surface exceeds mu times the normal force. The parts are norms of vector differences, so the parts of one
-contact can add up to more than its speed. If the last problem has several solutions, the range of the speed over the solutions that were
-found is given.
+contact can add up to more than its speed. If the last problem has several solutions, the range of the speed over the
+solutions that were found is given.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Scenes, the step of an engine, and its page in a browser: the floor above files and importers."""
+"""Scenes, the steps of an engine, and its page in a browser: the layer above files and importers."""

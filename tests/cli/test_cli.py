@@ -43,7 +43,7 @@ def test_check_ends_each_solver_at_its_time_limit(lavender):
 
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
-    assert code == cli.EXIT_UNMET and "1 problems are accepted by none of these solvers" in out
+    assert code == cli.EXIT_UNMET and "1 problems are not accepted by any of these solvers" in out
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
 
 
@@ -135,7 +135,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
         (("report", "--tolerances", "0"), "tolerance is 0;"),
-        (("report", "a.jsonl", "b.npz"), "shown alone"),
+        (("report", "a.jsonl", "b.npz"), "cannot be combined with problems"),
         (("report", "missing.jsonl"), "cannot read"),
         (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
         (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
@@ -176,9 +176,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
         (("report", "a.xml", "--seed", "3", "--controls", "zero"), "without --controls random"),
         (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
-        (("check", ""), "an empty argument"),
-        (("check", "a.jsonl"), "problems are checked, not records"),
-        (("report", "stack(n=4)", "--out", ""), "an empty argument"),
+        (("check", ""), "an argument is empty"),
+        (("check", "a.jsonl"), "only problems can be checked"),
+        (("report", "stack(n=4)", "--out", ""), "an argument is empty"),
         (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),

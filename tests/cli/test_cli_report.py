@@ -155,7 +155,7 @@ def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     lv.Problem.lcp(2.0 * mine.dense(), np.ones(9)).save(tmp_path / "ring.npz")
     code, _, err = lavender(*command)
-    assert code == cli.EXIT_BAD_INPUT and "is another problem here" in err
+    assert code == cli.EXIT_BAD_INPUT and "now holds another problem" in err
     mine.save(tmp_path / "ring.npz")
     before["vectors.bin"] = b"mine"
     (out / "vectors.bin").write_bytes(b"mine")

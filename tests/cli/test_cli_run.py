@@ -58,7 +58,7 @@ def test_two_outputs_of_a_run_are_not_one_file(lavender, tmp_path, names):
     (tmp_path / "sub").mkdir()
     plot, film = (tmp_path / name for name in names)
     code, out, err = lavender("run", "spinner", "--steps", "2", "--plot", plot, "--film", film)
-    assert (code, out) == (2, "") and "each needs a file of its own" in err
+    assert (code, out) == (2, "") and "each needs a different file" in err
     assert not (tmp_path / "x.png").exists()
     code, out, _ = lavender("run", "spinner", "--steps", "2", "--plot", plot)
     assert not code and f"figure: {tmp_path / 'x.png'}" in out

@@ -114,7 +114,7 @@ class Tuning:
         if self.sizes is None or self.sizes.has_enough_contact:
             return ""
         if not self.sizes.can_touch:
-            return f"No setting is recommended: {self.sizes.contact_phrase}, and settings have no effect without contact."
+            return f"No setting is recommended: {self.sizes.contact_phrase}; without contact settings have no effect."
         return (
             f"No setting is recommended: {self.sizes.contact_phrase}. A setting that is fast and accurate without "
             "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."

@@ -102,7 +102,9 @@ def tune(
         raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
     if engine == "kamino":
         if control != "random":
-            raise InputError("control is for models of MuJoCo; a scene of kamino sets its own: leave it out")
+            raise InputError(
+                "control needs a model of MuJoCo; a scene of kamino sets its own controls: leave it out"
+            )
         start = {"states": states, "spread": spread, "seed": seed}
         return measure_settings(
             lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),

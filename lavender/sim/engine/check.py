@@ -37,7 +37,7 @@ def check_state_sizes(own: State, size: np.ndarray) -> None:
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
-        raise _make_damaged_state_error("its sizes are not those of this scene")
+        raise _make_damaged_state_error("its sizes differ from the sizes of this scene")
 
 
 def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
@@ -55,10 +55,10 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     a, b = own.a, new.a
     for name in GIVEN:
         if a[name].tobytes() != b[name].tobytes():
-            raise _make_damaged_state_error(f"{name} is not that of this scene")
+            raise _make_damaged_state_error(f"{name} differs from the value of this scene")
     kj = int(own.size[SIZE["joints"]])
     if not np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1]):
-        raise _make_damaged_state_error("the rows of the joints are not those of this scene")
+        raise _make_damaged_state_error("the rows of the joints differ from the rows of this scene")
     settings = np.ones(len(own.setting), bool)
     for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
@@ -99,7 +99,7 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
             raise _make_damaged_state_error(f"{name} is {new.head[HEAD[name]]}, not {low} to {high}")
     for name in FIXED_HEAD:
         if new.head[HEAD[name]] != own.head[HEAD[name]]:
-            raise _make_damaged_state_error(f"{name} is not that of this scene")
+            raise _make_damaged_state_error(f"{name} differs from the value of this scene")
 
 
 def _check_contacts(new: State) -> None:
@@ -110,7 +110,7 @@ def _check_contacts(new: State) -> None:
     per, n = int(size[SIZE["rows_per_contact"]]), int(size[SIZE["bodies"]])
     cached = b["cache_key"][: new.head[HEAD["cached"]]] >> np.uint64(16)
     if (cached[1:] < cached[:-1]).any() or (cached >> np.uint64(24) >= n).any():
-        raise _make_damaged_state_error("cache_key is not in order")
+        raise _make_damaged_state_error("cache_key is not sorted")
     if not new.head[HEAD["solved"]]:
         return
     ptr = b["ptr"][kj : kj + c + 1].astype(np.int64)
@@ -144,13 +144,13 @@ def _check_numbers(own: State, new: State) -> None:
             raise _make_damaged_state_error(f"{name} is not finite")
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE).all():
-            raise _make_damaged_state_error("q holds a quaternion that is not of length 1")
+            raise _make_damaged_state_error("q holds a quaternion that does not have length 1")
     static = b["dyn"] < 0
     if b["v"][static].any():
         raise _make_damaged_state_error("v gives a static body a velocity")
     even = ~b["uneven"][b["body_of"]].astype(bool)
     if b["inv_inertia"][even].tobytes() != own.a["inv_inertia"][even].tobytes():
-        raise _make_damaged_state_error("inv_inertia is not that of this scene")
+        raise _make_damaged_state_error("inv_inertia differs from the value of this scene")
 
 
 def _make_damaged_state_error(reason: str) -> InputError:
@@ -169,6 +169,6 @@ def check_snapshot_fields(snapshot: Any) -> None:
     for name, dtype in (("size", np.int32), ("real", np.float64), ("index", np.int32), ("keys", np.uint64)):
         x = getattr(snapshot, name)
         if not isinstance(x, np.ndarray) or x.dtype != dtype or x.ndim != 1:
-            raise _make_damaged_state_error(f"{name} is no vector of {np.dtype(dtype).name}")
+            raise _make_damaged_state_error(f"{name} is not a vector of {np.dtype(dtype).name}")
     if len(snapshot.size) != N_SIZES:
         raise _make_damaged_state_error(f"size has {len(snapshot.size)} entries, not {N_SIZES}")

@@ -44,7 +44,7 @@ def get_picture_suffix(path: str | PathLike[str]) -> str:
     if suffix.lower() not in PICTURES:
         raise InputError(f"{str(path)!r} ends in {suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
     if suffix.lower() == ".mp4" and which("ffmpeg") is None:
-        raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
+        raise InputError("an .mp4 needs ffmpeg, which is not installed; give a .gif")
     return suffix.lower()
 
 

@@ -118,8 +118,8 @@ class Simulation(Stepping):
         -------
         dict
             relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s], bound [sqrt J] and
-            bound_speed [m/s]; a value that cannot be computed is None. open [m/s]: the distance of those two solutions,
-            0 without friction.
+            bound_speed [m/s]; a value that cannot be computed is None. open [m/s]: the distance between those two
+            solutions, 0 without friction.
 
         Raises
         ------
@@ -357,7 +357,7 @@ class Simulation(Stepping):
                 f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())"
             )
         if snapshot.fingerprint != self._fingerprint:
-            raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
+            raise InputError("the snapshot belongs to another scene: bodies, joints or parameters differ")
         check_snapshot_fields(snapshot)
         size = snapshot.size.copy()
         check_state_sizes(self.state, size)
@@ -370,9 +370,7 @@ class Simulation(Stepping):
         lost = snapshot.lost
         check_state(self.state, state, self._sweeps, bool(lost))
         if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
-            raise InputError(
-                f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"
-            )
+            raise InputError(f"the snapshot is damaged: {lost[:40]!r} is not the body with the lost state")
         self.state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
         self._last, self._end_reason = None, ""

@@ -90,7 +90,7 @@ class Snapshot:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"the snapshot {str(path)!r} cannot be read: {error}") from None
-            raise InputError(f"the snapshot {str(path)!r} does not hold what its header says") from None
+            raise InputError(f"the snapshot {str(path)!r} does not match its header") from None
         return snapshot
 
     @classmethod

@@ -82,7 +82,7 @@ class State:
             raise InputError(
                 f"{self.size[SIZE['bodies']]} bodies with memory for {self.size[CAP_PAIR]} pairs and "
                 f"{self.size[CAP_CONTACT]} contacts need more than the {MAX_BUFFER_BYTES >> 30} GiB that a simulation "
-                "may take: move the bodies apart or take fewer"
+                "may take: move the bodies apart, or use fewer bodies"
             )
         self.real = np.zeros(used[0])
         self.index = np.zeros(used[1], np.int32)
@@ -181,8 +181,8 @@ class State:
         per = 1 + 2 * rough + spin + 2 * rolling
         if p.friction_shape == "box" and (spin or rolling):
             raise InputError(
-                "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has no spin friction, and none "
-                "against rolling; leave one of the two out"
+                "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has neither torsional nor "
+                "rolling friction; leave one of the two out"
             )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())

@@ -224,7 +224,9 @@ class Stepping:
         if body not in self._names:
             raise UnknownName("body", body, self._names)
         if self._names.count(body) > 1:
-            raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
+            raise InputError(
+                f"{self._names.count(body)} bodies are named {body!r}; give the number of the body"
+            )
         return self._names.index(body)
 
     @run_exclusively
@@ -501,7 +503,7 @@ class Stepping:
     def _rebuild_last_problem(self) -> tuple[Problem, FloatArray]:
         """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""
         if not self.state.head[HEAD["solved"]]:
-            raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
+            raise InputError("no step has been done yet, or the last one was stopped: call step() first")
         problem = self._build_problem(self.state)
         return problem, self.state.a["impulse"][: problem.m].copy()
 

@@ -259,11 +259,10 @@ def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
     value = np.linalg.eigvalsh(x)
     if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
         raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")
-    if value[2] > (1.0 + PLATE_MOMENT_TOLERANCE) * (
-        value[0] + value[1]
-    ):  # I_3 = sum m (x_1^2 + x_2^2) <= I_1 + I_2
+    # Every body satisfies I_3 = sum m (x_1^2 + x_2^2) <= I_1 + I_2.
+    if value[2] > (1.0 + PLATE_MOMENT_TOLERANCE) * (value[0] + value[1]):
         raise InputError(
-            f"inertia of {label} has moments {value.tolist()} kg m^2; the largest is at most the sum of the others, as "
-            "of a flat plate: no body has more"
+            f"inertia of {label} has moments {value.tolist()} kg m^2; the largest may be at most the sum of the "
+            "others (a flat plate has exactly this sum)"
         )
     return x

@@ -172,11 +172,12 @@ class Parameters:
         check_name("order", self.order, SCENE_ORDERS)
         if self.order != "given" and not own:
             raise InputError(
-                f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
+                f"order={self.order!r} needs sequential_impulses; give {self.solver} its order in solver_options"
             )
         if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
             raise InputError(
-                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or take 'impulses'"
+                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or give "
+                "stepper='impulses'"
             )
         projections: Any = self.position_iterations
         if projections is None:
@@ -195,12 +196,13 @@ class Parameters:
         if self.solver != "sequential_impulses":
             if not stepper.solvers:
                 raise InputError(
-                    f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
+                    f"stepper {stepper.name!r} does not use the solver {self.solver!r}: leave solver= out, "
+                    "or give stepper='impulses'"
                 )
             return check_int("solver_iterations", spec.max_iter if sweeps is None else sweeps, 1)
         if self.solver_options:
             raise InputError(
-                f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
+                f"solver_options {sorted(self.solver_options)} need another solver; sequential_impulses "
                 "takes order= and seed= of the scene"
             )
         return 16 if sweeps is None else check_int("solver_iterations", sweeps, *stepper.sweeps)
@@ -429,7 +431,7 @@ class Scene:
         q = check_numbers(f"quaternion of {label}", quaternion, 4)
         unit_q = normalise(q, 1e-12)
         if unit_q is None:
-            raise InputError(f"quaternion of {label} is {q.tolist()}; one that is not zero is needed")
+            raise InputError(f"quaternion of {label} is {q.tolist()}; a nonzero quaternion is needed")
         v = check_numbers(f"velocity of {label} [m/s]", velocity, 3)
         omega = check_numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
         if static and (v.any() or omega.any()):
@@ -532,7 +534,7 @@ class Scene:
             else _check_common_point(label, *ends)
         )
         if (axis is None) == (kind == HINGE):
-            raise InputError(f"{label}: axis= goes with a hinge, and a hinge needs one")
+            raise InputError(f"{label}: axis= is needed for a hinge, and for no other joint")
         world_axis = (
             check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
         )
@@ -579,7 +581,7 @@ class Scene:
     ) -> tuple[FloatArray, FloatArray, float]:
         """Return the anchors (3,) [m] and the length [m] of a distance joint."""
         if anchor is not None or axis is not None:
-            raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
+            raise InputError(f"{label} takes anchor_a and anchor_b; leave anchor and axis out")
         pa, pb = (self._check_anchor(label, *end) for end in zip("ab", bodies, (a, b), strict=True))
         with np.errstate(over="ignore"):
             distance = arithmetic.compute_norm(pb - pa)

@@ -119,7 +119,7 @@ def explain_missing_requirement() -> str:
         return "Cython is not installed (pip install 'lavender-contact[wasm]')"
     named = os.environ.get("LAVENDER_WASM_CC", "")
     if named and shutil.which(shlex.split(named)[0]) is None:
-        return f"LAVENDER_WASM_CC names {shlex.split(named)[0]!r}, which is not there"
+        return f"LAVENDER_WASM_CC names {shlex.split(named)[0]!r}, which does not exist"
     if not named and importlib.util.find_spec("ziglang") is None:
         return (
             "no compiler for WebAssembly: pip install 'lavender-contact[wasm]' brings ziglang, or set "
@@ -189,7 +189,9 @@ def build(
     data += make_custom_section(SOURCES_SECTION, hash_sources(root, modules).encode())
     out = out.resolve()  # A link stays; its target is replaced.
     if out.exists() and not out.is_file():
-        raise BuildFailed(f"cannot write {out}: it is no file, and is not replaced; give the name of a file")
+        raise BuildFailed(
+            f"cannot write {out}: it is not a file, and is not replaced; give the name of a file"
+        )
     try:
         write_atomically(out, data)
     except OSError as error:
@@ -227,7 +229,9 @@ def _compile_to_wasm(source: Path, names: Iterable[str], extra_options: Iterable
     except BuildFailed as error:
         if "undefined symbol" not in str(error):
             raise
-        raise BuildFailed(f"a kernel needs Python, libm or malloc, which are not there:\n{error}") from None
+        raise BuildFailed(
+            f"a kernel needs Python, libm or malloc, which WebAssembly does not provide:\n{error}"
+        ) from None
     return linked.read_bytes()
 
 
@@ -266,9 +270,7 @@ def _check_module(module: bytes, max_bytes: int) -> None:
             if byte < 0x80:
                 break
         if kind == DATA_SECTION_ID:
-            raise BuildFailed(
-                f"a kernel reads static data ({size} bytes), which nothing fills outside Python"
-            )
+            raise BuildFailed(f"a kernel reads static data ({size} bytes), which only Python initialises")
         position += size
     if len(module) >= max_bytes:
         raise BuildFailed(f"the module has {len(module)} bytes; below {max_bytes} are allowed")

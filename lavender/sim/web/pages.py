@@ -107,8 +107,8 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
     script = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
     if not script.is_file():
         raise LavenderError(
-            f"{script.name} is in tests/sim/web of a checkout of the project, and not in this installation: clone the "
-            "project and install it from there with pip install -e '.[wasm]'"
+            f"{script.name} is part of a checkout of the project (tests/sim/web), and not of this installation: clone "
+            "the project and install it from there with pip install -e '.[wasm]'"
         )
     node = shutil.which("node")
     if node is None:

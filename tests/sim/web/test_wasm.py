@@ -129,7 +129,7 @@ def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("LAVENDER_WASM_CC", "no-such-compiler --target=wasm32-wasi")
-    with pytest.raises(LavenderError, match="names 'no-such-compiler', which is not there"):
+    with pytest.raises(LavenderError, match="names 'no-such-compiler', which does not exist"):
         pages.build_module(tmp_path / "a.wasm")
 
 

@@ -453,7 +453,7 @@ def _open_files(v, film):
     for name, data in wrong.items():
         v.page.set_input_files("#file", {"name": name, "mimeType": "", "buffer": data})
         v.page.wait_for_function(
-            f"document.querySelector('#failure').textContent.startsWith('{name} is no film')"
+            f"document.querySelector('#failure').textContent.startsWith('{name} is not a film')"
         )
         assert v.js("lavender.frames.length") == 61
     v.page.set_input_files("#file", {"name": "film", "mimeType": "", "buffer": film[: -len(of[2]) // 61]})

@@ -25,7 +25,7 @@ function read(bytes) {
     || !bodies.every((body) => [0, 1, 2, 3].includes(body.kind) && numbers(body.shape, 4))
     || !joints.every((joint) => isBody(joint.body) && isBody(joint.other) && joint.body >= 0 && numbers(joint.anchor, 3))
     || data.length % (LEAD + 7 * bodies.length) || !data.every(Number.isFinite)) {
-    throw new Error("its header and its frames are not those of this version");
+    throw new Error("its header or its frames have another version");
   }
   return { header, data };
 }
@@ -233,7 +233,7 @@ class Player {
     try {
       film = read(await file.arrayBuffer());
     } catch (error) {
-      fail(`${file.name} is no film that this page reads: ${error.message}`); // The displayed film stays.
+      fail(`${file.name} is not a film that this page reads: ${error.message}`); // The displayed film stays.
       return;
     }
     find("failure").hidden = true;
