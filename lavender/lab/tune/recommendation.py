@@ -164,7 +164,7 @@ class Tuning:
 
     @property
     def _lines_note(self) -> str:
-        """Explanation below the lines: how they were chosen and tested, and where they belong."""
+        """Explanation below the lines: how they were chosen and tested, and the element that they belong to."""
         if self.reason_without_line:
             return "None, for the reason above."
         sentences = ["Chosen on the worlds with even numbers, tested on the others."]
