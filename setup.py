@@ -48,19 +48,25 @@ SHARED = "lavender_ext._utility"
 
 #: Modules whose loops need the update of a block inlined into them: -O3 and gcc's inlining limits raised (INLINE).
 #: With lower limits they execute 2 to 12 % more instructions; at -O2 a sweep takes up to 1.7 times as long.
-HOT = ("sweep/", "local/", "judge/measure", "driver/", "engine/substep")
+HOT = ("sweep/", "local/", "driver/", "engine/substep")
 #: Modules compiled with -O3 and lower inlining limits: at -O2 a factorisation takes twice as long, and a solve of few
-#: bodies by Newton's method 1.2 times.
-FAST = ("factor/linear", "newton/solve")
-#: Modules without expensive loops: -O1. All others are compiled at -O2 with gcc's full vectoriser; solve times stay
-#: within 1 % of those at -O3, which takes a sixth longer to compile.
+#: bodies by Newton's method 1.2 to 1.3 times, also with -fpeel-loops.
+FAST = ("factor/linear", "judge/measure", "newton/solve")
+#: Modules without expensive loops: -O1, half of the compile time of -O2. All others are compiled at -O2 with gcc's full
+#: vectoriser; solve times stay within 1 % of those at -O3, which takes a sixth longer to compile.
 COLD = (
     "_utility",
     "host/",
     "engine/arrays",
+    "engine/newton_substep",
     "core/blocks",
     "core/checks",
+    "core/method",
+    "core/order",
     "factor/graph",
+    "factor/sparse",
+    "io/",
+    "newton/coupled",
 )
 
 LINK_ARGS, INLINE, LIMITS = [], [], []

@@ -37,6 +37,7 @@ def directives(*, debug: bool = False) -> dict[str, Any]:
         "initializedcheck": debug,
         "cdivision": True,
         "embedsignature": True,
+        "emit_code_comments": False,  # C code without its Cython lines is a third shorter
         "auto_pickle": False,  # classes that can be copied define it themselves (lavender.problem, lavender.judge)
         "freethreading_compatible": True,
     }

@@ -16,7 +16,7 @@ from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows,
 from lavender_ext.core.problem cimport DERIVED, lav_compute_body_diagonal, derived_t, compute_derived, compute_csr_derived
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse, refine_view,
                                          relative_residual_of_score, count_judge_scratch)

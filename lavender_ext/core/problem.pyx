@@ -19,7 +19,7 @@ from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport Operator, find_panel_pattern, whiten_panel
+from lavender_ext.core.generalized cimport Operator
 from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box_friction_contact, islands_t,
                                             count_tangent_rows,
@@ -28,6 +28,7 @@ from lavender_ext.core.rows cimport (
     compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass, multiply_jacobian,
 )
 from lavender_ext.core.steps cimport compute_block_steps, largest_eigenvalue_of_csr_pair, average_diagonal_of_pairs
+from lavender_ext.core.whiten cimport find_panel_pattern, whiten_panel
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
 

@@ -27,8 +27,8 @@ from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, form_scaled_csr,
                                               form_scaled_generalized, form_reduced_system, linearised_t, linearise_all_projections,
                                               multiply_block_derivatives, natural_t, number_system_rows)
+from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.factor.linear cimport LU, analyse_dense, linear_factor, linear_solve, linear_solve_transposed
-from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport (
     residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score, count_judge_scratch,
 )

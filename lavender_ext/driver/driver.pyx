@@ -6,7 +6,7 @@ from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
 from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, rows_workspace_size, rows_start, system_step
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms

@@ -24,7 +24,7 @@ from lavender_ext.engine.arrays cimport S_OUT, bind_engine_arrays, engine_t
 from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport find_reference, score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.newton.solve cimport bodies_start, bodies_workspace_size, system_step
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, band_width,
                                              bind_warm_workspace, judge_impulse, measure_as_engine, warm_solve,

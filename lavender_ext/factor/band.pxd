@@ -8,25 +8,12 @@ c[i, t] c[i, 0]. The method is right-looking: one division, one product and one 
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.factor.factors cimport no_pivots, pivots_t
+
 
 cdef enum:
     # A pivot below -size_i / NEGATIVE_PIVOT_RATIO is negative; rounding of a zero pivot stays above, because zeros are skipped.
     NEGATIVE_PIVOT_RATIO = 100000000
-
-
-cdef struct pivots_t:
-    int32_t small               # number of pivots of at most tiny size_i: their rows and columns are left out
-    int32_t negative            # number of negative pivots, which are used
-    double least                # smallest p_i / size_i
-    int32_t first_small         # index of the first small pivot, or -1
-
-
-cdef inline void no_pivots(pivots_t* out) noexcept nogil:
-    """Set the statistics of a factorisation without pivots."""
-    out.small = 0
-    out.negative = 0
-    out.least = 1.0 / 0.0
-    out.first_small = -1
 
 
 cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:

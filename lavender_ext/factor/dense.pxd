@@ -24,19 +24,13 @@ cdef inline int64_t panel_offset(int32_t n, int32_t k) noexcept nogil:
     return <int64_t>k * n - <int64_t>PANEL_COLUMNS * (k // PANEL_COLUMNS) * (k // PANEL_COLUMNS - 1) // 2 * PANEL_COLUMNS
 
 
-cdef inline int64_t cholesky_workspace_size(int32_t n) noexcept nogil:
-    """Return the number of doubles of L in its panels; at most n^2."""
-    cdef int32_t k = n - 1 - (n - 1) % PANEL_COLUMNS if n > 0 else 0
-    return panel_offset(n, k) + <int64_t>(n - k) * (n - k)
-
-
 cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* min_pivot,
                                    double* l) noexcept nogil:
-    """Write the factor (1) of a symmetric a (n, n) to l (`cholesky_workspace_size`); return the number of lost pivots.
+    """Write the factor (1) of a symmetric a (n, n) to l; return the number of lost pivots.
 
-    The entries of a at and after the diagonal of each row are read. 1 / L_jj is stored on the diagonal. A pivot is lost if it
-    does not exceed min_pivot (n); its column of L is zero. If min_pivot is NULL, pivots must be positive, and the factorisation
-    ends with the first panel that loses one.
+    l has `cholesky_workspace_size` of `linear.pxd`. The entries of a at and after the diagonal of each row are read. 1 / L_jj
+    is stored on the diagonal. A pivot is lost if it does not exceed min_pivot (n); its column of L is zero. If min_pivot is
+    NULL, pivots must be positive, and the factorisation ends with the first panel that loses one.
     """
     cdef int32_t k, p, j, t, w, lost = 0
     cdef double zero[PANEL_COLUMNS]

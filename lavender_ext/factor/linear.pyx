@@ -8,18 +8,19 @@ from lavender_ext.factor.symbolic import analyse as analyse_pattern
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport eliminate_tree_rows
-from lavender_ext.core.tree cimport solve_tree_factor as solve_mass_matrix
+from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.validate cimport norm_inf
-from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve, no_pivots
+from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve
 from lavender_ext.factor.blocks cimport factor_blocks
-from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
-                                        dense_lu_sign, dense_lu_solve, dense_lu_solve_transposed)
+from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
+                                        dense_lu_solve, dense_lu_solve_transposed, panel_offset)
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide, no_pivots, supernodal_t
 from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, analyse_dense,
                                          backward_tolerance, fallback_t, linear_t)
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
 from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
-                                             supernodal_scratch_size, supernodal_t)
-from lavender_ext.factor.tiles cimport has_wide
+                                             supernodal_scratch_size)
+from lavender_ext.factor.symbolic cimport column_pattern, find_supernodes, list_supernode_rows
 
 
 #: Largest accepted backward error (3) of `linear.pxd`.
@@ -28,6 +29,95 @@ BACKWARD_TOLERANCE = backward_tolerance()
 
 cdef enum:
     MAX_REFINEMENTS = 1         # Refinements of a solution with L U of ROWS before the fallback.
+
+
+# -- analyse and bind ----------------------------------------------------------------------------------------
+
+
+cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil:
+    """Return the number of doubles of L in its panels; at most n^2."""
+    cdef int32_t k = n - 1 - (n - 1) % PANEL_COLUMNS if n > 0 else 0
+    return panel_offset(n, k) + <int64_t>(n - k) * (n - k)
+
+
+cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
+                           const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil:
+    """Set the pattern of f in index (`block_pattern_index_size`, a multiple of 8 bytes); return the multiply-adds of L L^T.
+
+    nptr and nind are the blocks of N, parent (n) is the elimination tree and lptr (n + 1) the columns of L of `block_tree`.
+    """
+    cdef int32_t blocks = nptr[n], i, j, k, q, count
+    cdef int64_t place, ld
+    cdef double work
+    cdef supernodal_t* p = &f.factor
+    cdef int64_t* lower_offset = <int64_t*>index
+    cdef int64_t* upper_offset = lower_offset + blocks
+    cdef int64_t* value_offset = upper_offset + blocks
+    cdef int64_t* panel_upper_offset = value_offset + n + 1
+    cdef int32_t* supernode_of = <int32_t*>(panel_upper_offset + n + 1)
+    cdef int32_t* first = supernode_of + n * s
+    cdef int32_t* row_ptr = first + n + 1
+    cdef int32_t* group = row_ptr + n + 1
+    cdef int32_t* starts = group + n + 1
+    cdef int32_t* mark = starts + n + 1
+    cdef int32_t* lind = mark + n + 1
+    cdef int32_t* row_indices = lind + lptr[n] + 1
+    column_pattern(n, nptr, nind, parent, mark, lptr, starts, lind)
+    count = find_supernodes(n, lptr, lind, NULL, group)
+    for i in range(n + 1):
+        starts[i] = i * s
+    work = list_supernode_rows(count, starts, lptr, lind, group, first, supernode_of, row_ptr, row_indices, value_offset,
+                               panel_upper_offset)
+    p.n, p.supernodes = n * s, count
+    p.order = NULL
+    p.position = NULL
+    p.first, p.supernode_of, p.row_ptr, p.row_indices = first, supernode_of, row_ptr, row_indices
+    p.value_offset, p.upper_offset = value_offset, panel_upper_offset
+    f.n, f.s, f.nptr, f.nind, f.lower_offset, f.upper_offset = n, s, nptr, nind, lower_offset, upper_offset
+    # places of the blocks of N
+    for k in range(n):
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q] * s
+            i = supernode_of[j]
+            ld = panel_width(p, i) + rows_below(p, i)
+            if k * s < first[i + 1]:                    # both blocks are in the diagonal block of the supernode
+                lower_offset[q] = value_offset[i] + (k * s - first[i]) + (j - first[i]) * ld
+                upper_offset[q] = value_offset[i] + (j - first[i]) + (k * s - first[i]) * ld
+                continue
+            place = row_ptr[i]
+            while row_indices[place] != k * s:
+                place += 1
+            place -= row_ptr[i]
+            lower_offset[q] = value_offset[i] + panel_width(p, i) + place + (j - first[i]) * ld
+            upper_offset[q] = panel_upper_offset[i] + place + (j - first[i]) * <int64_t>rows_below(p, i)
+    return work
+
+
+cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil:
+    """Return the number of doubles that `bind_block_factor` assigns; `lu`: the matrix may be factored as L U."""
+    cdef const supernodal_t* p = &f.factor
+    cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s + p.value_offset[p.supernodes]
+    if lu:
+        values += <int64_t>f.nptr[f.n] * f.s * f.s + p.upper_offset[p.supernodes]
+    return values + supernodal_scratch_size(p, lu)
+
+
+cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* index, double* real) noexcept nogil:
+    """Bind the values of N and of its factor, after `analyse_blocks`; neither array needs initial values."""
+    cdef supernodal_t* p = &f.factor
+    cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s
+    p.wide = wide
+    p.swap, p.local_row, p.head = index, index + p.n, index + 2 * p.n
+    p.link, p.next_row = p.head + f.n, p.head + 2 * f.n
+    f.nval = real
+    real += values
+    f.mval = real
+    real += values if lu else 0
+    p.values = real
+    real += p.value_offset[p.supernodes]
+    p.upper = real
+    real += p.upper_offset[p.supernodes] if lu else 0
+    p.scratch = real
 
 
 # -- factor ------------------------------------------------------------------------------------------------------
@@ -148,7 +238,7 @@ cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
     elif f.kind == BLOCKS:
         solve_supernodes(&f.blocks.factor, x, f.factored == LU)
     elif f.kind == TREE:
-        solve_mass_matrix(f.n, f.lptr, f.lidx, f.matrix, f.scale, x)
+        solve_tree_factor(f.n, f.lptr, f.lidx, f.matrix, f.scale, x)
     elif f.factored == CHOLESKY:
         dense_cholesky_solve(f.n, f.lower, x)
     elif f.d == NULL:

@@ -8,20 +8,9 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.core.csr cimport transpose_csr
+from lavender_ext.factor.factors cimport sparse_t, supernodal_t
 from lavender_ext.factor.supernodal cimport (begin_supernodes, factor_supernode, panel_width, rows_below, set_local_rows,
-                                             solve_supernodes, supernodal_t)
-
-
-cdef struct sparse_t:
-    supernodal_t factor
-    const int32_t* indptr       # (n + 1) A in compressed rows, columns ascending
-    const int32_t* indices
-    double* data
-    int32_t* tptr               # (n + 2) A^T; L U only
-    int32_t* tind
-    double* tdata
-    double* scale               # (n) by position: D^-1/2 of L U, else the smallest accepted pivots
-    double* y                   # (n) scratch of a solve
+                                             solve_supernodes)
 
 
 cdef inline void fill_supernode(const sparse_t* s, int32_t i, int32_t lu, const double* d, double shift) noexcept nogil:

@@ -14,33 +14,9 @@ compressed rows, `blocks.pxd` from square blocks.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
+from lavender_ext.factor.factors cimport supernodal_t
 from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, gemm_subtract_lower, lu_panel
 from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
-
-
-cdef struct supernodal_t:
-    int32_t n                   # rows
-    int32_t supernodes
-    int32_t wide                # four lanes are one instruction
-    # pattern
-    const int32_t* order        # (n) row at each position, or NULL: as they stand
-    const int32_t* position     # (n) position of each row, or NULL
-    const int32_t* first        # (supernodes + 1) position of the first column
-    const int32_t* supernode_of     # (n) supernode of a position
-    const int32_t* row_ptr      # (supernodes + 1) rows below a supernode: positions, ascending
-    const int32_t* row_indices
-    const int64_t* value_offset     # (supernodes + 1) of a panel in `values`
-    const int64_t* upper_offset     # (supernodes + 1) of the rows of U beside a panel in `upper`
-    # factor
-    double* values
-    double* upper               # L U only
-    double* scratch             # (`supernodal_scratch_size`)
-    int32_t* swap               # (n) L U: index within the panel of the row that each pivot row was exchanged with
-    # state of a factorisation
-    int32_t* local_row          # (n) index of a position in the present panel
-    int32_t* head               # (supernodes) first descendant that updates a supernode next,
-    int32_t* link               # (supernodes) and the next one
-    int32_t* next_row           # (supernodes) first row of a supernode that has not updated its supernode
 
 
 cdef inline int32_t panel_width(const supernodal_t* f, int32_t i) noexcept nogil:

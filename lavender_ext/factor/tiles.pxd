@@ -1,8 +1,8 @@
 """Products of dense columns: C <- C - A B^T in tiles, in which dense and supernodal factorisations spend their time.
 
 Lanes are rows of C. The sum runs over the columns of A and B in their order, and each product is rounded before it is
-subtracted, so that all lane widths give the same bits. `wide` selects four lanes in one instruction (AVX2), which `has_wide`
-reports. With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, the loops have no lanes.
+subtracted, so that all lane widths give the same bits. `wide` selects four lanes in one instruction (AVX2), which `has_wide` of
+`factors.pxd` reports. With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, the loops have no lanes.
 """
 from libc.stdint cimport int32_t
 
@@ -111,11 +111,9 @@ cdef extern from *:
                                                                       const int* at, const double* x, double* out) {
         LAVENDER_COMBINE_ROWS(lavender_sum_4)
     }
-    #define LAVENDER_HAS_WIDE() (__builtin_cpu_supports("avx2") ? 1 : 0)
     #else
     #define lavender_gemm_wide lavender_gemm_narrow
     #define lavender_combine_rows_wide lavender_combine_rows_narrow
-    #define LAVENDER_HAS_WIDE() 0
     #endif
     static inline void lavender_gemm(int wide, int m, int n, int k, const double* a, long long lda, const double* b,
                                      long long ldb, double* c, long long ldc) {
@@ -158,4 +156,3 @@ cdef extern from *:
     void add_vector "lavender_add_vector"(int n, const double* x, double* y) noexcept nogil
     # Solve X L^T = A for rows 3 ... n + 2 of the three columns x, y, z, whose rows 0 ... 2 contain L with 1 / L_jj.
     void solve_three_columns "lavender_solve_three_columns"(int n, double* x, double* y, double* z) noexcept nogil
-    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil

@@ -24,7 +24,8 @@ from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport bound_condition_by_determinant, get_condition, solve_mass_matrix
+from lavender_ext.core.condition cimport bound_condition_by_determinant, get_condition
+from lavender_ext.core.generalized cimport solve_mass_matrix
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.forms cimport score_generalized_slack

@@ -9,10 +9,9 @@ from libc.string cimport memset
 
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t, view_t
-from lavender_ext.factor.blocks cimport (bind_block_factor, block_factor_index_size, block_factor_size,
-                                         block_pattern_index_size)
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
-from lavender_ext.factor.linear cimport BLOCKS, NO_FACTOR
+from lavender_ext.factor.linear cimport (BLOCKS, NO_FACTOR, bind_block_factor, block_factor_index_size, block_factor_size,
+                                         block_pattern_index_size)
 from lavender_ext.factor.symbolic cimport block_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport compute_panel, factor_inertia

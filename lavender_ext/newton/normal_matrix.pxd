@@ -1,7 +1,7 @@
 """Form N = I + K^T V K block by block, for runs of elements between the same two bodies."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.blocks cimport block_matrix_t
+from lavender_ext.factor.factors cimport block_matrix_t
 from lavender_ext.newton.elements cimport elements_t
 
 

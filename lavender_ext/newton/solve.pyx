@@ -17,10 +17,9 @@ from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
-from lavender_ext.factor.blocks cimport (analyse_blocks, block_factor_index_size, block_factor_size, block_matrix_t,
-                                         block_pattern_index_size)
-from lavender_ext.factor.linear cimport NO_FACTOR, LinearSystem, analyse_dense
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide
+from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, analyse_blocks, analyse_dense, block_factor_index_size,
+                                         block_factor_size, block_pattern_index_size)
 from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
                                          body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
                                          index_workspace_size, order_bodies, order_elements,

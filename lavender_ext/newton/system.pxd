@@ -17,9 +17,8 @@ from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.dense cimport cholesky_workspace_size
-from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, linear_factor, linear_sign, linear_solve,
-                                         linear_solve_checked, linear_t)
+from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, cholesky_workspace_size, linear_factor,
+                                         linear_sign, linear_solve, linear_solve_checked, linear_t)
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.coupled cimport couple_entries, coupled_t
 from lavender_ext.newton.elements cimport element_times, elements_t, is_row

@@ -16,9 +16,8 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block cimport project_row_update
 from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.band cimport no_pivots
+from lavender_ext.factor.factors cimport has_wide, no_pivots
 from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_band, analyse_dense, linear_factor, linear_solve
-from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.score cimport unit_roundoff
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, pivoting_t
 

@@ -23,7 +23,7 @@ from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_AR
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport get_block_bodies, csr_t, rows_t
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, Rules, small_problem_t,
                                       small_rules_t, solve_workspaces_t)
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size

@@ -274,7 +274,7 @@ static int32_t start_admm(lav_solver *s) {
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0 && core_csr_measure_asymmetry_and_bandwidth(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
     return LAV_ERROR_UNSUPPORTED; /* A is not symmetric; the factorisation needs it. */
-  s->table = TAKE(s, double, m * m + factor_dense_cholesky_workspace_size(s->p.n_rows));
+  s->table = TAKE(s, double, m * m + factor_linear_cholesky_workspace_size(s->p.n_rows));
   x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   memset(x, 0, (size_t)numbers * sizeof(double));

@@ -255,7 +255,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   s->g.lval = lval = TAKE(s, double, count);
   memmove(lidx, columns, (size_t)count * sizeof *lidx);
   memmove(lval, values, (size_t)count * sizeof *lval);
-  s->g.condition = core_generalized_estimate_condition(&s->g, s->stopping_test.v);
+  s->g.condition = core_condition_estimate_condition(&s->g, s->stopping_test.v);
   return LAV_OK;
 }
 
@@ -280,7 +280,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
     s->used = from;
     s->g.cols = columns = TAKE(s, int32_t, workspace);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
-    s->g.n_panels = core_generalized_find_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
+    s->g.n_panels = core_whiten_find_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
                                                    columns, workspace < 2147483647 ? (int32_t)workspace : 2147483647, &n_columns,
                                                    &values);
     if (s->g.n_panels >= 0) break;

@@ -117,7 +117,7 @@ static int64_t pivots_workspace_size(const lav_problem *q, const lav_options *o,
 static int64_t admm_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows;
   (void)n_v;
-  return m * m + factor_dense_cholesky_workspace_size(q->n_rows) + (int64_t)k_admm_workspace_size(q->n_rows, o->memory) + formed_workspace_size(q);
+  return m * m + factor_linear_cholesky_workspace_size(q->n_rows) + (int64_t)k_admm_workspace_size(q->n_rows, o->memory) + formed_workspace_size(q);
 }
 #endif
 
