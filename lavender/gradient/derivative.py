@@ -115,7 +115,7 @@ class Derivative:
         self._uses_kernel = regular and not problem.cones.has_ellipse and in_order
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle problem and impulse; a copy is factor_dense again."""
+        """Pickle problem and impulse; a copy is computed again."""
         return derivative, (self.problem, self._impulse)
 
     @property

@@ -451,7 +451,7 @@ class _Island:
         t = change_of_y @ inverse
         dz = np.abs(inverse @ self.f) + size @ self.f_rounding
         dy = np.abs(t @ self.f) + np.abs(t) @ self.f_rounding
-        inverse_error = error * dz.max()  # of dz, by G^-1 as computed
+        inverse_error = error * dz.max()  # Error of dz caused by the error of the computed G^-1.
         dz += inverse_error
         dy += np.abs(change_of_y).sum(axis=1) * inverse_error + self.h_rounding @ dz
         if not groups:

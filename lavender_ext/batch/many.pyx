@@ -157,13 +157,13 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
 
 cdef enum:                      # rows of `Worlds.numbers`: results of each world
     RELATIVE = 0
-    ENERGY = 1                  # sqrt J
-    SPEED = 2                   # m/s
+    ENERGY = 1                  # sqrt J, energy error
+    SPEED = 2                   # m/s, velocity error
     FLOOR = 3
-    START_ENERGY = 4            # of the zero impulse
+    START_ENERGY = 4            # sqrt J, energy error of the zero impulse
     START_SPEED = 5
     START_RELATIVE = 6
-    RHS_ENERGY = 7              # of b; set by `judge` only
+    RHS_ENERGY = 7              # energy norm of b; set by `judge` only
     PUSH = 8                    # N s, |e| of the worst row
     ABOVE_FLOOR = 9             # part of the relative residual above the round-off floor
     N_NUMBERS = 10
@@ -243,7 +243,7 @@ cdef class Worlds:
         Results; for arrays the impulse holds the starts on entry, unless `cold`.
     """
 
-    cdef task_t* tasks            # of objects
+    cdef task_t* tasks            # tasks of problems that are objects
     cdef worlds_t w
     cdef int64_t taken
     cdef bint cold
@@ -285,7 +285,7 @@ cdef class Worlds:
             self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
         self.w.blocks, self.w.asymmetry, self.w.general = blocks.at, asymmetry, arrays[1] is not None
         self.w.blocks.law = law
-        self.w.multiply_jacobian_row, self.w.mass_row = strides
+        self.w.jac_row_stride, self.w.mass_row = strides
         self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
@@ -409,7 +409,7 @@ cdef class Worlds:
         if j.general:
             solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
             if not had_derived:
-                h.made = j.made                         # its memory is reused for the next world
+                h.made = j.made                         # The next world reuses the memory of `made`.
             code = READY if j.solved else TRIED
         else:
             code = solve_small_task(&j, &h.small, rules, tol)

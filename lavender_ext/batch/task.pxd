@@ -66,15 +66,15 @@ cdef struct task_t:
     const double* push          # (n) M^-1 J^T lam, not for A; in workspace that the next world reuses
     score_t score
     double relative, floor, above_floor
-    double float64_relative     # of the first pass; NaN if it was not refined
+    double float64_relative     # relative residual of the first pass; NaN if it was not refined
 
 
-cdef struct task_workspaces_t:  # of one thread
-    workspace_t islands         # of `judge_zero_impulse_of_task`
+cdef struct task_workspaces_t:  # workspaces of one thread
+    workspace_t islands         # workspace of `judge_zero_impulse_of_task`
     workspace_t made            # A, d, nu and step
-    workspace_t formed          # of `form_matrix_of_bodies`
-    workspace_t bound           # of `derive_small_problem`
-    solve_workspaces_t call     # of `solve_small`
+    workspace_t formed          # workspace of `form_matrix_of_bodies`
+    workspace_t bound           # workspace of `derive_small_problem`
+    solve_workspaces_t call     # workspaces of `solve_small`
 
 
 cdef inline bint judge_zero_impulse_of_task(task_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
@@ -208,7 +208,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
             or estimate_newton_cost(&j.p, &j.g, limits, r.work) > max_newton_cost(&j.p, &j.g, limits, r.islands, soft)):
         return
     if m > limits.coulomb_rows and estimate_newton_cost(&j.p, &j.g, limits, r.work) > j.cost_limit:
-        return                                          # sweeps use a short time limit better
+        return                                          # In a short time sweeps reach a smaller residual.
     if not grow_workspace_to(workspace, 0, r.n_real):
         return
     r.real = workspace.real

@@ -49,7 +49,7 @@ cdef enum:                      # arrays that may be in float32
     N_ARRAYS = 6
 
 cdef enum:
-    MIN_REORDERED_VELOCITIES = 400                  # `Generalized` considers another order from this many velocities on
+    MIN_REORDERED_VELOCITIES = 400                  # `Generalized` searches another order from this number of velocities on
 
 
 cdef enum:                      # fields of bodies
@@ -83,7 +83,7 @@ cdef struct worlds_t:
     const int64_t* at           # (n, PLACES)
     const void* array[N_ARRAYS]     # J, M, v*, target, compliance, mu (NULL: mu of the blocks)
     int32_t narrow[N_ARRAYS]    # 1 for float32
-    int64_t multiply_jacobian_row             # stride of the rows of J; 0: number of velocities
+    int64_t jac_row_stride      # stride of the rows of J; 0: number of velocities
     int64_t mass_row            # stride of the rows of M
     const int32_t* mass_ptr     # (nv + 1) row pointers of lower triangles with one shared pattern; NULL: M is dense
     const int32_t* mass_col     # columns, ascending in each row, the diagonal last
@@ -172,7 +172,7 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
 
 
 cdef inline int32_t count_zeros_and_detect_new(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
-    """Count the zeros of x (n); new: whether one is not in `known`. Branch-free 64-bit integers, for vectorisation."""
+    """Count the zeros of x (n); new: whether one is not in `known`. Branch-free, to be vectorised."""
     cdef int64_t zeros = 0, unknown = 0, zero
     cdef int32_t k
     for k in range(n):
@@ -237,7 +237,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
     cdef bint shared = True
-    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.multiply_jacobian_row
+    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row_stride
     cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1 + THIN_PADDING, wide = all if m > n else <int64_t>n * n
     cdef const double* a
     cdef int32_t* ptr
@@ -307,7 +307,7 @@ cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_sc
     cdef double* b
     if not grow_workspace_to(&d.workspace, k + 1, m + k + <int64_t>m * m):
         return LEFT
-    b, row[0] = d.workspace.real, w.multiply_jacobian_row
+    b, row[0] = d.workspace.real, w.jac_row_stride
     a[0] = read_matrix_entries(w, 0, at[JAC], m, m, row, b + m + k)
     for j in range(m):
         if has_invalid_number(a[0] + j * row[0], m):

@@ -35,7 +35,7 @@ cdef enum:
     SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's, [2] needed
     SCRATCH_TOO_SMALL = -2      # result of `plan`
     INDEX_LIMIT = 2147483647
-    MAX_SUBSTEP_FACTORISATIONS = 200    # of a substep, since a frame waits for them
+    MAX_SUBSTEP_FACTORISATIONS = 200    # maximum in a substep, because a frame waits for them
 
 
 cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:

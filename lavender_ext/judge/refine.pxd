@@ -9,8 +9,8 @@ and the slack of row i, w = J x + c lam - b, has an error of at most sqrt(d_i) |
     n u |H^-1| max(1, k / 10)  >  0.1 max(tol, r)                                                             (2)
 
 where k is |x|_M as a relative residual, and r the residual of the first pass. (A bound by k itself is 40 to 2,000 times
-too large on random M and on chains of hinges, (2) is 3 to 1,000 times.) The correction is x <- x + M^-1 (J^T lam - M x). Its
-residual and x are sums of two float64 (Dekker 1971; the halves of a factor are cut off, so that every step is exact, with
+too large on random M and on chains of hinges; (2) is 3 to 1,000 times too large.) The correction is x <- x + M^-1 (J^T lam - M x).
+Its residual and x are sums of two float64 (Dekker 1971; the halves of a factor are cut off, so that every step is exact, with
 and without fused multiply-adds). It is repeated until
 
     |dx|_M q <= u |x|_M,      q = max(n u |H^-1|, largest ratio of two corrections so far)                     (3)

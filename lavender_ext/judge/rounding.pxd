@@ -141,7 +141,8 @@ cdef inline double float32_floor_of_score(const blocks_t* p, const double* squar
                                     double* above) noexcept nogil:
     """Return the float32 floor of a pass; with islands, the floor of the island with the largest residual.
 
-    `above` receives the counterpart of `above_floor_of`. With islands, s.by_island must hold the relative residuals.
+    `above` receives the relative residual that float32 rounding does not explain.
+    With islands, s.by_island must hold the relative residuals.
     """
     cdef int32_t i
     cdef double floor, worst = 0.0, own

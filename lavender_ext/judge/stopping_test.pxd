@@ -51,13 +51,13 @@ cdef struct stopping_test_t:
     double last                 # relative residual at the last check
     double best_relative        # relative residual of `best`
     double lowest               # lowest relative residual of all checks
-    double reference_energy     # sqrt J, of the zero impulse
-    double reference_velocity   # m/s, of the zero impulse
+    double reference_energy     # sqrt J, energy error of the zero impulse
+    double reference_velocity   # m/s, velocity error of the zero impulse
     best_t best
     double* marked              # (n) sqrt J, E of each island's best at the last better check
     double* w                   # (m) scratch
     double* e                   # (m) scratch
-    double* v                   # scratch (`scratch_of`)
+    double* v                   # scratch of `count_judge_scratch` doubles
     progress_t progress
 
 

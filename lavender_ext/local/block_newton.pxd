@@ -31,7 +31,7 @@ cdef enum:
     # hundred updates of the block.
     MAX_SLOW_STEPS = 4
     N_SCALES = 11               # values of t for contacts: 1, 0.1, 10, 0.01, 100, ...
-    N_ROW_SCALES = 4            # values of t for bounded rows, all of which are used in vain if rows contradict each other
+    N_ROW_SCALES = 4            # values of t for bounded rows; all of them fail if rows contradict each other
     N_PROJECTED_STEPS = 20      # between two values of t
 
 
@@ -40,7 +40,7 @@ cdef struct scaled_block_t:
     int32_t n                   # number of rows, at most MAX_ROWS
     bint bounded                # bounded rows, otherwise a contact
     const double* H             # (n, n)
-    friction_components_t components    # of a contact, with the coefficients of z
+    friction_components_t components    # friction components of a contact, with the coefficients of z
     double lower[MAX_ROWS]      # bounds of z
     double upper[MAX_ROWS]
     double z0[MAX_ROWS]

@@ -32,15 +32,15 @@ cdef struct small_problem_t:
     int32_t band                # half bandwidth of A for bounded rows; m - 1 if A is not symmetric
     int32_t split               # number of joint blocks, which are swept before the contacts
     bint pivots, linear, symmetric      # all rows bounded; all rows free; A symmetric
-    const int32_t* at           # offsets into `prepared` if blocks are solved exactly (gauss_seidel.prepare), else NULL
+    const int32_t* at           # offsets into `prepared` if blocks are solved exactly (`prepare_exact_blocks`), else NULL
     const double* prepared
-    score_t score               # of the result
+    score_t score               # score of the result
     double relative, floor
 
 
 cdef struct solve_workspaces_t:
     workspace_t work
-    workspace_t more            # of Newton's method, or of Lemke's paths
+    workspace_t more            # workspace of Newton's method, or of Lemke's paths
 
 
 cdef bint can_use_small_call(const blocks_t* p) noexcept nogil

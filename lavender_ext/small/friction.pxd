@@ -23,8 +23,8 @@ cdef enum:
     MIN_CHECK_INTERVAL = 4      # sweeps between two checks of the residual; later half of the sweeps done
     FIRST_FACTORISATIONS = 12   # Newton's factorisations before sweeps continue
     RESUMED_SWEEP_RATIO = 8     # Sweeps then continue to this multiple of `max_sweeps` in total.
-    MAX_SUBPROBLEM_FACTORISATIONS = 120    # of one subproblem in total
-    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's gain, repeated this many times the remaining checks, reaches tol.
+    MAX_SUBPROBLEM_FACTORISATIONS = 120    # maximum factorisations of one subproblem
+    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's reduction, over this many times the remaining checks, reaches tol.
     SWEEP_NS_PER_ROW = 15       # cost of a sweep with its mixing [ns] per row, plus 1 ns per entry of A
     SWEEP_NS_PER_BODY_ROW = 32  # or this per row over bodies
     FACTOR_NS_PER_ROW = 150     # cost of a factorisation with its steps [ns] per row,
@@ -36,7 +36,7 @@ cdef struct subproblem_t:
     double* lam                 # (m) N s, start
     double* answer              # (m) N s, result
     int32_t split               # number of joint blocks, which are swept before the contacts
-    const int32_t* at           # offsets into `prepared` if blocks are solved exactly (gauss_seidel.prepare), else NULL
+    const int32_t* at           # offsets into `prepared` if blocks are solved exactly (`prepare_exact_blocks`), else NULL
     const double* prepared
     double relative_at_zero     # relative residual of the zero impulse; -1: not known, as for an island
     double e0                   # its reference energy, sqrt J

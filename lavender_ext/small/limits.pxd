@@ -23,7 +23,7 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double values               # maximum number of entries of one island's N
     double max_cost             # ns, maximum of the permitted cost
     double coulomb_rows         # maximum rows of an island under Coulomb's law,
-    double cone_rows            # and under the cone law with a rigid contact; both apply only if
+    double cone_rows            # the same under the cone law with a rigid contact; both apply only if
     double dense                # there are fewer than this many rows per velocity
     double columns              # and no row has more entries: the velocities may then be of bodies (`graph.bodies_in`)
     double steps                # maximum steps of all islands together

@@ -62,7 +62,7 @@ cdef struct span_t:             # records that are read in sequence, forwards or
     pair_t* end                 # last record that is read
     bint backwards
     int32_t pass_               # number of the pass,
-    int32_t sweeps              # and of sweeps, if some lanes may not be due; else 0
+    int32_t sweeps              # number of sweeps if some lanes may not be due; else 0
 
 
 cdef inline span_t make_record_span(pair_t* first, pair_t* last, bint backwards) noexcept nogil:

@@ -42,7 +42,7 @@ cdef struct paused_t:           # an island whose step budget ended, to be conti
     int32_t island              # -1: no island is paused
     int32_t worst               # worst outcome of the islands before it
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)
-    int32_t stage               # of a round of Coulomb friction
+    int32_t stage               # stage of a round of Coulomb friction
     int32_t rounds              # completed rounds of Coulomb friction
     double island_error         # error of `island_best`, including points at which a call ended
     double best_error           # the same without those points, so that calls do not change the path
@@ -51,7 +51,7 @@ cdef struct paused_t:           # an island whose step budget ended, to be conti
 cdef struct flow_t:
     blocks_t p                  # a copy: its law is CONE while a convex problem is solved
     const generalized_t* g
-    int32_t law                 # of the problem
+    int32_t law                 # law of the problem
     double softness             # first rho as a fraction of d
     int32_t n_islands
     const int32_t* iptr         # (n_islands + 1) runs of panels of each island in `run`
@@ -113,7 +113,7 @@ cdef struct flow_t:
     double tol                  # required relative residual of each island
     double reference_energy     # sqrt J, if the problem has one island
     double reference_velocity   # m/s
-    double energy_limit         # of the present island, sqrt J
+    double energy_limit         # sqrt J, limit of the present island
     double velocity_limit       # m/s
     int32_t steps               # remaining Newton steps
     int32_t factorisations

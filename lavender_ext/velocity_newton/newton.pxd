@@ -190,7 +190,7 @@ cdef inline void set_theta_to_maximum(double* theta, int32_t first, int32_t end)
 cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double softness) noexcept nogil:
     """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_relative_compliance` d.
 
-    Rows of one friction component softness the largest theta'.
+    All rows of one friction component get the largest theta' among them.
     """
     cdef int32_t a, i, j, k, g, end, last
     cdef friction_components_t q

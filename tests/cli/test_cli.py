@@ -414,7 +414,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch
     for place in ("file",) if "/sub" in words else ("file", "absent"):  # a folder is made, with its parents
         code, out, err = lavender(*words.format(tmp_path / place).split())
         assert (code, out) == (cli.EXIT_BAD_INPUT, "")
-        assert re.search(r"^lavender: cannot write .*; (make|give) ", err)
+        assert re.search(r"^lavender: cannot (write|create) .*; (create|give) ", err)
         assert str(tmp_path / place) in err
 
 

@@ -34,7 +34,7 @@ def test_options_that_have_no_effect_are_refused(lavender, tmp_path):
     for words, sign in (
         (("@walking", "--check", "--out", tmp_path / "b"), "--out has no effect with --check"),
         (("--certify", tmp_path / "m.json", "--check"), "--check has no effect with --certify"),
-        (("--page", tmp_path / "none" / "page.md"), "make it first"),
+        (("--page", tmp_path / "none" / "page.md"), "create it first"),
     ):
         code, _, err = lavender("problems", *words)
         assert code == 2 and sign in err

@@ -261,7 +261,7 @@ MALFORMED = {
     "a flat M": (lambda g: {"M": g["M"].reshape(3, -1)}, "M has shape"),
     "M of other velocities": (lambda g: {"M": g["M"][:, 1:, 1:]}, "M has shape"),
     "a triangle without pointers": (lambda g: {"M": (g["M"][:, 0],)}, "M has shape"),
-    "a triangle out of range": (lambda g: {"M": (g["M"][:, 0], [1, 2], [0, 1, 2])}, "M's rows must"),
+    "a triangle out of range": (lambda g: {"M": (g["M"][:, 0], [1, 2], [0, 1, 2])}, "M must hold lower triangles"),
     "no contacts": (lambda g: {"contacts": ()}, "contacts is"),
     "contacts without friction": (lambda g: {"contacts": g["contacts"][:3]}, "contacts is"),
     "contacts of several lengths": (lambda g: contact(g, 0, lambda x: x[1:]), "efc_address of contacts has shape"),

@@ -233,7 +233,7 @@ def test_files_that_are_no_problem_are_refused(tmp_path):
         out.writestr("b.npy", npy("<f8", (0,)))
         with pytest.warns(UserWarning, match="Duplicate"):
             out.writestr("b.npy", npy("<f8", (0,)))
-    with pytest.raises(lv.InputError, match="under each name"):
+    with pytest.raises(lv.InputError, match="for each name"):
         lavender.io.load(tmp_path / "twice.npz")
 
 

@@ -185,13 +185,13 @@ def test_refusals_say_what_came_and_what_to_do():
     with pytest.raises(lv.CapabilityError, match="given as a matrix"):
         d.vjp(velocity=np.ones(3))
     g = d.vjp(impulse=np.ones(3))
-    with pytest.raises(lv.CapabilityError, match="J is of problems given as rows or generalized"):
+    with pytest.raises(lv.CapabilityError, match="J exists only for problems given as rows or generalized"):
         _ = g.J
     with pytest.raises(AttributeError, match="a gradient has no 'weight'"):
         _ = g.weight
     p = table()
     d = lv.derivative(p, lv.solve(p, tol=1e-12))
-    with pytest.raises(lv.InputError, match="the change of M is not symmetric"):
+    with pytest.raises(lv.InputError, match="the change of M must be symmetric"):
         d.jvp(M=np.triu(np.ones((3, 3))))
 
 
@@ -278,7 +278,7 @@ def test_batches_of_another_length_are_refused():
     found = lv.derivatives([p], [s]).vjp(impulse=[np.ones(p.m)])
     with pytest.raises(AttributeError, match=r"gradients of all problems have no 'M'; \[i\]"):
         found.M  # noqa: B018 - read
-    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is not a matrix"):
+    with pytest.raises(lv.InputError, match="full needs one of A, J, M; 'mu' is not a matrix"):
         found[0].full("mu")
     assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
 

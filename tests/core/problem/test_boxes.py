@@ -91,8 +91,8 @@ def test_findex_comes_back_in_any_order(seed):
         ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "upper is mu"),
         ([0, 1, -1], [np.inf, -1, 1], [-1, 0, 0], "upper is mu"),
         ([0, 2, -1], [np.inf, 1, 1], [-1, -1, 0], "lower <= upper"),
-        ([0, -1, -1], [5, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
-        ([-1, -1, -1], [np.inf, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
+        ([0, -1, -1], [5, 1, 1], [-1, 0, 0], r"a normal needs \[0, inf\]"),
+        ([-1, -1, -1], [np.inf, 1, 1], [-1, 0, 0], r"a normal needs \[0, inf\]"),
         ([0, -1], [np.inf, 1], [-1, 0, 0], "shape"),
     ],
 )
@@ -107,14 +107,14 @@ def test_fixed_normals_make_constant_bounds():
 
 
 def test_what_findex_cannot_hold_is_told():
-    with pytest.raises(lv.InputError, match="3 rows follow row 0"):
+    with pytest.raises(lv.InputError, match="findex of 3 rows is 0"):
         lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [np.inf, 1, 1, 1], [-1, 0, 0, 0])
     disk = lv.Problem.contact(np.eye(3), np.ones(3), 0.5)
     with pytest.raises(lv.InputError, match=r"shaped\('box'\)"):
         disk.to_findex()
     with pytest.raises(lv.InputError, match=r"relaxed\('coulomb'\)"):
         free(1, friction="cone").to_findex()
-    with pytest.raises(lv.InputError, match="bounds its tangents together"):
+    with pytest.raises(lv.InputError, match="bounds the norm of its tangents"):
         dragged(0, 3).to_findex()
 
 

@@ -38,7 +38,7 @@ INVALID_PROBLEM = {
     "no such shape": (lambda: lv.Cones.contacts(0.5, shape="square"), "unknown shape 'square'"),
     "a side below zero": (lambda: lv.Cones.contacts([(0.5, -0.2)], shape="box"), "mu"),
     "three sides": (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),
-    "a box that spins": (lambda: lv.Cones.contacts(0.5, 2, 0.1, shape="box"), "no spin"),
+    "a box that spins": (lambda: lv.Cones.contacts(0.5, 2, 0.1, shape="box"), "neither spin"),
     "a box of three tangents": (lambda: lv.Cones.contacts(0.5, 3, shape="box"), "up to two tangents"),
     "a box of four rows": (
         lambda: lv.Cones([0, 4], [4], np.zeros(4), np.ones(4), [0.5], [1.0]),
@@ -50,7 +50,7 @@ INVALID_PROBLEM = {
     "one arm for two": (lambda: lv.Cones.contacts([0.5, 0.5], rolling=[0.1]), "rolling"),
     "rolling in four rows": (
         lambda: lv.Cones([0, 4], [lv.CONTACT_ROLLING], np.zeros(4), np.ones(4), [0.5], [0.0], [0.1]),
-        "5 rows or 6",
+        "5 or 6",
     ),
     "an ellipse without a side": (
         lambda: lv.Cones.contacts([(0.5, 0.0)]),
@@ -60,13 +60,19 @@ INVALID_PROBLEM = {
         lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]),
         "contact 1 is",
     ),
-    "an ellipse of one tangent": (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
-    "an ellipse that spins": (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
+    "an ellipse of one tangent": (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "neither spin nor rolling"),
+    "an ellipse that spins": (
+        lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1),
+        "neither spin nor rolling",
+    ),
     "an ellipse that spins, of a problem": (
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1),
-        "bounds no spin",
+        "neither spin nor rolling",
     ),
-    "an ellipse that rolls": (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
+    "an ellipse that rolls": (
+        lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1),
+        "neither spin nor rolling",
+    ),
     "an ellipse of two rows": (
         lambda: lv.Cones([0, 2], [lv.CONTACT_ELLIPSE], np.zeros(2), np.ones(2), [0.5], [1.0]),
         "ellipse of 2 rows",

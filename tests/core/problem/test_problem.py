@@ -155,7 +155,7 @@ BAD_PROBLEMS = {
     ),
     "lower > upper": (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
     "rows per contact": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows for 2"),
-    "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangents"),
+    "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangent rows"),
     "law": (
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
         "'coulomb' or 'cone'",
@@ -166,7 +166,10 @@ BAD_PROBLEMS = {
     ),
     "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
     "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
-    "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),
+    "compliance": (
+        lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]),
+        "already contains it on its diagonal",
+    ),
     "both forms": (
         lambda: lv.Problem(
             np.ones(2), lv.Cones.free(2), I2, rows=random_bodies_and_contacts(np.random.default_rng(0))
