@@ -24,7 +24,7 @@ cdef enum:
     FIRST_FACTORISATIONS = 12   # Newton's factorisations before sweeps continue
     RESUMED_SWEEP_RATIO = 8     # Sweeps then continue to this multiple of `max_sweeps` in total.
     MAX_SUBPROBLEM_FACTORISATIONS = 120    # maximum factorisations of one subproblem
-    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's reduction, over this many times the remaining checks, reaches tol.
+    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's reduction over this many times the remaining checks reaches tol.
     SWEEP_NS_PER_ROW = 15       # cost of a sweep with its mixing [ns] per row, plus 1 ns per entry of A
     SWEEP_NS_PER_BODY_ROW = 32  # or this per row over bodies
     FACTOR_NS_PER_ROW = 150     # cost of a factorisation with its steps [ns] per row,
