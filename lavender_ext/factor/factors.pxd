@@ -30,6 +30,13 @@ cdef inline void no_pivots(pivots_t* out) noexcept nogil:
     out.first_small = -1
 
 
+cdef struct interrupt_t:        # checks for signals during a factorisation, which may take minutes
+    void* at
+    int32_t (*is_requested)(void* at) noexcept nogil        # whether the factorisation must end
+    double work                 # multiply-adds since the last check
+    int32_t stopped             # A check has ended a factorisation; the caller resets it.
+
+
 cdef struct supernodal_t:
     int32_t n                   # rows
     int32_t supernodes
@@ -53,6 +60,7 @@ cdef struct supernodal_t:
     int32_t* head               # (supernodes) first descendant that updates a supernode next,
     int32_t* link               # (supernodes) and the next one
     int32_t* next_row           # (supernodes) first row of a supernode that has not updated its supernode
+    interrupt_t* interrupt      # or NULL
 
 
 cdef struct sparse_t:

@@ -23,7 +23,7 @@ The fallback is a factorisation by the caller: SuperLU of SciPy (`lavender/base/
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.factors cimport block_matrix_t, pivots_t, sparse_t
+from lavender_ext.factor.factors cimport block_matrix_t, interrupt_t, pivots_t, sparse_t
 
 
 cdef enum:                      # kinds
@@ -123,6 +123,7 @@ cdef int32_t linear_sign(const linear_t* f) noexcept nogil
 cdef class LinearSystem:
     cdef linear_t f
     cdef fallback_t calls
+    cdef interrupt_t interrupt                          # of ROWS: a signal's exception ends a factorisation
     cdef readonly object indptr, indices                # pattern of ROWS
     cdef readonly object data                           # (nnz) entries of the last factor of ROWS
     cdef object analysis, numbers, upper, splu, other, error, held

@@ -1,4 +1,5 @@
 """One linear system: the functions of `linear.pxd`, compiled once, and `LinearSystem`, which gives Python the same system."""
+from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
@@ -14,7 +15,7 @@ from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve
 from lavender_ext.factor.blocks cimport factor_blocks
 from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
                                         dense_lu_solve, dense_lu_solve_transposed, panel_offset)
-from lavender_ext.factor.factors cimport block_matrix_t, has_wide, no_pivots, supernodal_t
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t, no_pivots, supernodal_t
 from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, analyse_dense,
                                          backward_tolerance, fallback_t, linear_t)
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
@@ -106,7 +107,7 @@ cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* inde
     """Bind the values of N and of its factor, after `analyse_blocks`; neither array needs initial values."""
     cdef supernodal_t* p = &f.factor
     cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s
-    p.wide = wide
+    p.wide, p.interrupt = wide, NULL
     p.swap, p.local_row, p.head = index, index + p.n, index + 2 * p.n
     p.link, p.next_row = p.head + f.n, p.head + 2 * f.n
     f.nval = real
@@ -320,6 +321,17 @@ cdef int32_t linear_sign(const linear_t* f) noexcept nogil:
 # -- for Python --------------------------------------------------------------------------------------------------
 
 
+cdef int32_t is_interrupted(void* at) noexcept with gil:
+    """Run the handlers of signals that have arrived; their exception is raised by `raise_error`."""
+    cdef LinearSystem system = <LinearSystem>at
+    try:
+        PyErr_CheckSignals()
+    except BaseException as error:
+        system.error = error
+        return 1
+    return 0
+
+
 cdef int32_t call_fallback(void* at) noexcept with gil:
     cdef LinearSystem system = <LinearSystem>at
     if system.error is not None:                        # The caller is about to raise it.
@@ -393,6 +405,8 @@ cdef class LinearSystem:
         f.link, f.next_row, f.row_indices = f.head + k, f.head + 2 * k, f.head + 3 * k
         f.value_offset, f.upper_offset = &offsets[0], &offsets[0] + k + 1
         f.n, f.supernodes, f.wide = n, k, self.f.wide
+        self.interrupt = interrupt_t(<void*>self, is_interrupted, 0.0, 0)
+        f.interrupt = &self.interrupt
         self.entries = f.value_offset[k]
         index = self.indptr
         self.f.rows.indptr = &index[0]
@@ -434,7 +448,7 @@ cdef class LinearSystem:
         return 0
 
     cdef int raise_error(self) except -1:
-        """Raise the error of the fallback, if any."""
+        """Raise the error of the fallback or of a signal's handler, if any."""
         error, self.error = self.error, None
         if error is not None:
             raise error
@@ -489,6 +503,7 @@ cdef class LinearSystem:
             self.f.d = &metric[0]
         self.f.rows.data = self.f.matrix = <double*>&x[0]
         self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
+        self.interrupt.stopped = 0
         with nogil:
             lost = linear_factor(&self.f)
         self.raise_error()

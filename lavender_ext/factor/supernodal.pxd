@@ -14,9 +14,25 @@ compressed rows, `blocks.pxd` from square blocks.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.factor.factors cimport supernodal_t
+from lavender_ext.factor.factors cimport interrupt_t, supernodal_t
 from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, gemm_subtract_lower, lu_panel
 from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
+
+
+cdef inline double interrupt_check_interval() noexcept nogil:
+    """Return the number of multiply-adds between two checks: 0.03 s to 0.2 s."""
+    return 2e8
+
+
+cdef inline bint is_stopped(const supernodal_t* f, double work) noexcept nogil:
+    """Count `work` multiply-adds; return whether a check, perhaps an earlier one, ended the factorisation."""
+    cdef interrupt_t* c = f.interrupt
+    if c == NULL:
+        return False
+    c.work += work
+    if c.work > interrupt_check_interval() and not c.stopped:
+        c.work, c.stopped = 0.0, c.is_requested(c.at)
+    return c.stopped
 
 
 cdef inline int32_t panel_width(const supernodal_t* f, int32_t i) noexcept nogil:
@@ -188,15 +204,21 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
                                      double min_lu_pivot) noexcept nogil:
     """Factor supernode i, whose entries of N are filled in and whose `local_row` is set; return the number of lost pivots.
 
+    After a request to end, every pivot counts as lost.
+
     min_pivot (n), by position, is that of `cholesky_panel`, or NULL; min_lu_pivot that of `lu_panel`.
     """
     cdef int32_t k = f.head[i], after, lost, width = panel_width(f, i), below = rows_below(f, i)
     cdef double* a = f.values + f.value_offset[i]
     while k >= 0:
         after = f.link[k]
+        if is_stopped(f, <double>panel_width(f, k) * (f.row_ptr[k + 1] - f.next_row[k]) * width):
+            return width
         subtract_descendant(f, i, k, lu)
         link_descendant(f, k, f.next_row[k])
         k = after
+    if is_stopped(f, 0.5 * width * width * (width + below)):
+        return width
     if lu:
         lost = lu_supernode(f, width, below, a, f.upper + f.upper_offset[i], f.swap + f.first[i], min_lu_pivot)
     else:

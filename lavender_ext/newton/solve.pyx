@@ -6,6 +6,7 @@ The unit of work is a factorisation; a step may do one or two more than requeste
 The method is compiled here once: other modules call the functions of `solve.pxd` by pointer. The classes give Python the
 same method, with arrays that `newton_t` points to, and its linear systems for tests.
 """
+from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
@@ -17,7 +18,7 @@ from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
-from lavender_ext.factor.factors cimport block_matrix_t, has_wide
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t
 from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, analyse_blocks, analyse_dense, block_factor_index_size,
                                          block_factor_size, block_pattern_index_size)
 from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
@@ -209,6 +210,18 @@ cdef void call_solve(void* at, double* x) noexcept with gil:
         view[:] = np.nan
 
 
+cdef int32_t is_interrupted(void* at) noexcept with gil:
+    """Run the handlers of signals that have arrived; an exception ends the step."""
+    cdef Solve self = <Solve>at
+    try:
+        PyErr_CheckSignals()
+    except BaseException as error:
+        self.raised = error
+        self.n.stop = 1
+        return 1
+    return 0
+
+
 cdef inline object part(object array, const void* at, Py_ssize_t n):
     cdef Py_ssize_t i = (<const char*>at - <const char*>get_data_pointer(array)) // <Py_ssize_t>array.itemsize
     return array[i:i + n]
@@ -271,6 +284,7 @@ cdef class Solve(Method):
     """
     cdef newton_t* n
     cdef external_t calls
+    cdef interrupt_t interrupt
     cdef list held
     cdef object others, raised, real, index
     cdef LinearSystem linear                            # of a sparse H
@@ -308,6 +322,7 @@ cdef class Solve(Method):
         self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
         self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
         self.calls = external_t(<void*>self, call_factor, call_solve)
+        self.interrupt = interrupt_t(<void*>self, is_interrupted, 0.0, 0)
 
     @property
     def whole(self):
@@ -388,6 +403,7 @@ cdef class Solve(Method):
         bind_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
                     <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
                     <double*>get_data_pointer(values) + factored)
+        f.factor.interrupt = &self.interrupt
 
     # -- start and step ----------------------------------------------------------------------------
 
@@ -400,6 +416,9 @@ cdef class Solve(Method):
 
     def step(self, int work, double[::1] impulse):
         """Do `work` factorisations or a few more; return the outcome, and write the best impulse (rows,)."""
+        self.interrupt.stopped = 0
+        if self.linear is not None:
+            self.linear.interrupt.stopped = 0
         Method.step(self, work, impulse)
         if self.linear is not None:
             self.linear.raise_error()
