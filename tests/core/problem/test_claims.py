@@ -322,7 +322,7 @@ def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register
     assert first.impulse.tobytes() == bits and str(first).rpartition(",")[0] == word
     for solution in (first, second):
         assert np.isfinite(solution.impulse).all() or not solution.success
-        assert (way in ("shape", "dtype")) == ("of the impulse an array of shape" in solution.message)
+        assert (way in ("shape", "dtype")) == ("changed the impulse to an array of shape" in solution.message)
         np.testing.assert_equal(solution.residual.relative, lv.residual(problem, solution.impulse).relative)
 
 
