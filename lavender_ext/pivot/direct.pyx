@@ -172,9 +172,11 @@ cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexce
 # -- linear systems and exchanges --------------------------------------------------------------------------------
 
 cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
-    """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
+    """Factor A with all rows free: SOLVED, SMALL_PIVOT, INDEFINITE, or ROUNDS_USED if an outside factor is not started."""
     if not t.s.is_factored:
         factor_all_rows(&t.s)
+    if t.s.late:
+        return ROUNDS_USED
     if t.s.linear.pivots.negative > 0:
         return INDEFINITE
     if t.s.linear.pivots.small == 0:
