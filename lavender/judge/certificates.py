@@ -42,6 +42,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, TooLate
 from lavender.judge.residuals import divide_by_reference, get_reference
 from lavender.problem import Problem
+from lavender_ext.factor.linear import LinearSystem
 
 __all__ = [
     "Proof",
@@ -70,6 +71,11 @@ MAX_POLISHED_ROWS = (
 LEAST_SQUARES_TIME = (
     6e-10  # s for each (row x column x smaller of both) of the dense least squares, measured.
 )
+LEAST_SQUARES_SHIFT = (
+    1e-14  # Shift of the normal equations, relative to their trace: above the rounding of a factor.
+)
+LEAST_SQUARES_ITERATIONS = 6  # Each one divides the error by 1 + (singular value)^2 / shift.
+PRODUCT_COLUMNS = 8  # OpenBLAS starts threads for products of more than 262,144 multiply-adds.
 
 
 @dataclass(frozen=True)
@@ -400,10 +406,34 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
         if deadline.passed(seconds):
             raise TooLate(seconds)
         system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
-        y[rows] -= np.linalg.lstsq(system, z[columns], rcond=1e-9)[0] / length[rows]
+        y[rows] -= _solve_least_squares(system, z[columns]) / length[rows]
     spacing = 2.0**-25 * _round_down_to_power_of_two(y)
     yield np.rint(y / spacing) * spacing
     yield y
+
+
+def _solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Return the shortest x (n,) with the least |S x - z|, for S (k, n) and z (k,), without singular values below 1e-7.
+
+    Proximal iteration with x += S^T (S S^T + s I)^-1 (z - S x), or with (S^T S + s I)^-1 S^T if n < k. Compared with a
+    singular value decomposition by LAPACK, one factor of the smaller side takes a tenth of the time and no threads.
+    """
+    wide = matrix.shape[0] < matrix.shape[1]
+    product = np.zeros(2 * (min(matrix.shape),))
+    short = matrix if wide else matrix.T
+    for first in range(0, short.shape[1], PRODUCT_COLUMNS):  # Larger products start BLAS's threads.
+        part = np.ascontiguousarray(short[:, first : first + PRODUCT_COLUMNS])
+        product += part @ part.T
+    size = float(np.trace(product))
+    x = np.zeros(matrix.shape[1])
+    if not 0.0 < size < math.inf:
+        return x
+    factor = LinearSystem(len(product))
+    factor.factor(product, None, LEAST_SQUARES_SHIFT * size)
+    for _ in range(LEAST_SQUARES_ITERATIONS):
+        error = rhs - matrix @ x
+        x += matrix.T @ factor.solve(error) if wide else factor.solve(matrix.T @ error)
+    return x
 
 
 def _explain_recession_violation(problem: Problem, y: FloatArray) -> str | None:
