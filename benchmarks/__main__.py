@@ -19,6 +19,7 @@ NAMES = (
     "page",
     "peers",
     "rates",
+    "regret",
     "stability",
     "stand",
     "worlds",
