@@ -45,10 +45,11 @@ SETUP_RATES = (
     "disk row", "disk entry", "matrix disk", "matrix disk row", "matrix disk entry", "judge product",
     "judge whitening", "judge entry",
 )  # fmt: skip
-NEWTON_RATES = ("start", "row", "entry", "bodies", "dense", "panels", "velocities")
+NEWTON_RATES = ("start", "row", "entry", "bodies", "dense", "panels", "velocities", "velocity row",
+                "velocity contact row")  # fmt: skip
 PIVOT_RATES = ("pivot row", "pivot work")
-SWEEP_RATES = ("sweep row", "sweep entry", "sweep cone")
-MEASURED_SWEEPS = 400
+SWEEP_RATES = ("sweep row", "sweep entry", "sweep cone", "sweep velocities")
+MEASURED_SWEEPS = 100  # The first sweeps cost more, and `auto` uses about as many.
 
 Fit = dict[str, float]  # Rate by name [ns].
 Line = tuple[str, dict[str, float], float]  # (problem, {rate: number of operations}, time [ns]).
@@ -113,7 +114,11 @@ def newton_lines() -> Iterator[Line]:
                 continue
             if state.general is not None:
                 each = steps / max(1, state.general.islands)
-                counts = {"entry": each * problem.metric.work, "velocities": each * state.general.work}
+                contact_rows = 0 if law == "lcp" else problem.m
+                counts = {
+                    "entry": each * problem.metric.work, "velocities": each * state.general.work,
+                    "velocity row": each * (problem.m - contact_rows), "velocity contact row": each * contact_rows,
+                }  # fmt: skip
             else:
                 c = state.count
                 counts = {
@@ -161,12 +166,9 @@ def sweep_lines() -> Iterator[Line]:
 
             p = fresh(problem)
             time = 1e9 * (run(p, MEASURED_SWEEPS) - run(p, 1)) / (MEASURED_SWEEPS - 1)
-            cone = p.law == "cone" and p.matrix is None
-            yield (
-                label,
-                {"sweep row": p.m, "sweep cone" if cone else "sweep entry": count_sweep_work(p)},
-                time,
-            )
+            rate = costs.get_sweep_rate(p)
+            rate = "sweep entry" if rate == "entry" else rate
+            yield label, {"sweep row": p.m, rate: count_sweep_work(p)}, time
 
 
 def with_ellipses(problem: Problem) -> Problem:

@@ -48,9 +48,6 @@ if TYPE_CHECKING:
 __all__ = ["Solutions", "solve_many"]
 
 # Worlds that are not started before the deadline are late: their start is judged.
-# Costs [ns] of such a world: to judge it in the compiled loop if it has J and M (the cost per entry is added), and to
-# store it if it belongs to a list of problems. The numbers of stored worlds are judged when they are read.
-JUDGED_LATE_WORLD_COST, LATE_WORLD_COST = 4e3, 4e4
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
@@ -222,11 +219,11 @@ class Solutions(Many, Sequence[Solution]):
             )
             entries = np.where(columns > 0.0, columns, rows)  # Entries of a row of J, or of A.
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
-            return float(JUDGED_LATE_WORLD_COST * len(rows) + RATES["judge entry"] * products)
+            return float(RATES["judged late world"] * len(rows) + RATES["judge entry"] * products)
         return sum(
-            JUDGED_LATE_WORLD_COST + estimate_judge_setup_cost(p) + estimate_pass_cost(p)
+            RATES["judged late world"] + estimate_judge_setup_cost(p) + estimate_pass_cost(p)
             if data and p.generalized
-            else LATE_WORLD_COST
+            else RATES["late world"]
             for p, data in zip(self.problems, self._data, strict=True)
         )
 
@@ -407,7 +404,7 @@ def solve_many(
         has_failed = solutions._worlds.code[i] == CODE["tried"]
         if deadline.is_set:
             if not isinstance(worlds, Batch):
-                deadline.reserve(-1e-9 * LATE_WORLD_COST)
+                deadline.reserve(-1e-9 * RATES["late world"])
             if deadline.passed():
                 check_accepted(problem, spec, deadline)
                 unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")

@@ -25,11 +25,10 @@ from lavender.external.running import call_backend_until_accepted
 from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
+from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
 
 MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
-FORM_COST = 1e6  # [ns] Forming any program costs up to this, 1.5 times the measured time.
-FORM_ENTRY_COST = 120.0  # [ns] Additional cost for each entry of A, 1.5 times the measured time.
 OPTION_HELP = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default: by size, mass ratio and backend); not for programs",
@@ -57,8 +56,8 @@ class QPSolver(Solver):
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
         """Estimate the cost to form the program, and to send it if the backend runs in another process."""
-        entry = FORM_ENTRY_COST + (1e9 * ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
-        return Cost(lambda: FORM_COST + entry * problem.max_entries)
+        entry = RATES["program entry"] + (1e9 * ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
+        return Cost(lambda: RATES["program"] + entry * problem.max_entries)
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:

@@ -40,7 +40,6 @@ from lavender.solvers.costs import (
 )
 from lavender.solvers.factors import (
     MAX_DENSE_RANK_ROWS,
-    PANELS_WORK_COST,
     PIVOT_TOLERANCE,
     USE_WIDE_LANES,
     get_sorted_csr_arrays,
@@ -60,10 +59,8 @@ _ADMM_PATIENCE = 5000
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
 # `prepare` scales the problem if that is estimated to cost up to this [ns]; otherwise `run` does.
 MAX_SETUP_SCALING_COST = 5e6
-_SCALING_ENTRY_COST = 10.0  # Cost [ns] per entry of A.
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
-_FULL_WORK_COST = 0.4  # Cost [ns] per multiply-add of L U of a full matrix.
 
 
 class _Breakdown(Exception):
@@ -140,11 +137,11 @@ class AdmmState:
             setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
             setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
             work = Layout(rows.block_bodies, rows.n_bodies, 6).work
-            return float(setup + rates["form row"] * n + PANELS_WORK_COST * work)
+            return float(setup + rates["form row"] * n + rates["panels work"] * work)
         if not problem.m:
             return 0.0
         work = (1.0 + self.lu) * _analyse_panels(self.system).cost
-        return float(rates["form row"] * problem.m + PANELS_WORK_COST * work)
+        return float(rates["form row"] * problem.m + rates["panels work"] * work)
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -194,7 +191,7 @@ class AdmmState:
             done = _factor_system(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # Row exchanges across supernodes are needed.
-            if self.deadline.passed(1e-9 * _FULL_WORK_COST * count_dense_work(m)):
+            if self.deadline.passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
                 raise TooLate
             self.full = True
             self.matrix = matrix = matrix.toarray()
@@ -220,7 +217,7 @@ def _estimate_scaling_cost(problem: Problem) -> float:
         product = rates["full layout entry"] * entries
         product += rates["dense factor"] * float(problem.metric.products_of_matrix)
         form = min(form, rates["set-up"] + product)
-    return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + _SCALING_ENTRY_COST * entries)
+    return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + rates["scaling entry"] * entries)
 
 
 def _estimate_setup_cost(problem: Problem) -> float:

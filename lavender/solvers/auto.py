@@ -5,8 +5,6 @@
                      estimated to cost no more than the first sweeps (`small.py`); attempted once
     sweeps           (`anderson`, unless the problem is linear) `first_sweeps`, then as many as cost as much as the
                      cheapest factorising solver, unless more are predicted to remain
-    loose pile       under Coulomb's law, for the same cost again, conjugate gradients over sweeps (`nncg`), first under
-                     the cone law unless there is rolling or torsional friction
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
                      cheapest first, each up to `budget_ratio` times its estimated cost
     certificate      that there is no solution: for J and M from the smallest violation, for others under Coulomb's law
@@ -41,12 +39,12 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.certify import (
-    MIN_LINEAR_PROGRAM_COST,
     certify_by_least_violation,
     certify_by_linear_programs,
     certify_infeasibility,
 )
 from lavender.solvers.costs import (
+    RATES,
     estimate_first_factor_cost,
     estimate_first_sweep_cost,
     estimate_formation_cost,
@@ -54,7 +52,6 @@ from lavender.solvers.costs import (
     get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
-from lavender.solvers.islands import count_pairs
 from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.recording import Recorder
@@ -114,6 +111,7 @@ class Tree:
 
     remaining_cost = 0.0  # Cost [ns] that remains for the alternation.
     compiled_call_failed = False  # The compiled call over velocities of J and M has failed.
+    started_from_zero = False  # That call started from the zero impulse.
     sweeps_failed = False  # Sweeps did not improve the residual in the alternation.
     best = nan
 
@@ -169,17 +167,32 @@ class Tree:
     @property
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
-        p = self.problem
         found = {name: state.cost for name, state in self.states.items()}  # `Newton.cost` with the state.
-        if p.matrix is not None and self.law == "lcp":
+        if self.can_pivot:
             found["direct"] = self.direct
         failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
         return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
 
     @cached_property
+    def can_pivot(self) -> bool:
+        """Whether `direct` is considered: for bounded rows, if A is given or costs less than the first sweeps."""
+        if self.law != "lcp":
+            return False
+        if self.formation > DECISIONS.first_sweeps * self.sweep:
+            return False
+        return not (
+            self.deadline.is_set and self.deadline.passed(1e-9 * self.formation / DECISIONS.time_share)
+        )
+
+    @cached_property
+    def formation(self) -> float:
+        """Cost to form A of bodies or of J and M [ns], whether or not it is cached."""
+        return estimate_formation_cost(self.problem, self.problem.matrix is not None)
+
+    @cached_property
     def direct(self) -> float:
-        """Cost of `direct` on bounded rows of a matrix [ns]."""
-        return estimate_cost("direct", self.problem).total
+        """Cost of `direct` on bounded rows [ns], with the formation of A."""
+        return self.formation + estimate_cost("direct", self.problem).total
 
     @property
     def newton(self) -> float:
@@ -212,18 +225,13 @@ class Tree:
         p, first = self.problem, DECISIONS.first_sweeps * self.sweep
         if self.law == "linear" or p.cones.has_round:
             return True
+        if self.can_pivot and self.direct < first:
+            return True
+        if self.compiled_call_failed:  # From the same start, Newton's method would stall again.
+            return False
         if p.matrix is not None:
-            return self.law == "lcp" and self.direct < first
+            return False
         return self.min_newton_cost < first and self.newton < first
-
-    @cached_property
-    def is_loose(self) -> bool:
-        """Whether nearly every contact under Coulomb's law is between another pair of bodies or of trees of M.
-
-        Sweeps then determine quickly which contacts stick.
-        """
-        p = self.problem
-        return self.law == "coulomb" and count_pairs(p) > DECISIONS.loose_fraction * p.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order; each is only needed if the stages before it did not solve the problem."""
@@ -231,7 +239,7 @@ class Tree:
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
         first = DECISIONS.first_sweeps * self.sweep
-        if self.factorises_first and p.matrix is not None and self.law == "lcp":
+        if self.factorises_first and self.can_pivot and self.direct < first:
             cost = ratio * self.direct
             yield Stage(
                 "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
@@ -242,9 +250,6 @@ class Tree:
         if not self.factorises_first and first < self.newton < inf:
             why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
-            if self.is_loose:
-                name = "nncg" if p.cones.has_more_components else "nncg from the cone law"
-                yield self.iterations(name, self.newton, f"a loose pile, {why}")
         if p.generalized is not None and not np.all(p.compliance):
             yield from islice(self.factorisations(0.25 * ratio), 1)
             state = self.states.get("newton")  # The smallest violation is found over velocities.
@@ -252,8 +257,8 @@ class Tree:
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.factorisations(ratio)
         self.add_row_form(ratio * self.newton)
-        if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= MIN_LINEAR_PROGRAM_COST:
-            yield Stage("certificate", 1.0, MIN_LINEAR_PROGRAM_COST, "whether a linear program proves it")
+        if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
+            yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
         yield from self.alternation()
 
     def alternation(self) -> Iterator[Stage]:
@@ -394,6 +399,7 @@ class Auto(Solver):
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = Tree(problem, deadline)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
+        tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
         log = SolveLog(problem, tol, max_iter, deadline)
         log.begin(impulse)
         log.recorder = recorder
@@ -530,6 +536,7 @@ def make_step(name: str, log: SolveLog, tree: Tree) -> Step:
     step = kinds.get(name, Iterations)(name, log)
     if isinstance(step, Newton):
         step.state = tree.states[name]
+        step.started_from_zero = name == "newton" and tree.started_from_zero
     return step
 
 

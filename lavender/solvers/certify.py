@@ -33,7 +33,7 @@ from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import group_blocks_by_island
-from lavender.solvers.costs import estimate_import_cost
+from lavender.solvers.costs import RATES, estimate_import_cost
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
@@ -44,7 +44,6 @@ from lavender_ext.judge.measure import residuals_by_island
 # Linear programs are used up to this many rows of all islands together.
 CERTIFICATE_ROWS = 3000
 LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
-MIN_LINEAR_PROGRAM_COST = 5e6  # Time [ns] that scipy needs for the smallest program.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
 MAX_RELAXATION_STEPS = 150  # Largest number of factorisations for a proof of the convex relaxation,
 MAX_SOFTENED_STEPS = 300  # and for the solution of a problem with additional compliance.
@@ -183,7 +182,7 @@ def certify_by_least_violation(log: SolveLog) -> None:
             rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
         )  # Negligible rows are empty.
         kernel = general.prepare(soft)
-        if kernel is None or log.ends_late(MIN_LINEAR_PROGRAM_COST):
+        if kernel is None or log.ends_late(RATES["linear program"]):
             return
         before, lam = lam, lam.copy()
         steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
@@ -221,12 +220,12 @@ def certify_infeasibility(log: SolveLog) -> None:
 def certify_by_linear_programs(log: SolveLog) -> None:
     """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize")):
+    if log.best < 1e-6 or log.ends_late(RATES["linear program"] + estimate_import_cost("scipy.optimize")):
         return
     total_rows = 0
     for part, rows in _list_unsolved_islands(log):
         total_rows += part.m
-        if total_rows > CERTIFICATE_ROWS or log.ends_late(MIN_LINEAR_PROGRAM_COST):
+        if total_rows > CERTIFICATE_ROWS or log.ends_late(RATES["linear program"]):
             return
         if not _has_simple_bounds(part):
             continue

@@ -5,17 +5,18 @@
 Iterations, which `auto` compares; the rates are fitted means:
 
     Newton   start + n (row m + entry e + work w)                                                             (1)
-    sweep    sweep_row m + entry e, under the cone law over J sweep_cone e                                    (2)
+    sweep    sweep_row m + entry e, with another rate of e over J and M, and under the cone law over J        (2)
     direct   n (row m + work w)                                                                               (3)
 
 m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds of
 one factorisation and its solves, from the solver's own analysis (`NewtonState.count`) or from the band of A. n is the
-number of factorisations: 1 for linear problems, otherwise `DECISIONS.factorisations`, and
-`DECISIONS.pivot_factorisations` for `direct`. Newton's method over generalised velocities is compiled without a start
-or row term, and so is its estimate (`lavender_ext/small/limits.pxd`).
+number of factorisations: 1 for linear problems, `DECISIONS.pivot_factorisations` for bounded rows of a matrix or of
+bodies, otherwise `DECISIONS.factorisations`. Newton's method over generalised velocities has its own estimate, without
+a start and with two rates of rows (`lavender_ext/small/limits.pxd`).
 
 Set-ups and the judge, which are only estimated under a time limit, because they cannot be interrupted; their rates are
-1.5 times the fitted means. `python -m benchmarks rates` measures all rates and writes the file. The same problem has
+1.5 times the fitted means. `python -m benchmarks rates` measures these rates and writes the file. Rates from "band
+work" on were measured once: they choose a factorisation or decide under a time limit alone. The same problem has
 the same cost on every machine that has the same file.
 """
 
@@ -39,6 +40,8 @@ __all__ = [
     "Count",
     "count_dense_work",
     "estimate_analysis_cost",
+    "estimate_band_factor_cost",
+    "estimate_dense_factor_cost",
     "estimate_direct_cost",
     "estimate_disk_cost",
     "estimate_elimination_cost",
@@ -50,6 +53,7 @@ __all__ = [
     "estimate_matrix_setup_cost",
     "estimate_newton_cost",
     "estimate_order_cost",
+    "estimate_panel_factor_cost",
     "estimate_pass_cost",
     "estimate_refusal_cost",
     "estimate_result_cost",
@@ -59,6 +63,7 @@ __all__ = [
     "estimate_symmetry_cost",
     "get_factorisation_count",
     "get_loose_limit",
+    "get_sweep_rate",
     "is_formed",
 ]
 
@@ -70,6 +75,9 @@ SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factoris
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
 ANALYSIS_BANDWIDTH = 1500.0
 PRODUCTS_PER_BODY_ROW = 32  # Multiply-adds of a pass of the judge for each row between two bodies.
+PANELS_GROWTH_ROWS = (
+    8000.0  # A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
+)
 # A time limit above these costs [ns], constant and per entry of a full A, is about a hundred times the set-up and the
 # judge together: nothing else is estimated before the solve, because estimates take longer than a small problem.
 LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
@@ -144,16 +152,19 @@ class Count:
 # -- iterations ----------------------------------------------------------------------------------
 
 
-def get_factorisation_count(law: str) -> float:
+def get_factorisation_count(problem: Problem) -> float:
     """Return the expected number of factorisations of Newton's method: 1 for linear problems."""
-    return 1.0 if law == "linear" else DECISIONS.factorisations
+    if problem.law == "linear":
+        return 1.0
+    pivots = problem.law == "lcp" and problem.generalized is None
+    return DECISIONS.pivot_factorisations if pivots else DECISIONS.factorisations
 
 
-def estimate_newton_cost(count: Count, law: str) -> float:
+def estimate_newton_cost(count: Count, problem: Problem) -> float:
     """Estimate the cost of Newton's method over rows or bodies [ns], (1)."""
     r = RATES
     step_cost = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
-    return float(r["start"] + count.set_up + get_factorisation_count(law) * step_cost)
+    return float(r["start"] + count.set_up + get_factorisation_count(problem) * step_cost)
 
 
 def estimate_direct_cost(problem: Problem) -> float:
@@ -167,8 +178,16 @@ def estimate_direct_cost(problem: Problem) -> float:
 
 def estimate_sweep_cost(problem: Problem, work: float) -> float:
     """Estimate the cost of one sweep of `work` multiply-adds [ns], (2)."""
-    cone = problem.law == "cone" and problem.matrix is None
-    return float(RATES["sweep row"] * problem.m + RATES["sweep cone" if cone else "entry"] * work)
+    return float(RATES["sweep row"] * problem.m + RATES[get_sweep_rate(problem)] * work)
+
+
+def get_sweep_rate(problem: Problem) -> str:
+    """Return the name of the rate of a sweep's multiply-adds."""
+    if problem.matrix is not None:
+        return "entry"
+    if problem.law == "cone":
+        return "sweep cone"
+    return "entry" if problem.generalized is None else "sweep velocities"
 
 
 def count_dense_work(m: int) -> float:
@@ -272,6 +291,24 @@ def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
     """Estimate the cost of a first factor of m rows [ns]; sparse if `entries` is given and that is cheaper."""
     dense = RATES["dense factor"] * count_dense_work(m)
     return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
+
+
+def estimate_band_factor_cost(m: int, band: int) -> float:
+    """Return the cost of one compiled factor of m rows of a half bandwidth [ns]."""
+    return float(RATES["band work"] * m * float(band + 1) ** 2)
+
+
+def estimate_dense_factor_cost(m: int) -> float:
+    """Return the cost of one full Cholesky factor of m rows [ns], without the call.
+
+    LAPACK on one thread takes 0.7 to 1 times as long.
+    """
+    return float(RATES["dense work"] * count_dense_work(m) + RATES["dense entry"] * float(m) ** 2)
+
+
+def estimate_panel_factor_cost(nnz: int, m: int) -> float:
+    """Return the cost of one factor by panels with its analysis [ns], of m rows and nnz symmetric entries."""
+    return float(RATES["panels call"] + RATES["panels entry"] * nnz * (1.0 + m / PANELS_GROWTH_ROWS))
 
 
 def estimate_elimination_cost(problem: Problem, kind: str) -> float:

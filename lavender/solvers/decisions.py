@@ -44,21 +44,18 @@ NUMBERS = (
     Number("call_cost", 1e7, "ns",
            "The compiled call over J and M runs up to this estimated cost, because it does not check for Ctrl-C.",
            "A delay of 10 ms is not noticed."),
-    Number("first_sweeps", 80.0, "sweeps",
+    Number("first_sweeps", 100.0, "sweeps",
            "Sweeps before a factorising solver, unless it costs less; they predict how many remain.",
            REPLAY + "; values from 64 to 128 lose less than 5 %"),
     Number("factorisations", 18.0, "factorisations",
-           "Newton's method is expected to need this many unless the problem is linear.",
+           "Newton's method is expected to need this many with friction or over J and M; 1 for linear problems.",
            REPLAY + "; values from 12 to 25 lose less than 4 %"),
     Number("pivot_factorisations", 4.0, "factorisations",
-           "`direct` is expected to need this many for bounded rows of a matrix.",
+           "`direct`, and Newton's method for a matrix or bodies, are expected to need this many for bounded rows.",
            REPLAY + "; values of 2 and 8 lose 3 %"),
     Number("budget_ratio", 16.0, "",
            "A factorising solver may use this multiple of its estimated cost before solvers alternate.",
            REPLAY + "; values from 8 to 32 lose less than 2 %"),
-    Number("loose_fraction", 0.75, "",
-           "Contacts are a loose pile if more than this fraction of them are between different pairs of bodies.",
-           "Values from 0.5 to 0.9 select the same problems."),
     Number("total_ratio", 200.0, "",
            "All solvers together may use this multiple of Newton's estimated cost.",
            "No problem drawn at random was solved later."),
@@ -78,7 +75,6 @@ class Decisions:
     factorisations: float
     pivot_factorisations: float
     budget_ratio: float
-    loose_fraction: float
     total_ratio: float
     time_share: float
 

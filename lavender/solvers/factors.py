@@ -22,7 +22,12 @@ from lavender.base.lazy_import import import_numerics, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
-from lavender.solvers.costs import count_dense_work
+from lavender.solvers.costs import (
+    RATES,
+    estimate_band_factor_cost,
+    estimate_dense_factor_cost,
+    estimate_panel_factor_cost,
+)
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import free_part, is_mirrored
 
@@ -32,12 +37,6 @@ MAX_COMPILED_FACTOR_ROWS = 64
 MAX_COMPILED_BAND = 40  # Largest half bandwidth for which the compiled band factor is the fastest.
 MIN_DENSE_FRACTION = 0.1  # From this fraction of nonzeros, dense Cholesky is faster than sparse.
 MAX_PANELS_FRACTION = 0.25  # Up to this fraction of nonzeros, panels are considered for a linear system.
-# Costs [ns]: of a compiled band, per row and square of its width; of a full Cholesky, per call, multiply-add and entry
-# (LAPACK on one thread takes 0.7 to 1 times as long); of panels with their analysis, per call and per nonzero of A,
-# which grows by 1 + rows / PANELS_GROWTH_ROWS.
-BAND_WORK_COST, DENSE_CALL_COST, DENSE_WORK_COST, DENSE_ENTRY_COST = 0.4, 20e3, 0.03, 3.0
-PANELS_CALL_COST, PANELS_ENTRY_COST, PANELS_GROWTH_ROWS = 20e3, 17.0, 8000.0
-PANELS_WORK_COST = 0.2  # Cost [ns] per multiply-add of panels, after their analysis.
 MAX_DENSE_ROWS = 6000  # Largest dense matrix: 288 MB.
 # Use vectors of four numbers if the processor has them; the bits are the same.
 USE_WIDE_LANES = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")
@@ -63,8 +62,8 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
     nnz = len(problem._compressed[1])
     if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
         # Only one factor is needed: the cheapest one is chosen.
-        narrow = BAND_WORK_COST * m * float(band + 1) ** 2
-        full = DENSE_CALL_COST + estimate_dense_factor_cost(m)
+        narrow = estimate_band_factor_cost(m, band)
+        full = RATES["dense call"] + estimate_dense_factor_cost(m)
         if estimate_panel_factor_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
@@ -79,16 +78,6 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
         if band <= MAX_COMPILED_BAND:
             return "band", band, order
     return "sparse", m - 1, None
-
-
-def estimate_dense_factor_cost(m: int) -> float:
-    """Return the cost of one full Cholesky factor of m rows [ns], without the call."""
-    return DENSE_WORK_COST * count_dense_work(m) + DENSE_ENTRY_COST * float(m) ** 2
-
-
-def estimate_panel_factor_cost(nnz: int, m: int) -> float:
-    """Return the cost of one factor by panels [ns] of a symmetric matrix of m rows and nnz entries."""
-    return PANELS_CALL_COST + PANELS_ENTRY_COST * nnz * (1.0 + m / PANELS_GROWTH_ROWS)
 
 
 def find_small_bandwidth_order(problem: Problem) -> IntArray:

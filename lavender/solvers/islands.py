@@ -10,7 +10,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
-from lavender_ext.factor import graph
 
 
 def find_islands(problem: Problem) -> tuple[int, IntArray]:
@@ -21,23 +20,6 @@ def find_islands(problem: Problem) -> tuple[int, IntArray]:
     view = problem.derived.view
     count, label = (problem.data if view is None else view).islands()
     return int(count), label
-
-
-def count_pairs(problem: Problem) -> int:
-    """Return the number of pairs of bodies, or of trees of M, with a block between them.
-
-    For a matrix, it is the number of different column patterns of blocks: blocks between the same bodies share theirs.
-    """
-    if problem.matrix is None:
-        rows = problem.rows
-        ends = graph.tree_ends(problem.derived.view) if rows is None else rows.block_bodies
-        low, high = np.sort(ends, axis=1).T
-        return len(np.unique(low.astype(np.int64) << 32 | high))
-    indptr, indices, _ = problem._compressed
-    column_sums = np.concatenate([[0], np.cumsum(indices, dtype=np.int64)])
-    first = problem.cones.ptr[:-1]
-    columns = [indptr[first + 1] - indptr[first], column_sums[indptr[first + 1]] - column_sums[indptr[first]]]
-    return int(np.unique(np.stack(columns), axis=1).shape[1])
 
 
 def get_rows_of_blocks(problem: Problem, blocks: IntArray) -> IntArray:

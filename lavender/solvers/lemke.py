@@ -25,10 +25,9 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.certify import (
     CERTIFICATE_ROWS,
-    MIN_LINEAR_PROGRAM_COST,
     find_certificate_by_linear_program,
 )
-from lavender.solvers.costs import Cost, estimate_import_cost, estimate_matrix_setup_cost
+from lavender.solvers.costs import RATES, Cost, estimate_import_cost, estimate_matrix_setup_cost
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
@@ -39,9 +38,6 @@ RAY_MESSAGE = (
     "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
 )
 MAX_LEMKE_ROWS = 2000  # Largest number of rows: a dictionary of 32 MB.
-PIVOT_ENTRY_TIME = 1e-9  # Time [s] per entry of the dictionary in a pivot.
-# Time [s] per entry of the dictionary: to build it, and to eliminate one free row.
-DICTIONARY_ENTRY_TIME, ELIMINATION_ENTRY_TIME = 5e-8, 5e-10
 
 
 def _count_dictionary_rows(problem: Problem) -> tuple[int, int]:
@@ -79,7 +75,10 @@ class Lemke(Solver):
             return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})
         deadline = Deadline(time_limit)
         n, free = _count_dictionary_rows(state.problem)
-        if deadline.passed(DICTIONARY_ENTRY_TIME * n**2 + ELIMINATION_ENTRY_TIME * free * n**2):
+        # The dictionary is built, and every free row eliminated.
+        if deadline.passed(
+            1e-9 * (RATES["dictionary entry"] + RATES["dictionary elimination"] * free) * n**2
+        ):
             return Claim(
                 Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
             )
@@ -87,9 +86,8 @@ class Lemke(Solver):
         paths = lemke.Lemke(state.rows)
         paths.begin(impulse)
         try:
-            claim = self._follow_paths(
-                state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (PIVOT_ENTRY_TIME * n * n)))
-            )
+            chunk = max(1, int(CHUNK_TIME / (1e-9 * RATES["dictionary pivot"] * n * n)))
+            claim = self._follow_paths(state, paths, max_iter, tol, deadline, chunk)
         finally:
             paths.judge()
             best = state.rows.best
@@ -140,7 +138,7 @@ def _find_certificate_by_linear_program(
 ) -> FloatArray | None:
     """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
     if problem.m > CERTIFICATE_ROWS or deadline.passed(
-        1e-9 * (MIN_LINEAR_PROGRAM_COST + estimate_import_cost("scipy.optimize"))
+        1e-9 * (RATES["linear program"] + estimate_import_cost("scipy.optimize"))
     ):
         return None
     y = find_certificate_by_linear_program(problem, deadline)

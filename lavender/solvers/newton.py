@@ -119,14 +119,14 @@ class NewtonState:
     def steps(self) -> float:
         """Expected number of iterations; over velocities, an iteration is a step of one island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
-        return get_factorisation_count(self.problem.law) * islands
+        return get_factorisation_count(self.problem) * islands
 
     @property
     def cost(self) -> float:
         """Estimated cost of all steps [ns]."""
         if self.general is not None:
             return estimate_velocity_cost(self.problem, self.general.work)
-        return estimate_newton_cost(self.count, self.problem.law)
+        return estimate_newton_cost(self.count, self.problem)
 
 
 @dataclass(frozen=True)
@@ -165,13 +165,13 @@ class Newton(Solver):
         """Return a lower bound of the cost of all steps [ns] that needs no analysis."""
         m = float(problem.m)
         if problem.generalized is None:
-            return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem.law)
+            return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem)
         if self.form != "impulse":
             return estimate_velocity_cost(problem, 0.0)
         entries = min(float(problem.metric.entries_of_matrix), m * m)
         work = 0.0 if entries < 0.5 * m * m else count_dense_work(problem.m)
         count = Count("dense", work, entries, m, estimate_formation_cost(problem, False))
-        return estimate_newton_cost(count, problem.law)
+        return estimate_newton_cost(count, problem)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """Build the linear system of a problem, or the driver over its velocities."""
@@ -356,7 +356,7 @@ def _estimate_full_matrix_cost(problem: Problem) -> float:
     if m > MAX_FORMED_ROWS or problem.cones.has_round:
         return inf
     form = estimate_formation_cost(problem, False)
-    return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem.law)
+    return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem)
 
 
 def _run_stages(

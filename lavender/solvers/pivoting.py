@@ -12,11 +12,12 @@ from lavender.problem import Problem
 from lavender.solvers.costs import (
     RATES,
     count_dense_work,
+    estimate_band_factor_cost,
+    estimate_dense_factor_cost,
     estimate_first_factor_cost,
     estimate_sparse_work,
 )
 from lavender.solvers.factors import (
-    BAND_WORK_COST,
     MAX_COMPILED_FACTOR_ROWS,
     PIVOT_TOLERANCE,
     DenseFactor,
@@ -24,13 +25,11 @@ from lavender.solvers.factors import (
     LUFactor,
     SparseFactor,
     choose_factorisation,
-    estimate_dense_factor_cost,
     find_small_bandwidth_order,
     half_bandwidth_in_order,
 )
 from lavender_ext.pivot.direct import Pivoting
 
-SWEEP_ENTRY_TIME = 4e-9  # Time [s] per nonzero of a symmetric sweep with its slack.
 # Smallest and largest number of symmetric Gauss-Seidel sweeps that guess the free rows.
 MIN_GUESS_SWEEPS, MAX_GUESS_SWEEPS = 2, 24
 # These sweeps may cost this fraction of a factor; a multiply-add of a sweep takes a nanosecond.
@@ -92,9 +91,8 @@ class PivotState:
         )
         get_reference(problem)
         # Time [s] of one round with a compiled factor: estimated for all rows free, then that of the last round.
-        self.seconds = (
-            1e-9 * BAND_WORK_COST * problem.m * (band + 1.0) ** 2 + SWEEP_ENTRY_TIME * problem.csr_data.work
-        )
+        sweep_cost = RATES["symmetric sweep entry"] * problem.csr_data.work  # With its slack [ns].
+        self.seconds = 1e-9 * (estimate_band_factor_cost(problem.m, band) + sweep_cost)
         self.rows = Pivoting(
             problem.csr_data, band, order, PIVOT_TOLERANCE, problem.metric, self.outside, problem.law == "linear",
             self.symmetric,
@@ -124,7 +122,8 @@ class PivotState:
 
     def is_too_late_to_sweep(self, deadline: Deadline) -> bool:
         """Return whether the sweeps before the first factor would end after the deadline."""
-        return deadline.passed(self.sweeps * SWEEP_ENTRY_TIME * self.problem.csr_data.work)
+        cost = self.sweeps * RATES["symmetric sweep entry"] * self.problem.csr_data.work
+        return deadline.passed(1e-9 * cost)
 
     def advance(self, deadline: Deadline, max_rounds: int) -> tuple[int, bool]:
         """Run at most `max_rounds` rounds that are expected to end before the deadline.

@@ -30,10 +30,10 @@ from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
+from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
 
-# Assumed number of rows of (1) or (2) per row of the problem, and time [s] per row to build them.
-ROWS_RATIO, ROW_COST = 3.0, 2e4
+ROWS_RATIO = 3.0  # Assumed number of rows of (1) or (2) per row of the problem.
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class ThroughRows(Solver):
         own = self.solver.cost(problem)
         if problem.law in ("linear", "lcp"):
             return own
-        return Cost(lambda: ROWS_RATIO * own.setup + ROW_COST * problem.m)
+        return Cost(lambda: ROWS_RATIO * own.setup + RATES["rows of contact"] * problem.m)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""

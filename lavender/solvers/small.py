@@ -25,7 +25,6 @@ from lavender.solvers.costs import (
     estimate_formation_cost,
     estimate_judge_setup_cost,
     estimate_pass_cost,
-    get_factorisation_count,
     get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS
@@ -47,8 +46,6 @@ NO_WORK_MESSAGES = {
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
 WARM_START_MAX_RESIDUAL = 1e-3  # Newton's method starts from an iterate up to this relative residual.
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-ISLANDS_ROW_COST = 200.0  # Cost [ns] per row to separate the islands.
-TREE_OVERHEAD_COST = 2e5  # Cost [ns] of Python in two stages of the tree, which the compiled call avoids.
 # From this many rows per velocity, the matrix N is full, and small compared with the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
 VELOCITIES_OF_TWO_BODIES = 12.0
@@ -70,13 +67,15 @@ def make_limits(
     steps : float
         and do at most this many steps.
     """
-    sweep = TREE_OVERHEAD_COST, RATES["sweep row"], RATES["sweep cone"], sweeps
-    step = RATES["entry"], RATES["work"]["velocities"], get_factorisation_count("lcp")
+    sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
+    step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
+    row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ALWAYS_DENSE_ROWS, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
     return Limits(
         np.array(
             [
                 *step,
+                *row_rates,
                 *sweep,
                 general.MAX_MATRIX_ENTRIES,
                 max_cost,
@@ -103,7 +102,7 @@ def time_fraction(problem: Problem, seconds: float) -> float:
         cost = estimate_judge_setup_cost(problem) + estimate_pass_cost(problem)
     else:
         sweeps = MAX_SWEEPS_BEFORE_FACTOR * get("anderson").load()().cost(problem).iteration
-        cost = ISLANDS_ROW_COST * problem.m + estimate_formation_cost(problem) + sweeps
+        cost = RATES["island row"] * problem.m + estimate_formation_cost(problem) + sweeps
     return DECISIONS.time_share if 1e-9 * cost <= DECISIONS.time_share * seconds else 0.0
 
 

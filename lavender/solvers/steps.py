@@ -32,8 +32,6 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
     "nncg": ("nncg", NNCG_OPTIONS),
-    # For a loose pile: the convex relaxation is unique, and equals Coulomb's solution if contacts stick.
-    "nncg from the cone law": ("nncg", NNCG_OPTIONS | {"convex": int(DECISIONS.first_sweeps)}),
     "admm": ("admm", {}),
 }
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations of one call.
@@ -115,25 +113,27 @@ class Step:
 class Newton(Step):
     """Newton's method with the state that the tree has analysed.
 
-    It starts from the best impulse. If it stalls from an impulse that is not zero, it starts once more from zero.
+    It starts from the best impulse. If it stalls from an impulse that is not zero, it starts once more from zero,
+    unless the compiled call did.
     """
 
-    started_from_zero = has_stalled = False
+    started_from_zero = is_second_start = has_stalled = False
 
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero if the first one stalls."""
         log, done = self.log, self.log.iterations
         super().run(n)
         if self.has_stalled and not self.started_from_zero and not log.done():
-            self.started_from_zero, self.over, self.state.begun = True, False, False
+            self.started_from_zero = self.is_second_start = True
+            self.over = self.state.begun = False
             super().run(n - (log.iterations - done))
 
     def advance(self, n: int) -> Claim:
         """Run about n iterations; choose the start at the first call."""
         log = self.log
         if not self.state.begun:
-            self.impulse = log.problem.start() if self.started_from_zero else log.impulse.copy()
-            self.started_from_zero = not (self.impulse - log.problem.start()).any()
+            self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
+            self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
         claim = self.solver.advance(
             self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
         )

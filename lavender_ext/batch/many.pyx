@@ -115,7 +115,7 @@ cdef void store_zero_residual(task_t* j, Data p):
 
 
 cdef class Limits:
-    """Cost limits, from the fields of a `limits_t` as an array (14,)."""
+    """Cost limits, from the fields of a `limits_t` as an array (17,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):

@@ -39,27 +39,6 @@ def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const in
     return count, label_array
 
 
-def tree_ends(Data p):
-    """Return the first and the last kinematic tree that each block's rows touch, (k, 2), or -1 if they touch none."""
-    cdef const generalized_t* g = &p.general
-    cdef int32_t i, j, q, t, k = p.blocks.n_blocks
-    cdef int32_t[::1] tree = np.empty(g.n + 1, np.int32)
-    ends = np.full((k, 2), -1, np.int32)
-    cdef int32_t[:, ::1] body = ends
-    with nogil:
-        for i in range(g.n):
-            tree[i] = i if g.parent[i] < 0 else tree[g.parent[i]]
-        for i in range(k):
-            for j in range(p.blocks.ptr[i], p.blocks.ptr[i + 1]):
-                for q in range(g.jptr[j], g.jptr[j + 1]):
-                    t = tree[g.jidx[q]]
-                    if body[i, 0] < 0 or t < body[i, 0]:
-                        body[i, 0] = t
-                    if t > body[i, 1]:
-                        body[i, 1] = t
-    return ends
-
-
 cdef enum:
     MAX_BODY_VELOCITIES = 6     # A body has at most six velocities.
 

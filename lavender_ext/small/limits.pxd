@@ -1,8 +1,9 @@
 """Estimated and permitted cost [ns] of Newton's method over J and M, for single problems and batches.
 
-    count (entry (2 Y + 4 m) + work w)                                                                     (1)
+    count (row m_1 + contact_row m_c + entry (2 Y + 4 m) + work w)                                         (1)
 
-Y: entries of J L^-1, m: rows, w: multiply-adds to factorise N of every island, count: number of factorisations. Python
+m: rows, m_c of which belong to contacts with friction and m_1 do not; Y: entries of J L^-1; w: multiply-adds to
+factorise N of every island; count: number of factorisations. Python
 calls this estimate, too (`estimate_velocity_cost` of `lavender/solvers/small.py`); the rates are in `rates.json` there.
 """
 from libc.math cimport INFINITY
@@ -13,12 +14,15 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.py
-    double entry                # ns per multiply-add of a sweep
+    double entry                # ns per entry that a step reads
     double work                 # ns per multiply-add of a factorisation
     double count                # factorisations, if some row is not free
+    double row                  # ns per independent row of a step
+    double contact_row          # ns per row of a contact with friction of a step
     double start                # ns, minimum time of a solve outside of this call
     double sweep_row            # ns per row of a sweep outside of this call
     double sweep_cone           # ns per multiply-add of such a sweep under the cone law
+    double sweep_entry          # ns per multiply-add of such a sweep under another law
     double sweeps               # number of such sweeps
     double values               # maximum number of entries of one island's N
     double max_cost             # ns, maximum of the permitted cost
@@ -45,9 +49,20 @@ cdef inline bint has_only_free_rows(const blocks_t* p) noexcept nogil:
     return True
 
 
+cdef inline double estimate_row_cost(const blocks_t* p, const limits_t* l) noexcept nogil:
+    """Return the cost [ns] of the projections of all rows and of their derivatives in one step."""
+    cdef int32_t i, n
+    cdef double cost = 0.0
+    for i in range(p.n_blocks):
+        n = p.ptr[i + 1] - p.ptr[i]
+        cost += (l.row if n == 1 or has_independent_rows(p, i) else l.contact_row) * n
+    return cost
+
+
 cdef inline double estimate_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
     """Return the estimated cost [ns] of Newton's method, (1)."""
-    return (1.0 if has_only_free_rows(p) else l.count) * estimate_newton_step_cost(p, g, l, work)
+    cdef double step = estimate_row_cost(p, l) + estimate_newton_step_cost(p, g, l, work)
+    return (1.0 if has_only_free_rows(p) else l.count) * step
 
 
 cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept nogil:
@@ -63,7 +78,7 @@ cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, co
                            bint soft) noexcept nogil:
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
     cdef bint frictional = has_friction(p)
-    cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.entry
+    cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.sweep_entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
     cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
     if frictional and islands * max_rows < p.n_rows < l.dense * g.n and are_rows_short(g, l.columns):

@@ -14,6 +14,7 @@ from lavender.base.deadline import Deadline, Stopwatch
 from lavender.judge.residuals import get_reference, judge_impulse
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
+from lavender.solvers.costs import RATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
@@ -26,7 +27,7 @@ MAX_STEPS_PER_CHECK = 64
 CHECK_INTERVAL = 4.0
 CALL_TIME_FRACTION = 0.5
 SPARSE_TIME_RATIO = 20.0
-FLOP_TIME = 1e-10  # Time [s] per multiply-add of a dense factor.
+FLOP_TIME = 1e-9 * RATES["work"]["velocities"]  # Time [s] per multiply-add of a dense factor.
 # If the judge does not confirm the kernel's result, the kernel runs again with a smaller tolerance, down to this
 # fraction of tol.
 MIN_TOLERANCE_RATIO = 1e-2

@@ -11,7 +11,7 @@ CASES = {
     "ramp(angle=30)": {"start", "anderson"},
     "pyramid(k=6, mass_ratio=100)": {"start", "anderson"},
     "box_stackF(n=10)": {"start", "anderson", "newton"},
-    "granularF(n=3, sliding=0.5)": {"start", "anderson", "nncg from the cone law"},
+    "granularF(n=3, sliding=0.5)": {"start", "anderson", "newton"},
     "anisotropic(ratio=100, speed=3)": {"start", "anderson"},
     "hang(n=33)": {"start", "newton"},
     "wedge(angle=1e-8)": {"start", "anderson", "newton", "admm", "nncg", "linear program"},

@@ -37,7 +37,6 @@ def asymmetric():
 
 
 SWEPT = ["anderson", "anderson"]
-LOOSE = [*SWEPT, "nncg", "newton"]
 # The first stages of `auto` for a problem of each kind.
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
@@ -45,19 +44,19 @@ FIRST = {
     "linear, J and M": (lambda: over_velocities(30, 60, cones=lv.Cones.free(30), compliance=0.1), ["newton"]),
     "J and M": (lambda: over_velocities(120, 60, compliance=0.1), [*SWEPT, "newton"]),
     "bounded rows of a narrow band": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
-    "bounded rows of bodies": (lambda: suite.stack(n=200).problem, [*SWEPT, "newton"]),
-    "bounded rows of a dense matrix": (lambda: random_lcp(0, m=80), [*SWEPT, "direct", "newton"]),
-    "bounded rows, not symmetric": (lambda: asymmetric(), [*SWEPT, "direct", "newton"]),
+    "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["direct"]),
+    "bounded rows of a dense matrix": (lambda: random_lcp(0, m=80), ["anderson", "newton", "direct"]),
+    "bounded rows, not symmetric": (lambda: asymmetric(), ["anderson", "newton", "direct"]),
     "the cone law": (lambda: suite.granular(n=6, friction="coulomb").problem.relaxed("cone"), [*SWEPT, "newton"]),
     "the cone law, a matrix": (
         lambda: as_matrix(suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone")),
         [*SWEPT, "newton"],
     ),
-    "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
-    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
-    "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
-    "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, LOOSE),
-    "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), LOOSE),
+    "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, [*SWEPT, "newton"]),
+    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), [*SWEPT, "newton"]),
+    "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), [*SWEPT, "newton"]),
+    "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, [*SWEPT, "newton"]),
+    "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), [*SWEPT, "newton"]),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, [*SWEPT, "newton"]),
 }  # fmt: skip
 
@@ -68,14 +67,16 @@ def test_each_line_is_reached_and_named(name):
     problem = make()
     stages = lv.explain(problem).stages
     assert [stage.solver.partition(" ")[0] for stage in stages[: len(expected)]] == expected
-    assert ("nncg from the cone law" in [stage.solver for stage in stages]) == ("loose" in name)
     assert all(stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in stages)
     methods = {METHODS[stage.solver][0] for stage in stages if stage.solver != "certificate"}
     assert [name for name in methods if registry.get(name).refuses(problem)] == []
     found = lv.prepare(make(), "auto").solve(tol=1e-6)
     assert found.success
     compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= registry.SMALL_ROWS else set()
-    assert {stage.solver.partition(" ")[0] for stage in found.stages} <= set(expected) | compiled
+    searched = (
+        {"least"} if "newton" in expected and problem.generalized is not None else set()
+    )  # least violation
+    assert {stage.solver.partition(" ")[0] for stage in found.stages} <= set(expected) | compiled | searched
 
 
 @pytest.mark.parametrize("name", FIRST)
@@ -172,7 +173,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
         "lavender.solvers.auto.make_step", lambda name, log, tree: made.setdefault(name, Made(name, log))
     )
     solve(log, tree)
-    assert not Made.found and set(made) <= {"anderson", "newton", "admm", "nncg"}, (
+    assert not Made.found and set(made) <= {"anderson", "direct", "newton", "admm", "nncg"}, (
         "one of each, asked again and again"
     )
     np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
@@ -289,7 +290,7 @@ def test_a_certificate_that_costs_more_than_ten_times_newton_comes_after_these()
 
 
 def test_what_a_turn_of_many_rows_on_few_velocities_cannot_pay_is_left_out_or_comes_last():
-    """Of `admm` a factor of A would cost all turns; newton over rows of A is asked when nobody gains any more."""
+    """A factor of A for `admm` would cost all stages; newton over rows of A runs after the cheaper solvers."""
     rng, n, each = np.random.default_rng(0), 100, 30
     row = np.arange((n - 1) * each)
     column = np.stack([row // each, row // each + 1], axis=1)
@@ -302,7 +303,8 @@ def test_what_a_turn_of_many_rows_on_few_velocities_cannot_pay_is_left_out_or_co
     for stage in tree:
         tree.best = 1.0  # nobody gains
         ran.append(stage.solver)
-    assert "admm" not in ran and ran[-2:] == ["newton", "newton over rows"]
+    assert "admm" not in ran
+    assert ran[:4] == ["newton", "certificate", "newton", "direct"] and ran[4:].count("newton over rows") > 1
 
 
 def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
