@@ -44,7 +44,7 @@ MAX_RUNS = 5
 
 def draw_from_generators(rng: np.random.Generator, seed: int) -> Problem:
     """Draw a problem of `lavender.contract` or of the tests' generators: kind, law, form and size at random."""
-    from lavender.contract.problems import CONTACTS, FORMS, random_general, random_lcp
+    from lavender.contract.problems import CONTACTS, FORMS, random_generalized_problem, random_lcp
 
     rows = round(10.0 * (MAX_ROWS / 10.0) ** rng.random())
     kind = str(rng.choice([*CONTACTS, "lcp", "lcp", "velocities", "velocities", "velocities"]))
@@ -57,7 +57,7 @@ def draw_from_generators(rng: np.random.Generator, seed: int) -> Problem:
         n = max(6, round(contacts * rng.uniform(0.5, 2.0)))
         soft = bool(rng.random() < 0.5)
         spin = bool(rng.random() < 0.2)
-        return random_general(seed, law, n=n, compliance=soft, contacts=contacts, spin=spin)
+        return random_generalized_problem(seed, law, n=n, compliance=soft, contacts=contacts, spin=spin)
     bodies = max(3, round(rows / rng.uniform(6.0, 15.0)))
     contacts = max(2, rows // 4)
     problem = CONTACTS[kind](seed, law, bodies=bodies, joints=max(1, rows // 12), contacts=contacts)

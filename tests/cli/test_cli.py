@@ -66,7 +66,8 @@ RUNS = {
     "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1), "tune": ("m.xml", "--worlds", 2, "--steps", 2),
     "record": ("m.xml", "--steps", 1, "--out", "out"), "check": ("stack(n=2)", "--solvers", "pgs"),
     "explain": ("stack(n=2)",), "phenomena": ("--steppers", "none"), "prove": ("stack(n=2)",),
-    "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK), "solve": ("stack(n=2)",),
+    "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK), "run": ("stack", "--solver", "newton"),
+    "solve": ("stack(n=2)",),
 }  # fmt: skip
 
 
