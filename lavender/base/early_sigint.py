@@ -30,7 +30,7 @@ def _is_lavender_command() -> bool:
     return name.removesuffix(".exe").removesuffix("-script.py") == "lavender"
 
 
-def _exit(number: int, frame: FrameType | None) -> None:
+def _exit_on_signal(number: int, frame: FrameType | None) -> None:
     os.write(2, b"lavender: stopped\n")
     os._exit(EXIT_INTERRUPTED)  # Nothing has started that would need a clean end.
 
@@ -39,14 +39,14 @@ def exit_on_sigint() -> None:
     """Let Ctrl-C end the command at once."""
     if _is_lavender_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         try:
-            signal.signal(signal.SIGINT, _exit)
+            signal.signal(signal.SIGINT, _exit_on_signal)
         except ValueError:  # not in the main thread
             return
 
 
 def restore_keyboard_interrupt() -> None:
     """Let Ctrl-C raise KeyboardInterrupt again."""
-    if signal.getsignal(signal.SIGINT) is _exit:
+    if signal.getsignal(signal.SIGINT) is _exit_on_signal:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -43,13 +43,13 @@ def import_locked(name: str) -> Any:
         return import_module(name)
 
 
-def _replace_lock() -> None:
+def _replace_lock_after_fork() -> None:
     global _lock
     _lock = RLock()  # In a forked process, the thread that may hold the old lock does not exist.
 
 
 if hasattr(os, "register_at_fork"):  # Windows has none.
-    os.register_at_fork(after_in_child=_replace_lock)
+    os.register_at_fork(after_in_child=_replace_lock_after_fork)
 
 
 class _LazyModule:

@@ -164,7 +164,7 @@ class ProcessBackend:
         received: list[tuple[bytes, bytes] | BaseException] = []
 
         # If a process that left the group still holds a pipe, only this thread waits for it.
-        def exchange() -> None:
+        def exchange_request_and_answer() -> None:
             try:
                 assert process.stdin is not None and process.stdout is not None
                 process.stdin.write(struct.pack("<Q", len(request)))
@@ -180,7 +180,7 @@ class ProcessBackend:
                 _close_streams(process)
                 received.append(error)
 
-        self._exchange_thread = threading.Thread(target=exchange, daemon=True)
+        self._exchange_thread = threading.Thread(target=exchange_request_and_answer, daemon=True)
         self._exchange_thread.start()
         try:
             self._exchange_thread.join(min(timeout, threading.TIMEOUT_MAX))

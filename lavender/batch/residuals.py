@@ -42,7 +42,7 @@ from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_pr
 NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
 
-class Many:
+class WorldResults:
     """n worlds and their judged numbers.
 
     All arrays are read-only, or copies in the library of `like`.
@@ -165,7 +165,7 @@ class Many:
 
     def _process_worlds(
         self,
-        process_next: Callable[[Worker], int],
+        process_until_deferred: Callable[[Worker], int],
         process_single: Callable[[int], None],
         threads: int,
         errors: str,
@@ -174,7 +174,7 @@ class Many:
 
         Parameters
         ----------
-        process_next : callable
+        process_until_deferred : callable
             Processes the next world in the compiled loop, or returns its index if a single call must process it.
         process_single : callable
             Processes a world by a single call.
@@ -191,7 +191,7 @@ class Many:
 
         def work(stop: bytearray) -> None:
             hand = Worker(self._worlds, stop)
-            while (i := process_next(hand)) != NO_MORE_WORLDS:
+            while (i := process_until_deferred(hand)) != NO_MORE_WORLDS:
                 if i >= 0:
                     try_single(i, stop)
 
@@ -211,7 +211,7 @@ class Many:
         return error
 
 
-class Residuals(Many):
+class Residuals(WorldResults):
     """Verdicts of `residual_many`, in arrays; `errors[i]` is the `Residual` of world i.
 
     Parameters

@@ -16,7 +16,7 @@ from lavender.base.arrays import FloatArray, check_float, check_int, mark_read_o
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
-from lavender.batch.residuals import Many, check_problems, convert_impulses_or_guesses, residual_many
+from lavender.batch.residuals import WorldResults, check_problems, convert_impulses_or_guesses, residual_many
 from lavender.judge.residuals import judge_impulse, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
@@ -52,7 +52,7 @@ STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
 
-class Solutions(Many, Sequence[Solution]):
+class Solutions(WorldResults, Sequence[Solution]):
     """Results of `solve_many`, in arrays; `many[i]` is the `Solution` of world i, in NumPy arrays.
 
     Arrays are read-only NumPy arrays, or copies in the library of `like`, except `status` and `ptr`.
@@ -382,7 +382,7 @@ def solve_many(
     small = spec.small if uses_loop else None
     limits = (small.limits, small.rules) if small is not None else (None, None)
 
-    def process_next(hand: Worker) -> int:
+    def process_until_deferred(hand: Worker) -> int:
         if not deadline.is_set:
             return int(hand.solve(tol, *limits))
         if deadline.passed(0.0):
@@ -422,7 +422,7 @@ def solve_many(
         store(i, solution if "callback" in options else raise_if_interrupted(solution))
 
     begin = perf_counter()
-    solutions._process_worlds(process_next, solve_single, threads, errors)
+    solutions._process_worlds(process_until_deferred, solve_single, threads, errors)
     solutions.clear_invalid()
     solutions._time_per_world = (perf_counter() - begin) / max(1, len(worlds))
     if not isinstance(worlds, Batch):

@@ -76,7 +76,7 @@ def check(
             comparison = cross_check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
-            stored = item.judge_stored(precision, threshold)
+            stored = item.judge_stored_answer(precision, threshold)
             print_escaped(item.name, style="bold")
             print_escaped(str(comparison))
             if stored is not None:

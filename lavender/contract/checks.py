@@ -41,7 +41,7 @@ __all__ = [
     "CHECKS",
     "Check",
     "ContractError",
-    "check_name",
+    "get_check_name",
     "list_checks",
     "make_problems_of_every_kind",
     "make_well_posed_problems",
@@ -96,12 +96,12 @@ class Check:
 CHECKS: dict[str, Check] = {}
 
 
-def check_name(function: Callable[[SolverSpec], None]) -> str:
+def get_check_name(function: Callable[[SolverSpec], None]) -> str:
     """Return the name of the check that a function implements."""
     return function.__name__.removeprefix("require_")
 
 
-def _register(
+def _register_check(
     applies_to: str, applies: Callable[[SolverSpec], bool] = lambda spec: True
 ) -> Callable[[Callable[[SolverSpec], None]], Callable[[SolverSpec], None]]:
     """Return a decorator that adds a function to `CHECKS`; its docstring is "Require that ..."."""
@@ -109,7 +109,7 @@ def _register(
     def add(function: Callable[[SolverSpec], None]) -> Callable[[SolverSpec], None]:
         summary = (inspect.getdoc(function) or "").partition("\n\n")[0].replace("\n", " ")
         text = summary.removeprefix("Require that ")
-        name = check_name(function)
+        name = get_check_name(function)
         CHECKS[name] = Check(name, text[:1].upper() + text[1:], applies_to, applies, function)
         return function
 
@@ -227,7 +227,7 @@ def _describe_difference(first: Solution, second: Solution) -> str:
 # -- laws, forms and options --------------------------------------------------------------------------
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
     """Require that the solver solves every law that it lists, in every form that it accepts, and counts its work."""
     must_solve = not spec.external or spec.name in REQUIRED_BACKENDS
@@ -287,7 +287,7 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
     )
 
 
-@_register("solvers with an option `form`", lambda spec: "form" in spec.options)
+@_register_check("solvers with an option `form`", lambda spec: "form" in spec.options)
 def require_forms_agree(spec: SolverSpec) -> None:
     """Require that every value of the option `form` gives the same solution."""
     tol, must_solve = _choose_tolerance(spec), not spec.external or spec.name in REQUIRED_BACKENDS
@@ -322,7 +322,7 @@ def require_forms_agree(spec: SolverSpec) -> None:
         raise ContractError("form='velocities' does not exist and raised no error")
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_unknown_options_are_rejected(spec: SolverSpec) -> None:
     """Require that an option that the solver does not have raises an error that names it."""
     problem = _make_first_well_posed_problem(spec)
@@ -348,7 +348,7 @@ def require_unknown_options_are_rejected(spec: SolverSpec) -> None:
             )
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_options_match_the_factory(spec: SolverSpec) -> None:
     """Require that the spec lists exactly the options that the factory accepts."""
     parameters = set(inspect.signature(spec.load()).parameters)
@@ -364,7 +364,7 @@ def require_options_match_the_factory(spec: SolverSpec) -> None:
 # -- iterations ---------------------------------------------------------------------------------------
 
 
-@_register("all solvers except code of another project", lambda spec: not spec.external)
+@_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_budgets_are_kept(spec: SolverSpec) -> None:
     """Require that iteration limits are kept: 0 returns the start, and with tol = 0 exactly max_iter iterations run."""
     for problem in make_well_posed_problems(spec):
@@ -403,7 +403,7 @@ def require_budgets_are_kept(spec: SolverSpec) -> None:
             )
 
 
-@_register(
+@_register_check(
     "solvers with `resumable`, except code of another project",
     lambda spec: spec.resumable and not spec.external,
 )
@@ -435,7 +435,7 @@ def _run_in_parts(
     return done, status, impulse.tobytes()
 
 
-@_register("solvers with `resumable`", lambda spec: spec.resumable)
+@_register_check("solvers with `resumable`", lambda spec: spec.resumable)
 def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     """Require that a time limit ends a long solve with TIME_LIMIT and at least one iteration."""
     problem = _make_first_well_posed_problem(spec)
@@ -448,7 +448,7 @@ def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     )
 
 
-@_register("solvers with `history`", lambda spec: spec.history and not spec.delegates)
+@_register_check("solvers with `history`", lambda spec: spec.history and not spec.delegates)
 def require_history_at_fixed_counts(spec: SolverSpec) -> None:
     """Require that a history records the residual at fixed iteration counts and does not change the result."""
     problem = _make_first_well_posed_problem(spec)
@@ -475,7 +475,7 @@ def require_history_at_fixed_counts(spec: SolverSpec) -> None:
     )
 
 
-@_register("solvers with `callback`", lambda spec: spec.callback)
+@_register_check("solvers with `callback`", lambda spec: spec.callback)
 def require_callback_may_stop(spec: SolverSpec) -> None:
     """Require that a callback receives copies of the iterates and can stop the solve."""
     problem, counts = _make_first_well_posed_problem(spec), []
@@ -499,7 +499,7 @@ def require_callback_may_stop(spec: SolverSpec) -> None:
 # -- starts, orders and seeds -------------------------------------------------------------------------
 
 
-@_register("solvers with `impulse`", lambda spec: spec.impulse)
+@_register_check("solvers with `impulse`", lambda spec: spec.impulse)
 def require_a_solution_as_start_is_kept(spec: SolverSpec) -> None:
     """Require that a solve that starts at a solution ends there, and does not modify the array of the start."""
     for problem in make_well_posed_problems(spec):
@@ -516,7 +516,7 @@ def require_a_solution_as_start_is_kept(spec: SolverSpec) -> None:
         )
 
 
-@_register(
+@_register_check(
     "solvers of the law cone with `impulse`, except code of another project",
     lambda spec: spec.impulse and not spec.external and "cone" in spec.laws,
 )
@@ -548,7 +548,7 @@ def require_a_normal_without_inverse_mass_bears_friction(spec: SolverSpec) -> No
         )
 
 
-@_register("solvers with `order`", lambda spec: spec.order)
+@_register_check("solvers with `order`", lambda spec: spec.order)
 def require_orders_change_the_sweep(spec: SolverSpec) -> None:
     """Require that each order sweeps differently and all orders lead to a solution."""
     problem = next((p for p in make_well_posed_problems(spec) if p.law != "coulomb"), None)
@@ -570,7 +570,7 @@ def require_orders_change_the_sweep(spec: SolverSpec) -> None:
         early[bits] = order
 
 
-@_register("solvers with `seed`", lambda spec: spec.seed)
+@_register_check("solvers with `seed`", lambda spec: spec.seed)
 def require_seeds_change_random_sweeps(spec: SolverSpec) -> None:
     """Require that equal seeds give equal bits and different seeds give different random sweeps."""
     problem = _make_first_well_posed_problem(spec)
@@ -589,7 +589,7 @@ def _make_short_options(spec: SolverSpec) -> dict[str, Any]:
     return {"tol": 1e-7, "max_iter": 60 if spec.resumable else None}
 
 
-@_register("all solvers except code of another project", lambda spec: not spec.external)
+@_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_results_are_reproducible(spec: SolverSpec) -> None:
     """Require that the same call gives the same bits, also from several threads at once."""
     options = _make_short_options(spec)
@@ -613,7 +613,7 @@ def require_results_are_reproducible(spec: SolverSpec) -> None:
                 )
 
 
-@_register("all solvers except code of another project", lambda spec: not spec.external)
+@_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_update_equals_prepare(spec: SolverSpec) -> None:
     """Require that `update` to new numbers gives the bits of a new `prepare`."""
     options = _make_short_options(spec)
@@ -631,7 +631,7 @@ def require_update_equals_prepare(spec: SolverSpec) -> None:
         )
 
 
-@_register("all solvers except code of another project", lambda spec: not spec.external)
+@_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_units_do_not_matter(spec: SolverSpec) -> None:
     """Require that impulses scale with the units of mass and velocity."""
     mass, velocity = 2.0**10, 2.0**-20  # Powers of two: the scaled data have no rounding errors.
@@ -695,7 +695,7 @@ def make_unusual_problems() -> dict[str, Problem]:
     }
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_unusual_problems_have_a_result(spec: SolverSpec) -> None:
     """Require that unusual but valid problems have a finite result, or are refused with a CapabilityError."""
     for name, problem in make_unusual_problems().items():
@@ -713,7 +713,7 @@ def require_unusual_problems_have_a_result(spec: SolverSpec) -> None:
         _raise_unless(problem.m > 0 or solution.success, f"{name} are not CONVERGED: {solution}")
 
 
-@_register("all solvers except code of another project", lambda spec: not spec.external)
+@_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_claims_are_true(spec: SolverSpec) -> None:
     """Require that every claim about a small random matrix is true: solutions, and that there is none."""
 
@@ -762,7 +762,7 @@ def check_on_random_problems(compare: Callable[[int, int], None]) -> None:
     settings(draw(call))()
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_failures_have_a_message(spec: SolverSpec) -> None:
     """Require that DIVERGED, STALLED and NUMERICAL_ERROR come with a message."""
     for matrix in UNSOLVABLE_MATRICES:
@@ -782,7 +782,7 @@ def require_failures_have_a_message(spec: SolverSpec) -> None:
 UNSOLVABLE_MATRICES = ([[0.0, 1.0], [1.0, 2.0]], [[2.0, 3.0], [3.0, -1.0]], [[1.0, 3.0], [3.0, 1.0]])
 
 
-@_register("all solvers")
+@_register_check("all solvers")
 def require_infeasible_rows_are_reported(spec: SolverSpec) -> None:
     """Require that a row that no impulse can satisfy gives INFEASIBLE with a certificate that names the row."""
     problem = Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0])

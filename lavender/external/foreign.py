@@ -24,7 +24,7 @@ from lavender.solvers.registry import Cost, Solver
 from lavender_ext.judge.measure import all_finite
 
 
-class Foreign(Solver):
+class ForeignSolver(Solver):
     """Wrapper of a solver of another package, which must have the methods `prepare` and `run`."""
 
     def __init__(self, name: str, solver: Any) -> None:

@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
 from lavender.external.as_qp import QP, build_impulse_form
 from lavender.external.backend import Backend
-from lavender.external.running import Answer, Failed, Limits, capture_backend_output
+from lavender.external.running import Answer, BackendFailed, Limits, capture_backend_output
 from lavender.judge.solution import Status
 from lavender.problem import Problem
 
@@ -69,7 +69,7 @@ def call_backend(
     ------
     InputError
         The backend has no such setting, or a setting cannot be pickled.
-    Failed
+    BackendFailed
         The backend raised an exception, or its process died.
     """
     assert limit.time_limit is not None
@@ -98,13 +98,13 @@ def call_backend(
             f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
         ) from None
     except ProcessEnded as error:
-        raise Failed(f"the process of the backend died ({error})") from None
+        raise BackendFailed(f"the process of the backend died ({error})") from None
     except InvalidAnswer as error:
-        raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
+        raise BackendFailed(f"the process of the backend sent an invalid answer ({error})") from None
     except RemoteError as error:
         idle_processes.append(process)
         raise (
-            InputError(str(error)) if error.kind == "InputError" else Failed(f"{error.kind}: {error}")
+            InputError(str(error)) if error.kind == "InputError" else BackendFailed(f"{error.kind}: {error}")
         ) from None
     idle_processes.append(process)
     try:  # The backend may have written anything.
@@ -112,7 +112,7 @@ def call_backend(
         by_name = dict(zip(ANSWER_ARRAYS, arrays, strict=True))
         return Answer(status=Status[fields["status"]], message=str(fields["message"]), work=work, **by_name)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
+        raise BackendFailed(f"the process of the backend sent an invalid answer ({error})") from None
 
 
 def _take_idle_process() -> ProcessBackend | None:

@@ -127,7 +127,7 @@ def copy_certificate(y: Any, size: int) -> FloatArray | None:
 Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
 
 
-class Failed(Exception):
+class BackendFailed(Exception):
     """A backend failed in another process; the message describes the failure."""
 
 
@@ -247,7 +247,7 @@ def _call_backend_once(
             answer = call(qp, impulse, limit, dict(settings))
     except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
         raise
-    except Failed as failure:
+    except BackendFailed as failure:
         message = f"{failure}; start point returned"
         return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, message, qp.form)
     except BaseException as error:  # A backend may raise anything; a panic of Rust is not an Exception.

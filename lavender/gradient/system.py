@@ -19,14 +19,15 @@ from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import free_part
 
 MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
-SHIFT_OF_SINGULAR = 1e-11  # eps of (6), divided by the diagonal entry.
-# Number of steps of (6). A component with a pivot of 1e-11 times the diagonal entry then has an error of 2^-8, with a
-# pivot of 1e-9 an error of 1e-16.
+# Shift of each diagonal entry of a singular G, relative to the entry: eps of equation (6) in `lavender.gradient`.
+SHIFT_OF_SINGULAR = 1e-11
+# Number of proximal steps of (6). Each divides the error of a component by 1 + pivot / shift: eight steps leave 2^-8 if
+# its pivot is as large as the shift, and 1e-16 if it is 100 times as large.
 MAX_PROXIMAL_STEPS = 8
 MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by up to this fraction of its largest entry.
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
 MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
-# Systems of up to this many rows are also dense if A is not symmetric and sparse, or if a contact slides.
+# Systems of up to this many rows are also dense if a contact slides, or if A is sparse and not symmetric.
 MAX_DENSE_ROWS = 400
 
 Solve = Callable[
@@ -54,7 +55,7 @@ class System:
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self.linear, self.n = problem, linear, linear.rows
-        is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.slides and problem.is_symmetric
+        is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.has_sliding_contact and problem.is_symmetric
         if is_symmetric and not is_dense_faster(problem.csr.nnz, problem.m, True):
             factor = self._factor_symmetric
         else:

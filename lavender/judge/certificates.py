@@ -312,7 +312,10 @@ def _round_down_to_power_of_two(x: FloatArray) -> float:
 
 
 def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
-    """Return the normal row, the friction coefficient and |x| (m,) over the rows of each friction component."""
+    """Return three arrays with one entry per friction component: normal row, friction coefficient, Euclidean norm of x.
+
+    The norm is taken over the rows of the component; x has shape (m,).
+    """
     c = problem.cones
     components, coefficient_of_row = list(c.friction_components()), c.friction_coefficient
     normal = c.ptr[np.array([block for block, _ in components], int)]

@@ -363,7 +363,11 @@ class _Island:
         )
 
     def _make_stick_or_slide_groups(self, c: _Component, x: FloatArray, p: FloatArray) -> list[_Group]:
-        """Build the groups of a component that sticks or slides in a closed contact, and write P0 to p."""
+        """Return the groups of a component that may stick or slide in a closed contact, and write P0 of (1) to p.
+
+        P0 is the middle of the values that the derivative of the projection may have; the groups bound the deviation
+        from it. If the direction of sliding is known, only the change along it is uncertain.
+        """
         t, a, unit = _norm(self.y[c.rows]), c.coefficient, np.eye(len(c.block))
         if not _norm(x[c.rows]) < 0.5 * t:  # The direction of sliding is not known.
             if self.is_cone:

@@ -268,7 +268,7 @@ def compare_claims(
     finally:
         if recorder is not None:
             recorder.close()
-            _write_states(recorder)
+            _write_states_before_steps(recorder)
     if not outcomes:
         raise InputError("there are no steps to judge")
     result.outcome, result.velocity = np.array(outcomes), np.array(velocities)
@@ -276,7 +276,7 @@ def compare_claims(
     return result
 
 
-def _write_states(recorder: Recorder) -> None:
+def _write_states_before_steps(recorder: Recorder) -> None:
     """Write `states.npz` next to the recorder's folder: the states before the recorded steps, from which to start."""
     labels = [NUMBER_PATTERN.findall(file.replace("_", " ")) for file in recorder.files]
     folder = recorder.folder / STATES_FOLDER

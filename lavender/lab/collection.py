@@ -23,7 +23,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.io.stored import read_whole_file, write_text
 from lavender.judge.solution import CONFIRMED, Status
 from lavender.lab import suite
-from lavender.lab.bench.cases import compute_condition, hash_problem, is_path, resolve_sources
+from lavender.lab.bench.cases import compute_condition_number, hash_problem, is_path, resolve_sources
 from lavender.lab.motion import find_solutions
 from lavender.lab.proof import prove
 from lavender.problem import Problem
@@ -95,7 +95,7 @@ class Entry:
 
 def certify_problem(problem: Problem, name: str, group: str) -> Entry:
     """Build the entry of a problem, with a proof or a certificate if there is one; needs the extra `proof`."""
-    package = suite.get_model_package(name)
+    package = suite.get_package_name_of_case(name)
     answer = solve(problem, "auto", tol=1e-12, time_limit=ANSWER_TIME_LIMIT)
     entry = Entry(
         name=name,
@@ -107,7 +107,7 @@ def certify_problem(problem: Problem, name: str, group: str) -> Entry:
         licence=suite.LICENCES.get(package, ""),
         made=suite.get_package_versions(package),
         sweeps=count_sweeps_to_thousandth(problem),
-        condition=compute_condition(problem),
+        condition=compute_condition_number(problem),
         degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
     base = asdict(entry)
@@ -179,7 +179,7 @@ def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
     missing = {
         e.name: suite.explain_missing_packages(package)
         for e in entries
-        if (package := suite.get_model_package(e.name))
+        if (package := suite.get_package_name_of_case(e.name))
     }
     buildable = [e for e in entries if not missing.get(e.name)]
     return buildable, sorted({message for message in missing.values() if message})
@@ -190,7 +190,7 @@ def find_changed_problems(entries: Iterable[Entry]) -> Iterator[str]:
     for entry in entries:
         problem = suite.case(entry.name).problem
         if (now := hash_problem(problem)) != entry.sha:
-            here = suite.get_package_versions(suite.get_model_package(entry.name))
+            here = suite.get_package_versions(suite.get_package_name_of_case(entry.name))
             why = f"; made with {entry.made}, here {here}" if here != entry.made else ""
             yield f"{entry.name}: {now} here, {entry.sha} in the manifest{why}"
 

@@ -27,7 +27,7 @@ from lavender.problem.findex import convert_from_findex, convert_to_findex, orde
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
-from lavender.problem.program import convert_program, unpack_program
+from lavender.problem.program import make_quadratic_program, unpack_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import multiply_body_jacobian
 
@@ -61,7 +61,10 @@ class ProblemOptions(NewProblemOptions, total=False):
 
 
 def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()) -> None:
-    """Raise InputError at a keyword that `Problem.method` does not have; the message lists its keywords."""
+    """Raise InputError at a keyword that is not in PROBLEM_KEYWORDS; the message suggests a similar one, or lists all.
+
+    `own` names the explicit arguments of `Problem.method`, for the message.
+    """
     for name in keywords:
         if name not in PROBLEM_KEYWORDS:
             valid = (*own, *PROBLEM_KEYWORDS)
@@ -487,7 +490,7 @@ class Builders(Operators):
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
         check_keywords("from_qp", more, ("P", "q", "G", "h", "A", "b", "lb", "ub"))
-        qp = convert_program(unpack_program((P, q, G, h, A, b, lb, ub)))
+        qp = make_quadratic_program(unpack_program((P, q, G, h, A, b, lb, ub)))
         if qp.is_singular:
             n, m = len(qp.q), len(qp.target)
             more.setdefault("names", Names(n + m, partial(_make_program_names, n, m)))

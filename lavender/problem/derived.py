@@ -45,13 +45,13 @@ class Derived:
 _process = object()
 
 
-def _replace_process() -> None:
+def _replace_process_after_fork() -> None:
     global _process
     _process = object()
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_replace_process)
+    os.register_at_fork(after_in_child=_replace_process_after_fork)
 
 
 class cached_property(Generic[T]):

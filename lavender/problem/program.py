@@ -376,7 +376,7 @@ def _make_one_sided_cones(free: int, m: int) -> Cones:
     return Cones.bounded(low, np.inf)
 
 
-def convert_program(arrays: ProgramArrays) -> QuadraticProgram:
+def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
     """Check the arrays P, q, G, h, A, b, lb, ub and convert them to a program; see `Problem.from_qp`."""
     P, q, G, h, A, b, lb, ub = arrays
     q = as_array("q", q, (None,))

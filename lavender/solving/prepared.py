@@ -15,7 +15,7 @@ from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerics
 from lavender.base.renamed import suggest_argument
-from lavender.external.foreign import Foreign
+from lavender.external.foreign import ForeignSolver
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
@@ -445,7 +445,7 @@ def _unstretched_callback(problem: Problem, stretch: FloatArray, callback: Callb
 
 
 def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
-    """Create the solver; wrap solvers of others (`Foreign`) and own solvers of bounded rows (`ThroughRows`)."""
+    """Create the solver; wrap solvers of others (`ForeignSolver`) and own solvers of bounded rows (`ThroughRows`)."""
     factory = spec.load()
     try:
         solver = factory(**options)
@@ -454,7 +454,7 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
     if not spec.builtin:
-        return Foreign(spec.name, solver)
+        return ForeignSolver(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:
         return solver
     # Imported here, because it imports the table of solvers.

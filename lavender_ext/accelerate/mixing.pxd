@@ -35,10 +35,10 @@ cdef struct mixing_t:
     int32_t memory
     double* control             # (CONTROL), zero at the start
     double* gram                # (MAX_MEMORY, MAX_MEMORY) products of the dg
-    double* v                   # (m) v of the previous evaluation
-    double* g                   # (m) g of the previous evaluation
-    double* dv                  # (memory, m) differences of v, a ring buffer
-    double* dg                  # (memory, m) differences of g
+    double* v                   # (m) v = T(u) of the previous evaluation
+    double* g                   # (m) g = v - u of the previous evaluation
+    double* dv                  # (memory, m) differences of successive v, a ring buffer
+    double* dg                  # (memory, m) differences of successive g
 
 
 cdef inline int32_t solve_mixing_coefficients(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,

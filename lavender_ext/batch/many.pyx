@@ -19,7 +19,7 @@ from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
 from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived, judge_task, judge_zero_impulse_of_task,
-                                      judge_task_workspace_size, prepare_small_problem,
+                                      judge_task_workspace_size, prepare_task_for_small_call,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport max_newton_cost, estimate_newton_cost, limits_t
 from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
@@ -440,7 +440,7 @@ cdef class Worlds:
             return self.store_empty_world(i, &h.scratch)
         code = LEFT
         if not j.general:
-            if narrow or (late and self.tasks != NULL) or not prepare_small_problem(&j, &s, &h.small):
+            if narrow or (late and self.tasks != NULL) or not prepare_task_for_small_call(&j, &s, &h.small):
                 return LEFT
             if not grow_workspace_to(&h.small.call.work, 0, count_judge_scratch(&s.v)):
                 return LEFT

@@ -302,7 +302,7 @@ cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
     return v
 
 
-cdef inline bint prepare_small_problem(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
+cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
     """Set up A or bodies for a solve or the judge; return False to defer the task, as with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
@@ -334,7 +334,7 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
     cdef bint pivots = are_all_rows_bounded(&j.p)
     if j.p.n_rows > rules.rows or not can_use_small_call(&j.p) or not (rules.pivots if pivots else rules.follows):
         return LEFT
-    if (not prepare_small_problem(j, &s, workspaces)
+    if (not prepare_task_for_small_call(j, &s, workspaces)
             or (pivots and j.factored and not form_matrix_of_bodies(j, &s, &workspaces.formed))):
         return LEFT
     if not derive_small_problem(&s, &workspaces.bound):

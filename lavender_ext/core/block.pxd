@@ -143,7 +143,10 @@ cdef inline double project_cone_normal(const int32_t n, const double* a, const d
 
 cdef inline void compute_cone_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
                             double* e) noexcept nogil:
-    """Compute the error (7) of a contact under the cone law, in the variables y = sqrt(d) (lam - w / d)."""
+    """Compute the error e of a contact's rows under the cone law by (7).
+
+    The projection is computed for y = sqrt(d) (lam - w / d), in which the metric of d is the Euclidean one.
+    """
     cdef double t[MAX_FRICTION_COMPONENTS]
     cdef double a[MAX_FRICTION_COMPONENTS]
     cdef double y[6]

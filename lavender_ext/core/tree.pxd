@@ -3,7 +3,7 @@
     M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = n - 1 ... 0: each leaf of a
     kinematic tree is eliminated before its ancestors, and there is no fill-in (Featherstone 2008, section 6.5)     (1)
 
-The mass matrix of a problem and the normal matrix of Newton's method over its velocities are factored by `eliminate_tree_rows`.
+The mass matrix of a problem and the normal matrix of Newton's method over its velocities are factored by `factor_tree_matrix`.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
@@ -129,10 +129,10 @@ cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
-    return eliminate_tree_rows(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio())
+    return factor_tree_matrix(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio())
 
 
-cdef inline int32_t eliminate_tree_rows(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                    double* inv_pivot, double min_pivot) noexcept nogil:
     """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row with too small a pivot.
 

@@ -323,7 +323,7 @@ cdef class Linear:
         return out if is_valid else None
 
     @property
-    def slides(self):
+    def has_sliding_contact(self):
         """Whether any contact slides or has no friction, so that its rows of G are not those of H."""
         cdef int32_t i, j
         for i in range(self.at.v.p.n_blocks):

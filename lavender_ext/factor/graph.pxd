@@ -38,7 +38,7 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
 
 
 cdef inline int64_t pattern_workspace_size(int64_t n, int64_t k) noexcept nogil:
-    """Return the number of int32 of scratch for `eliminate_bodies` of n bodies and k blocks, aligned to 8 bytes."""
+    """Return the number of int32 of scratch for `order_bodies_and_list_block_rows` of n bodies and k blocks, aligned to 8 bytes."""
     return order_workspace_size(n, 2 * k) + 3 * n + 1 + 2 * k
 
 
@@ -78,7 +78,7 @@ cdef inline void find_neighbours(int32_t k, const int32_t* body, int32_t n, int3
         ptr[i + 1] = to
 
 
-cdef inline void eliminate_bodies(int32_t k, const int32_t* body, int32_t n, int32_t* scratch, int32_t* parent,
+cdef inline void order_bodies_and_list_block_rows(int32_t k, const int32_t* body, int32_t n, int32_t* scratch, int32_t* parent,
                                   int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot, int32_t* swapped) noexcept nogil:
     """Order the bodies of blocks (k, 2), -1 if static, and list the lower block rows of the matrix over them in that order.
 

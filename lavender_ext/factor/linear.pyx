@@ -8,7 +8,7 @@ import numpy as np
 from lavender_ext.factor.symbolic import analyse as analyse_pattern
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport eliminate_tree_rows
+from lavender_ext.core.tree cimport factor_tree_matrix
 from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve
@@ -192,7 +192,7 @@ cdef inline void factor_rows(linear_t* f) noexcept nogil:
 
 
 cdef inline void use_fallback(linear_t* f) noexcept nogil:
-    """Factor by the fallback, if there is one."""
+    """Replace the factor by the one of the caller's fallback; without a fallback, or if it fails, no factor is left."""
     f.factored = NO_FACTOR
     if f.fallback != NULL and f.fallback.factor(f.fallback.at):
         f.factored, f.pivots.small = FALLBACK, 0
@@ -213,7 +213,7 @@ cdef int32_t linear_factor(linear_t* f) noexcept nogil:
         f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
     else:
         f.factored = CHOLESKY
-        lost = eliminate_tree_rows(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
+        lost = factor_tree_matrix(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
         f.pivots.small, f.pivots.first_small = lost >= 0, lost
     return f.pivots.small
 
@@ -532,7 +532,10 @@ cdef class LinearSystem:
         return out if is_good else None
 
     def multiply(self, const double[::1] x):
-        """Return A x (n,) with the entries of the last factor; not after L U of a full matrix."""
+        """Return A x (n,) for the matrix A of the last factorisation.
+
+        A full matrix is overwritten by its L U factor, so the product is not available after it.
+        """
         out = np.empty(self.f.n)
         cdef double[::1] y = out
         if x.shape[0] != self.f.n or self.data is None:

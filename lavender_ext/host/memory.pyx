@@ -70,7 +70,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     b.head[H_PAIRS_VALID] = 0
 
 
-def grow_workspace(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
+def compute_grown_workspace_sizes(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
     """Return sizes (10,) with capacity for the pairs and contacts that did not fit in the last substep."""
     cdef int32_t[::1] out = np.empty(N_SIZES, np.int32)
     lav_engine_grow_workspace(&size[0], &real[0], &index[0], &keys[0], &out[0])

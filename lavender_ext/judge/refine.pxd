@@ -58,7 +58,7 @@ cdef inline void add_product_double_double(double x, double y, double* high, dou
 
 
 cdef inline void add_number_double_double(double x, double* high, double* low) noexcept nogil:
-    """Add x to high + low."""
+    """Add x to high + low; the rounding error of high + x is added to low."""
     cdef double total = high[0] + x, part = total - high[0]
     low[0] += (high[0] - (total - part)) + (x - part)
     high[0] = total

@@ -9,7 +9,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t, view_t
-from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
+from lavender_ext.factor.graph cimport order_bodies_and_list_block_rows, pattern_workspace_size
 from lavender_ext.factor.linear cimport (BLOCKS, NO_FACTOR, bind_block_factor, block_factor_index_size, block_factor_size,
                                          block_pattern_index_size)
 from lavender_ext.factor.symbolic cimport block_tree
@@ -82,7 +82,7 @@ cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
     """Order the bodies of a.body (k, 2) for elimination, and list the blocks of N; return the off-diagonal blocks of L."""
     cdef int32_t i
     cdef int64_t below = 0
-    eliminate_bodies(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.swapped)
+    order_bodies_and_list_block_rows(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.swapped)
     block_tree(a.n, a.nptr, a.nind, a.parent, a.mark, a.scratch, a.lptr + 1)
     a.lptr[0] = 0
     for i in range(a.n):

@@ -136,7 +136,7 @@ cdef inline double first_step_length() noexcept nogil:
 
 
 cdef inline double path_compliance() noexcept nogil:
-    """First eps, relative to d."""
+    """Return the first compliance eps of the smoothed path, relative to d; it is divided by ten if the path cannot start."""
     return 1e-9
 
 
@@ -151,7 +151,7 @@ cdef inline double smooth_max_slope(double x, double tau) noexcept nogil:
     return smooth_max(x, tau) / sqrt(x * x + 4.0 * tau * tau)
 
 
-cdef inline double smooth_max_rise(double x, double tau) noexcept nogil:
+cdef inline double smooth_max_log_tau_derivative(double x, double tau) noexcept nogil:
     """Return dp / d log tau."""
     return 2.0 * tau * tau / sqrt(x * x + 4.0 * tau * tau)
 
@@ -170,13 +170,14 @@ cdef inline void smooth_row(const elements_t* e, int32_t j, double z, double s, 
     if has_lower_bound(e, j):
         x = y - e.lower[j]
         out.f[0] = s - smooth_max(-x, tau) if x > 0.0 else z - e.lower[j] - smooth_max(x, tau)
-        out.p[0], out.rest[0], out.ft[0] = smooth_max_slope(x, tau), smooth_max_slope(-x, tau), -smooth_max_rise(x, tau)
+        out.p[0], out.rest[0], out.ft[0] = smooth_max_slope(x, tau), smooth_max_slope(-x, tau), \
+            -smooth_max_log_tau_derivative(x, tau)
     if has_upper_bound(e, j):
         x = e.upper[j] - y
         out.f[0] = out.f[0] + smooth_max(-x, tau) if x > 0.0 else out.f[0] - x + smooth_max(x, tau)
         out.p[0] -= smooth_max_slope(-x, tau)
         out.rest[0] += smooth_max_slope(-x, tau)
-        out.ft[0] += smooth_max_rise(x, tau)
+        out.ft[0] += smooth_max_log_tau_derivative(x, tau)
 
 
 cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
@@ -189,7 +190,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
     memset(out.rest, 0, nr * nr * sizeof(double))
     # Normal.
     out.f[0] = s[0] - smooth_max(-y, tau) if y > 0.0 else z[0] - normal
-    out.p[0], out.rest[0], out.ft[0] = dn, smooth_max_slope(-y, tau), -smooth_max_rise(y, tau)
+    out.p[0], out.rest[0], out.ft[0] = dn, smooth_max_slope(-y, tau), -smooth_max_log_tau_derivative(y, tau)
     # Friction components.
     for g in range(e.part[i], e.part[i + 1]):
         n = e.size[g]
@@ -211,7 +212,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             out.f[k] = s[k] + across * x if d > 0.0 else z[k] - r / m * x
             out.p[k * nr] = x * fr * a * dn
             out.rest[k * nr] = -out.p[k * nr]
-            out.ft[k] = -x * (fr * a * smooth_max_rise(y, tau) - r * smooth_max_rise(d, wide) / (m * m))
+            out.ft[k] = -x * (fr * a * smooth_max_log_tau_derivative(y, tau) - r * smooth_max_log_tau_derivative(d, wide) / (m * m))
             for l in range(first, first + n):
                 own = x * (z[l] - s[l]) / (q * q) if q > 0.0 else 0.0
                 out.rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own

@@ -194,7 +194,7 @@ cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcep
 # -- bounded rows and cones --------------------------------------------------------------------------------------------
 
 
-cdef inline void plan_convex(newton_t* n) noexcept nogil:
+cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     """Enter the next state of the convex laws."""
     cdef int32_t state = n.stage
     n.stage = state + 1
@@ -286,7 +286,7 @@ cdef inline void step_de_saxce(newton_t* n) noexcept nogil:
         begin_de_saxce_end(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
-cdef inline void plan_coulomb(newton_t* n) noexcept nogil:
+cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
     # Loops of rigid joints have nearly dependent rows; the answer must not depend on whether a host can factor their
@@ -326,9 +326,9 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
     """Do at most one factorisation of the phase on top of the stack, or end it."""
     cdef int32_t phase = n.stack[n.depth - 1]
     if phase == PLAN_CONVEX:
-        plan_convex(n)
+        enter_next_convex_state(n)
     elif phase == PLAN_COULOMB:
-        plan_coulomb(n)
+        enter_next_coulomb_state(n)
     elif phase == DE_SAXCE:
         step_de_saxce(n)
     elif phase == ACTIVE_SET:

@@ -225,7 +225,7 @@ cdef inline void number_complementary_pairs(lemke_t* l, int32_t* pair_of) noexce
     l.d.n_pairs = l.d.n = n
 
 
-cdef inline void build_lemke_dictionary(lemke_t* l) noexcept nogil:
+cdef inline void build_dictionary_without_cover(lemke_t* l) noexcept nogil:
     """Build (1) as a dictionary in which every w is basic; z has no column yet."""
     cdef dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
@@ -356,7 +356,7 @@ cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
     cdef int32_t i, entering, r = 0
     cdef double* row
     cdef double* first_row
-    build_lemke_dictionary(l)
+    build_dictionary_without_cover(l)
     pivot_out_free_rows(l)
     # covering vector
     for i in range(d.n_pairs):
@@ -552,7 +552,7 @@ cdef class Lemke:
         return self.rows.raise_error(code)
 
     def judge(self):
-        """Judge the present impulse of a path that is not continued."""
+        """Judge the present impulse if a path was interrupted, and keep it in `rows` if its residual is the lowest."""
         judge_unfinished_path(&self.l)
 
     @property

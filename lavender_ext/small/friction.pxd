@@ -20,11 +20,11 @@ from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 
 cdef enum:
     MIXING_MEMORY = 5           # sweeps that Anderson mixing combines
-    MIN_CHECK_INTERVAL = 4      # sweeps between two checks of the residual; later half of the sweeps done
-    FIRST_FACTORISATIONS = 12   # Newton's factorisations before sweeps continue
+    MIN_CHECK_INTERVAL = 4      # The residual is checked after this many sweeps, later after half as many as are done.
+    FIRST_FACTORISATIONS = 12   # Newton's method may do this many factorisations before sweeps continue.
     RESUMED_SWEEP_RATIO = 8     # Sweeps then continue to this multiple of `max_sweeps` in total.
     MAX_SUBPROBLEM_FACTORISATIONS = 120    # maximum factorisations of one subproblem
-    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's reduction over this many times the remaining checks reaches tol.
+    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if tol is reached at the present rate within this multiple of the remaining checks.
     SWEEP_NS_PER_ROW = 15       # cost of a sweep with its mixing [ns] per row, plus 1 ns per entry of A
     SWEEP_NS_PER_BODY_ROW = 32  # or this per row over bodies
     FACTOR_NS_PER_ROW = 150     # cost of a factorisation with its steps [ns] per row,

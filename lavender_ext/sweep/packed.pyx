@@ -220,7 +220,10 @@ cdef inline void append_packed_record(const blocks_t* p, const rows_t* r, const 
 cdef inline void append_records_of_slot(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x,
                                         int32_t begin,
                              int32_t end, int32_t next_end, packed_t* out) noexcept nogil:
-    """Append the records of one slot, by_slot[begin:end]; blocks without a partner in the slot come last."""
+    """Append the records of one slot, the blocks by_slot[begin:end], two blocks of one kind per record.
+
+    Blocks that stay single come last. Each is paired with a block of the next slot, by_slot[end:next_end], if possible.
+    """
     cdef int32_t unpaired[N_KINDS]
     cdef int32_t i, block, waiting = -1, partner, n_unpaired = 0
     for i in range(begin, end):
@@ -356,7 +359,7 @@ cdef inline void restore_inactive_lanes(pair_t* record, int32_t n, int32_t due, 
             (<double*>(record + HEADER_SIZE))[k] = saved[k]
 
 
-cdef inline void load_record_impulses(const pair_t* record, int32_t n, const double* lam, pair_t* impulses) noexcept nogil:
+cdef inline void gather_impulses_of_record(const pair_t* record, int32_t n, const double* lam, pair_t* impulses) noexcept nogil:
     """Load the impulses of a record from lam (m)."""
     cdef const int64_t* header = <const int64_t*>record
     cdef int32_t k
@@ -392,7 +395,7 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
         write_offset = <int64_t*>record + WRITE_OFFSET * LANES
         due = all_lanes
         if packed.single:
-            load_record_impulses(record, n, lam, outside)
+            gather_impulses_of_record(record, n, lam, outside)
             impulses = outside
         elif span.sweeps > 0:
             due = find_active_lanes(<int64_t*>record, span.pass_, span.sweeps)

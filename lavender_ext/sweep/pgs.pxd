@@ -5,7 +5,7 @@ from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 
 
-cdef void sweep_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil
+cdef void sweep_csr_once(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil
 cdef void sweep_bounded_rows(const blocks_t* p, const csr_t* a, double* lam) noexcept nogil
 cdef void sweep_matrix_sor(const blocks_t* p, const csr_t* a, double omega, const int32_t* order, double* lam) noexcept nogil
 cdef void sweep_jacobi(const blocks_t* p, const double* w, double omega, double* lam) noexcept nogil

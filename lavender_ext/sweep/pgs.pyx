@@ -81,7 +81,7 @@ cdef inline void sweep_blocks(const blocks_t* p, const form_t* form, const int32
             relax_rows_block(p, form, i, lam, v)
 
 
-cdef void sweep_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil:
+cdef void sweep_csr_once(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil:
     """Sweep over A in compressed rows."""
     sweep_blocks(p, a, order, p.n_blocks, lam, NULL)
 

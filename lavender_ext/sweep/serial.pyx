@@ -27,7 +27,7 @@ from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepare
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_packed_impulses, pack_blocks_in_order,
                                         packed_workspace_size_of_blocks, store_packed_impulses,
                                         sweep_records)
-from lavender_ext.sweep.pgs cimport (sweep_bodies, sweep_matrix_sor, sweep_generalized, sweep_matrix, sweep_bounded_rows,
+from lavender_ext.sweep.pgs cimport (sweep_bodies, sweep_matrix_sor, sweep_generalized, sweep_csr_once, sweep_bounded_rows,
                                      sweep_jacobi)
 from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKED, NOT_WORTH_PACKING, PACKED, packing_t,
                                         sweep_context_t, sweep_run_t)
@@ -162,7 +162,7 @@ cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, dou
     elif c.csr != NULL and c.order == NULL:
         sweep_bounded_rows(p, c.csr, lam)
     elif c.csr != NULL:
-        sweep_matrix(p, c.csr, c.order, lam)
+        sweep_csr_once(p, c.csr, c.order, lam)
     elif ALL_SWEEPS and c.packing != NULL and c.packing.single and c.packing.status == PACKED:
         sweep_records(p, c.rows, &c.packing.packed, 1, c.packing.backwards, lam, c.v)
     else:

@@ -35,14 +35,14 @@ cdef struct descent_t:          # Newton steps under one law
     double best_error           # error of `best`, in multiples of the limits
     double lowest_error         # lowest error of this descent
     double error_at_last_center     # energy error when the centre moved last, -1: not yet
-    double sizes[3]             # |G| of the last three steps
+    double sizes[3]             # norms of the gradient G at the last three steps
 
 
 cdef struct paused_t:           # an island whose step budget ended, to be continued
     int32_t island              # -1: no island is paused
     int32_t worst               # worst outcome of the islands before it
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)
-    int32_t stage               # stage of a round of Coulomb friction
+    int32_t stage               # CONVEX_STAGE, COULOMB_STAGE or NEXT_ROUND, under Coulomb's law
     int32_t rounds              # completed rounds of Coulomb friction
     double island_error         # error of `island_best`, including points at which a call ended
     double best_error           # the same without those points, so that calls do not change the path

@@ -58,7 +58,10 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
 
 
 cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
-    """Write the first block of each panel, the offsets of V, and the sizes of the largest panels."""
+    """Write the first block of each panel to `pblock`, and the offset of each block's V to `vptr`.
+
+    `need` receives the largest number of columns, values and rows of a panel.
+    """
     cdef int32_t b, i = 0, size, nc, rows, at = 0
     cdef const int32_t* ptr = f.p.ptr
     cdef int32_t* pblock = <int32_t*>f.pblock
@@ -143,10 +146,10 @@ cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requiremen
 
 
 cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t* need) noexcept nogil:
-    """Return whether steps over the rows of A take less work than with N, and add the work and sizes of that choice.
+    """Return whether a step over the rows of A takes less work than a step over velocities, and add work and sizes of the choice.
 
-    The counts are the multiply-adds of one step of three with half of the rows free, without the factor of N. The
-    constants were fitted to dense rows and to trees.
+    The work is the number of multiply-adds of a step if three steps are made and half of the rows are free. The factor of
+    N = M + J^T D J is not included. The constants were fitted to dense rows and to trees.
     """
     cdef int32_t a, b
     cdef bint applies

@@ -171,7 +171,7 @@ cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, do
 # -- one island --------------------------------------------------------------------------------------------------
 
 
-cdef inline void move_center(const flow_t* f, int32_t island) noexcept nogil:
+cdef inline void move_proximal_centre(const flow_t* f, int32_t island) noexcept nogil:
     """Move the centre of the proximal terms to lambda."""
     copy_rows(f, island, f.lam, f.center)
 
@@ -271,7 +271,7 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double er
     recompute_slack(f, island)
 
 
-cdef inline double score_iterate(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
+cdef inline double store_iterate_if_best(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
     """Return the error of lambda over its limits (`u` as in `measure_error`), and keep lambda in `best` if it is lower."""
     cdef descent_t* x = &f.descent
     cdef double velocity, over
@@ -325,7 +325,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.response_is_known = 0
         moves = multiply_y_transpose(f, island, f.lam, f.u)
         size = compute_gradient(f)
-        over = score_iterate(f, island, moves, &energy)
+        over = store_iterate_if_best(f, island, moves, &energy)
         if over != over:
             return LOST
         if over <= goal:
@@ -339,7 +339,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             return STUCK
         if rigid and (size <= 0.1 * energy and size <= 0.1 * proximal_error(f, island) or size == 0.0):
             # The softened problem is solved well enough: move its centre.
-            move_center(f, island)
+            move_proximal_centre(f, island)
             x.center_moved = 1
             if x.error_at_last_center >= 0.0 and energy > 0.3 * x.error_at_last_center and x.softness > 1e-9:
                 x.softness = 0.1 * x.softness
@@ -412,7 +412,7 @@ cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const do
     cdef int32_t a, c
     copy_rows(f, island, lam, f.lam)
     copy_rows(f, island, lam, f.best)                   # `best` must be set even if all later errors overflow.
-    move_center(f, island)
+    move_proximal_centre(f, island)
     f.is_zero = not multiply_y_transpose(f, island, lam, f.u)
     for a in range(f.n_unknowns):
         c = f.unknowns[a]

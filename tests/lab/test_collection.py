@@ -20,15 +20,17 @@ ENTRIES = collection.load_manifest()
 def test_the_manifest_has_every_problem_of_every_set_in_order():
     names = [n for chosen in suite.SETS.values() for n in chosen]
     assert [e.name for e in ENTRIES] == [
-        n if suite.get_model_package(n) else suite.case(n).name for n in names
+        n if suite.get_package_name_of_case(n) else suite.case(n).name for n in names
     ]
-    assert all(e.licence and e.made for e in ENTRIES if suite.get_model_package(e.name))
+    assert all(e.licence and e.made for e in ENTRIES if suite.get_package_name_of_case(e.name))
 
 
 @pytest.mark.parametrize("start", range(5))
 def test_problems_are_made_again_with_the_same_numbers(start):
     chosen, _ = collection.select_buildable(e for e in ENTRIES[start::15] if e.rows < 2000)
-    chosen = [e for e in chosen if e.made == suite.get_package_versions(suite.get_model_package(e.name))]
+    chosen = [
+        e for e in chosen if e.made == suite.get_package_versions(suite.get_package_name_of_case(e.name))
+    ]
     assert list(collection.find_changed_problems(chosen)) == []
     wrong = replace(chosen[0], sha="0" * 16)
     (line,) = collection.find_changed_problems([wrong])

@@ -11,7 +11,7 @@ from typing import Any
 
 from lavender.lab.bench.cases import Source
 from lavender.lab.bench.recommendation import SHORT_TIME_RATIO, Advice, Subject, list_subjects
-from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_calls
+from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_calls_with_most_cases
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import UNLIMITED_ITERATIONS, Plan
 from lavender.lab.bench.running.timing import CallSpec
@@ -49,7 +49,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallS
                     CallSpec(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
                 )
             call_specs.append(CallSpec(solver, "tol", tolerance, max_iter, timing_mode="batch"))
-        single = select_calls(records, subject.timing_mode, interleaved=False)
+        single = select_calls_with_most_cases(records, subject.timing_mode, interleaved=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
                 call_specs += _list_time_limited_calls(records, subject, single, advice, tolerance)

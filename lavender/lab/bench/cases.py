@@ -83,7 +83,7 @@ class Item:
         """The problem; accessing it raises the errors of loading it."""
         return self.load()
 
-    def judge_stored(
+    def judge_stored_answer(
         self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
     ) -> Residual | None:
         """Judge the stored answer; None if there is none, or if its length belongs to another problem."""
@@ -417,7 +417,7 @@ def describe_case(item: Item, run: str) -> CaseInfo:
     """Load the problem of an item and describe it for the report."""
     p = item.problem
     contacts = int(np.count_nonzero(p.cones.is_contact))
-    answer = item.judge_stored()
+    answer = item.judge_stored_answer()
     return CaseInfo(
         run=run,
         case=item.name,
@@ -440,7 +440,7 @@ def describe_case(item: Item, run: str) -> CaseInfo:
         nothing_to_do=is_solved_by_zero(p),
         diagnostics=tuple(map(str, diagnose(p))),
         guess=_classify_guess(item),
-        condition=compute_condition(p),
+        condition=compute_condition_number(p),
     )
 
 
@@ -603,7 +603,7 @@ def _has_redundant_rows(problem: Problem) -> bool:
     return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])
 
 
-def compute_condition(problem: Problem) -> float | None:
+def compute_condition_number(problem: Problem) -> float | None:
     """Compute the condition of A, scaled to a unit diagonal, on its range; None for A = 0 or too many rows."""
     values = _compute_singular_values(problem)
     nonzero = values[values > ZERO_SINGULAR_VALUE_TOL * values.max(initial=0.0)]

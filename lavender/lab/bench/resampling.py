@@ -99,7 +99,9 @@ class ResampledRanking:
         return tuple(dict.fromkeys([solvers[0], *others]))
 
 
-def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -> list[TimedCall]:
+def select_calls_with_most_cases(
+    records: Records, timing_mode: str, interleaved: bool = True
+) -> list[TimedCall]:
     """Select the calls of a timing mode ("call", "steps", "batch") that ran on the largest number of cases.
 
     With `interleaved` these are calls that were timed alternately. Without it they are runs that were measured
@@ -124,7 +126,9 @@ def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -
         return calls
     # A batch of some of the cases cannot be compared with a call on all of them.
     complete = {
-        (f.as_record.solver, *sorted(f.runs)) for one in ("call", "steps") for f in select_calls(records, one)
+        (f.as_record.solver, *sorted(f.runs))
+        for one in ("call", "steps")
+        for f in select_calls_with_most_cases(records, one)
     }
     return [f for f in calls if (f.as_record.solver, *sorted(f.runs)) in complete]
 
@@ -190,7 +194,9 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
     """
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
-    interleaved = {timing_mode: select_calls(records, timing_mode) for timing_mode in ("call", "steps")}
+    interleaved = {
+        timing_mode: select_calls_with_most_cases(records, timing_mode) for timing_mode in ("call", "steps")
+    }
     advice = []
     for family in recommend_from_single_runs(records, times):
         calls = interleaved["steps" if family.sequence else "call"]

@@ -210,7 +210,7 @@ class SolutionSet:
         return self.nearest(p.impulse_array(impulse))
 
     def nearest(self, impulse: FloatArray) -> Motion:
-        """Return the motion at the smallest distance from an impulse (m,) [N s]."""
+        """Return the motion whose difference from the motion of an impulse (m,) [N s] has the smallest energy."""
         return min(
             self.motions,
             key=lambda motion: measure_motion_distance(self.problem, impulse, motion.impulse).energy,
@@ -387,7 +387,11 @@ def converge_to_solution(problem: Problem, impulse: Any) -> Reference:
 
 
 def solve_with_vanishing_compliance(problem: Problem) -> FloatArray:
-    """Solve with compliance s d on every row, s from 1 to 1e-12, then with none, each from the last; (m,) [N s]."""
+    """Return the solution (m,) [N s] that is the limit of solutions with vanishing compliance.
+
+    Row i gets the compliance s A_ii. The factor s falls from 1 to 1e-12, then the problem is solved without it. Each
+    solve starts from the result of the one before.
+    """
     x, s = problem.start(), LARGEST_COMPLIANCE_FRACTION
     while s >= SMALLEST_COMPLIANCE_FRACTION:
         x = np.array(

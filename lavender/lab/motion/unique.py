@@ -154,7 +154,7 @@ def _proves_no_contact_slides(
     bounded = rows[~c.is_contact[np.searchsorted(c.ptr, rows, side="right") - 1]]
     if np.any(c.lower[bounded] > 0.0) or np.any(c.upper[bounded] < 0.0):
         return False
-    components, unused_friction = _list_friction_components(c), []
+    components, unused_friction = _group_friction_rows_by_contact(c), []
     for i in block.tolist():
         if i not in components:
             continue
@@ -183,7 +183,7 @@ def _compute_contraction_number(
     size = c.friction_coefficient[rows[tangents]] / scale[tangents]
     sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
     inverse_on_normals = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
-    components = _list_friction_components(c)
+    components = _group_friction_rows_by_contact(c)
     n_components = float(max(len(components[i]) for i in contacts.tolist()))
     max_sliding = np.zeros(len(contacts))
     np.maximum.at(max_sliding, contact_index, np.diagonal(sliding))
@@ -197,7 +197,7 @@ def _compute_contraction_number(
     return best, np.diagonal(inverse_on_normals)
 
 
-def _list_friction_components(c: Cones) -> dict[int, list[IntArray]]:
+def _group_friction_rows_by_contact(c: Cones) -> dict[int, list[IntArray]]:
     """Return the friction components of each contact that have a non-zero bound."""
     components: dict[int, list[IntArray]] = {}
     reach = c.friction_coefficient

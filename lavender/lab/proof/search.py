@@ -20,13 +20,13 @@ from lavender.problem import Problem
 # Up to this many unknowns, if nothing slides, boundaries of two cases are decided in rational numbers.
 MAX_RATIONAL_UNKNOWNS = 100
 
-MAX_SINGULAR_DIRECTION_UNKNOWNS = (
-    2000  # Up to this many unknowns, a singular direction is computed to name blocks.
-)
+# Up to this many unknowns, a null vector of singular equations is computed, so that the message names its blocks.
+MAX_SINGULAR_DIRECTION_UNKNOWNS = 2000
 
 MAX_SINGLE_ISLAND_UNKNOWNS = 32  # Up to this many unknowns, the equations are not split into islands.
 
-MAX_CASE_CHANGES = 30  # The cases change at most this often, as in an active-set method.
+# The cases of the blocks (separated, sticking, sliding, at a bound) are guessed and corrected at most this often.
+MAX_CASE_CHANGES = 30
 
 
 @dataclass(frozen=True, eq=False)

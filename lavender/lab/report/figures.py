@@ -248,14 +248,14 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
     """
     timed = passes[0].mode == "tol"
 
-    def rank(w: statistics.Pass) -> tuple[float, float, str]:
+    def get_sort_key(w: statistics.Pass) -> tuple[float, float, str]:
         return (
             -len(w.times[w.start]),
             w.total_times[w.start] if timed else w.get_median_residual(w.start),
             w.solver,
         )
 
-    ranked = [w.solver for w in sorted(passes, key=rank)]
+    ranked = [w.solver for w in sorted(passes, key=get_sort_key)]
     drawn = set(select_drawn_solvers(ranked))
     curves = []
     for w in passes:
@@ -275,7 +275,7 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
 def build_profile_figure(profile: statistics.Profile) -> Figure:
     """Plot a Dolan-More profile of the plug-ins and of the solvers that solve the largest number of cases fastest."""
 
-    def standing(name: str) -> tuple[float, float, str]:
+    def get_sort_key(name: str) -> tuple[float, float, str]:
         steps = profile.curves[name]
         last = steps[-1][1] if steps else 0.0
         return (
@@ -284,9 +284,9 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
             name,
         )
 
-    ranked = sorted(profile.curves, key=standing)
+    ranked = sorted(profile.curves, key=get_sort_key)
     drawn = set(
-        select_drawn_solvers([name for name in ranked if standing(name)[0] < 0.0 or is_plug_in(name)])
+        select_drawn_solvers([name for name in ranked if get_sort_key(name)[0] < 0.0 or is_plug_in(name)])
     )
     shown = [name for name in ranked if name in drawn]
     curves = [

@@ -583,14 +583,14 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
     by_target = {(w.solver, w.mode, w.tol if w.mode == "tol" else w.max_iter): w for w in passes}
     middle = tolerances[len(tolerances) // 2] if tolerances else math.nan
 
-    def rank(solver: str) -> tuple[float, float, str]:
+    def get_sort_key(solver: str) -> tuple[float, float, str]:
         w = by_target.get((solver, "tol", middle))
         return (
             (0, math.inf, solver) if w is None else (-len(w.times[w.start]), w.total_times[w.start], solver)
         )
 
     rows: Rows = []
-    for solver in sorted({w.solver for w in passes}, key=rank):
+    for solver in sorted({w.solver for w in passes}, key=get_sort_key):
         timed = [by_target.get((solver, "tol", x)) for x in tolerances]
         limited = [by_target.get((solver, "budget", n)) for n in budgets]
         rows.append(
@@ -646,7 +646,7 @@ def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) ->
     timing_mode = "steps" if records.cases[cases[0]].sequence else "call"
     alone = recommendation.rank_to_tolerance(records, "", cases, tolerance)
     best = resampling.recommend_for_cases(
-        records, alone, resampling.select_calls(records, timing_mode), cases
+        records, alone, resampling.select_calls_with_most_cases(records, timing_mode), cases
     ).best
     return best if best is not None and best.solved else None
 

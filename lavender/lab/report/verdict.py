@@ -27,7 +27,7 @@ from lavender.lab.bench.resampling import (
     compute_serving_time,
     rank_calls_in_time,
     rank_calls_to_tolerance,
-    select_calls,
+    select_calls_with_most_cases,
 )
 from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
@@ -132,8 +132,8 @@ def _recommend_solver(
     """Recommend a solver for one subject by the interleaved calls, or by single runs without them."""
     tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     interleaved, single = (
-        select_calls(records, subject.timing_mode),
-        select_calls(records, subject.timing_mode, interleaved=False),
+        select_calls_with_most_cases(records, subject.timing_mode),
+        select_calls_with_most_cases(records, subject.timing_mode, interleaved=False),
     )
     resampled = rank_calls_to_tolerance(records, interleaved or single, tolerance, n)
     cases = _describe_subject(records, subject, n)
@@ -158,7 +158,7 @@ def _recommend_solver(
     leaders = [c.solver for _, c in resampled.ranking[:3] if c.solved]
     batches = [
         f
-        for f in select_calls(records, "batch")
+        for f in select_calls_with_most_cases(records, "batch")
         if f.as_record.solver == first.solver and set(f.runs) <= set(call.runs)
     ]
     for batch in batches[:1] if len(call.runs) > 1 else ():
@@ -243,7 +243,7 @@ def _describe_velocity_tolerance(speed: float) -> str:
 
 
 def _describe_subject(records: Records, subject: Subject, n: int) -> str:
-    """Return words for the cases of a subject, with the number of those that did not load."""
+    """Describe a subject: its single cases, or the n steps of its sequences, with the number of unloaded cases."""
     names, lost = subject.names, records.left_out
     if subject.timing_mode == "call":
         return _describe_cases(records, names) + format_left_out_count(len(lost.get("", ())))

@@ -227,7 +227,10 @@ def _solve_rows(problem: Problem, operator: ExtendedOperator, rows: np.ndarray, 
         result = _refine_to_last_bit(operator, index, start, solve)
         if result is not None:
             return result
-    raise InputError("the refinement does not converge: the rows are singular to float64")
+    raise InputError(
+        f"the refinement of {problem.name} does not converge: its {len(index)} rows are linearly dependent in float64. "
+        "Remove dependent rows (`redundancy(problem)` finds them), or give them compliance"
+    )
 
 
 def _refine_to_last_bit(

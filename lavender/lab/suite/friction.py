@@ -125,7 +125,10 @@ def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
 
 
 def _solve_secular_equation(b: FloatArray, ratio: float) -> FloatArray:
-    """Solve the secular equation of the sliding contact; (3,) [N s]."""
+    """Return the impulse (3,) [N s] of a contact with A = diag(1, 1, ratio), right-hand side b (3,) and mu = 0.5.
+
+    It is A^-1 b if the contact sticks, else b_t / (A_tt + s), with the root s of |lambda_t(s)| = mu lambda_n.
+    """
     from scipy.optimize import brentq
 
     radius, mass = 0.5 * b[0], np.array([1.0, ratio])

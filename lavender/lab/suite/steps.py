@@ -101,7 +101,7 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
     return Draft(problem, f"{model} of {package} under random controls: few rows that share many velocities")
 
 
-def get_model_package(name: str) -> str:
+def get_package_name_of_case(name: str) -> str:
     """Return the package of models that a case's name needs; empty if it needs none."""
     if name.partition("(")[0] != "robot":
         return ""

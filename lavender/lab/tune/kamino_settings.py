@@ -126,7 +126,10 @@ class KaminoStage(Stage):
         return config
 
     def _run(self, setting: Setting, after_step: Callable[[], Any] | None = None) -> FloatArray:
-        """Run all stretches with a setting, calling `after_step`; return the time of each step of one world [s]."""
+        """Step all worlds from their start states with a setting; return each step's time divided by the worlds [s].
+
+        `after_step` is called after each step, outside of the measured time.
+        """
         assert isinstance(setting, KaminoSetting)
         scene = self.scene
         scene.solver = scene.solver_type(scene.model, config=self._make_config(setting))

@@ -113,16 +113,16 @@ class Schedule:
         self._reserved = dict.fromkeys(MEASUREMENTS, 0)
         self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
 
-    def reserve(self, kind: str, count: int) -> None:
+    def reserve_measurements(self, kind: str, count: int) -> None:
         """Set the estimate of later measurements that are not announced yet."""
         self._reserved[kind] = count
 
-    def expect(self, kind: str, count: int) -> None:
+    def announce_measurements(self, kind: str, count: int) -> None:
         """Announce measurements; they replace reserved ones."""
         self._expected[kind] += count
         self._reserved[kind] = max(0, self._reserved[kind] - count)
 
-    def skip(self, kind: str) -> None:
+    def skip_measurement(self, kind: str) -> None:
         """Count an announced measurement as unnecessary."""
         self._expected[kind] -= 1
 
@@ -137,7 +137,7 @@ class Schedule:
         return total if every else None
 
     @contextlib.contextmanager
-    def measure(self, kind: str, text: str) -> Iterator[None]:
+    def time_measurement(self, kind: str, text: str) -> Iterator[None]:
         """Show the progress, then run and time the block, which is one measurement."""
         if self.watch is not None:
             count = sum(self._expected.values()) + sum(self._reserved.values())
@@ -182,14 +182,16 @@ class Stage(ABC):
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
         runs = [self.prepare_timing(m.setting) for m in settings]
-        schedule.expect("timing", len(settings) * repeats)
+        schedule.announce_measurements("timing", len(settings) * repeats)
         for round_index in range(repeats):
             for m, run in zip(settings, runs, strict=True):
                 # Medians: a step that is interrupted in the first round does not exclude a setting.
                 if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
-                    schedule.skip("timing")
+                    schedule.skip_measurement("timing")
                     continue
-                with schedule.measure("timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"):
+                with schedule.time_measurement(
+                    "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
+                ):
                     m.times = np.minimum(m.times, run())
 
 

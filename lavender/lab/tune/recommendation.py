@@ -152,7 +152,7 @@ class Tuning:
                 description = f"PROVISIONAL, {self.reason_provisional}: {description}"
             lines += [
                 f"{m.setting.option_line}  {m.setting.comment.format(description)}",
-                f"    chosen on: {_compare(m, self.present_result)}",
+                f"    chosen on: {_format_comparison(m, self.present_result)}",
                 f"    held back: {'not measured' if held is None else self._compare_held_back(held)}",
             ]  # fmt: skip
         return lines
@@ -160,7 +160,7 @@ class Tuning:
     def _compare_held_back(self, held: Measured) -> str:
         """Compare a setting with the present one on the worlds held back, with the largest error there."""
         worst = f"at most {format_size(float(held.error.max()))} in {len(held.error)} steps"
-        return f"{_compare(held, self.held[0])} ({worst})"
+        return f"{_format_comparison(held, self.held[0])} ({worst})"
 
     @property
     def _lines_note(self) -> str:
@@ -178,7 +178,7 @@ class Tuning:
             sentences.append(self.present_result.setting.merge_note)
         return " ".join(filter(None, sentences))
 
-    def _table(self, settings: Iterable[Measured]) -> Table:
+    def _build_table_of_settings(self, settings: Iterable[Measured]) -> Table:
         """Build the table of some settings."""
         rows: list[list[str | Cell]] = [
             [
@@ -247,10 +247,10 @@ class Tuning:
                      note=self._lines_note),
                 PageSection("Rows and contacts", sizes, short=2,
                      note="Rows and contacts of the steps with the model's own setting."),
-                PageSection("The front of time and error", [self._table(shown)], figures, short=5),
-                PageSection("Other problems", [self._table(other)], short=2,
+                PageSection("The front of time and error", [self._build_table_of_settings(shown)], figures, short=5),
+                PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
-                PageSection("Every setting", [self._table(every)],
+                PageSection("Every setting", [self._build_table_of_settings(every)],
                      note="Settings with which a world diverges are left out."),
             ],
             {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
@@ -261,7 +261,7 @@ class Tuning:
         )  # fmt: skip
 
 
-def _compare(m: Measured, now: Measured) -> str:
+def _format_comparison(m: Measured, now: Measured) -> str:
     """Compare time and error of a setting with the present ones."""
     return (
         f"{m.mean_step_time / now.mean_step_time:.2f} of the time, error {format_size(m.worst_error)} m/s "

@@ -106,7 +106,7 @@ def tune(
                 "control needs a model of MuJoCo; a scene of kamino sets its own controls: leave it out"
             )
         start = {"states": states, "spread": spread, "seed": seed}
-        return measure_settings(
+        return run_tuning(
             lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
             name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2, watch=watch,
         )  # fmt: skip
@@ -124,13 +124,13 @@ def tune(
         )
         return cast("tuple[Stage, Stage]", (even, odd))
 
-    return measure_settings(
+    return run_tuning(
         make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
         n_held_worlds=worlds // 2, watch=watch,
     )  # fmt: skip
 
 
-def measure_settings(
+def run_tuning(
     make_stages: Callable[[], tuple[Stage, Stage]],
     model: str,
     horizon: int,
@@ -173,9 +173,9 @@ def measure_settings(
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         """Judge settings."""
         results = []
-        schedule.expect("judging", len(settings))
+        schedule.announce_measurements("judging", len(settings))
         for setting in settings:
-            with schedule.measure("judging", setting.name):
+            with schedule.time_measurement("judging", setting.name):
                 results.append(stage.judge_setting(setting))
         return results
 
@@ -184,8 +184,10 @@ def measure_settings(
         own, first_settings = stage.own_setting, stage.list_first_settings()
         n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
         n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
-        schedule.reserve("judging", n_first + 3 + n_variants)  # 3: the worlds held back
-        schedule.reserve("timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats)
+        schedule.reserve_measurements("judging", n_first + 3 + n_variants)  # 3: the worlds held back
+        schedule.reserve_measurements(
+            "timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats
+        )
         measured += judge(stage, [own])
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{model}: these worlds diverge with the model's own setting")
@@ -194,8 +196,8 @@ def measure_settings(
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
         sizes = StepSizes(rows, contacts, can_touch)
         if not sizes.has_enough_contact:
-            schedule.reserve("judging", 0)
-            schedule.reserve("timing", 0)
+            schedule.reserve_measurements("judging", 0)
+            schedule.reserve_measurements("timing", 0)
             stage.time_settings(measured, repeats, schedule)
             return make_result(False)
         measured += judge(stage, first_settings[1:])
@@ -207,15 +209,15 @@ def measure_settings(
         ]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [own, *near] for x in stage.list_variants(s) if x not in known)
-        schedule.reserve("judging", len(more) + 2)
-        schedule.reserve("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
+        schedule.reserve_measurements("judging", len(more) + 2)
+        schedule.reserve_measurements("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
         measured += judge(stage, list(more))
         stage.time_settings(measured, repeats, schedule)
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
-        schedule.reserve("judging", 0)
-        schedule.reserve("timing", 0)
+        schedule.reserve_measurements("judging", 0)
+        schedule.reserve_measurements("timing", 0)
         held_back.time_settings(last, 2 * repeats, schedule)
         held += last if np.isfinite(last[0].mean_step_time) else []
     except KeyboardInterrupt:

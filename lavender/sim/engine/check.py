@@ -122,7 +122,9 @@ def _check_contacts(new: State) -> None:
         ptr[0] != mj or ptr[-1] != mj + rows
         or (blocks < np.where(friction, 3, 1)).any() or (blocks > max_rows).any() or blocks.max(initial=1) > per
     ):  # fmt: skip
-        raise _make_damaged_state_error("the rows of its contacts do not add up")
+        raise _make_damaged_state_error(
+            f"ptr does not give each of the {c} contacts the rows of its kind, {rows} in total"
+        )
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])

@@ -153,7 +153,7 @@ class State:
                 "move them apart"
             )
         own = (self.size, self.real, self.index, self.keys)
-        other = State(memory.grow_workspace(*own))
+        other = State(memory.compute_grown_workspace_sizes(*own))
         memory.move_engine_state(*own, other.size, other.real, other.index, other.keys)
         return other
 

@@ -246,7 +246,7 @@ class Stepping:
         self._load_scene(self.scene)
         self.state.head[HEAD["iterations"]] = sweeps
         self.state.head[HEAD["warm_start"]] = warm
-        return self._make_observation(), self._make_info()
+        return self._make_observation(), self._make_step_info()
 
     def step(self, action: None = None) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by dt.
@@ -298,7 +298,7 @@ class Stepping:
                 if self.films:
                     for film in self.films:
                         film.add(self.time, observation)
-                return observation, 0.0, bool(lost), False, self._make_info(lost)
+                return observation, 0.0, bool(lost), False, self._make_step_info(lost)
             finally:
                 self._refusal = ""
 
@@ -376,7 +376,7 @@ class Stepping:
             self.prepare_substep()
             kernel, a = self.state.kernel, self.state.a
             kernel.solve(False)
-            if not (warm and self._solve_in_place()):
+            if not (warm and self._run_newton_on_engine_arrays()):
                 try:
                     problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
@@ -395,7 +395,7 @@ class Stepping:
             bodies = [*self.state.a["contact_pair"][:1].ravel().tolist(), int(self.state.a["body_of"][0])]
             self.state.head[HEAD["lost"]] = next(i for i in bodies if self.state.a["dyn"][i] >= 0)
 
-    def _solve_in_place(self) -> bool:
+    def _run_newton_on_engine_arrays(self) -> bool:
         """Run the first phase of `newton` on the engine's arrays; return whether it solved the problem.
 
         The impulses are bit for bit the result of lavender.solve(problem, "newton"), without building the problem.
@@ -467,7 +467,7 @@ class Stepping:
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
         return out
 
-    def _make_info(self, lost: str = "") -> dict[str, Any]:
+    def _make_step_info(self, lost: str = "") -> dict[str, Any]:
         """Return the `info` of a step."""
         info: dict[str, Any] = {
             "time": self.time,

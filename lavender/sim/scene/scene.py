@@ -595,7 +595,10 @@ class Scene:
         if point is not None:
             return check_numbers(f"anchor_{side} of {label} [m]", point, 3)
         if body < 0:
-            raise InputError(f"{label}: the world has no centre; give the anchor at its side")
+            raise InputError(
+                f"{label}: anchor_{side} is missing, and body {side} is the world, which has no centre; give "
+                f"anchor_{side} in world coordinates [m]"
+            )
         return self.bodies[body].position
 
     def _convert_to_local(self, label: str, body: int, point: FloatArray) -> FloatArray:

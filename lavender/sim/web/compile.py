@@ -273,7 +273,10 @@ def _check_module(module: bytes, max_bytes: int) -> None:
             raise BuildFailed(f"a kernel reads static data ({size} bytes), which only Python initialises")
         position += size
     if len(module) >= max_bytes:
-        raise BuildFailed(f"the module has {len(module)} bytes; below {max_bytes} are allowed")
+        raise BuildFailed(
+            f"the module has {len(module)} bytes; below {max_bytes} are allowed: take kernels out "
+            "of its list, or raise MAX_MODULE_BYTES"
+        )
 
 
 def make_custom_section(name: str, content: bytes) -> bytes:

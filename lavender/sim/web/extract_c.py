@@ -343,7 +343,7 @@ class _Table:
             for name in item.defines:
                 self.by_name.setdefault(name, []).append(item)
 
-    def collect_needed(self, roots: Iterable[str]) -> list[Item]:
+    def collect_needed_declarations(self, roots: Iterable[str]) -> list[Item]:
         """Return all declarations that the names need, ordered so that each precedes its use."""
         done: dict[int, Item] = {}
         for name in sorted(roots):
@@ -408,7 +408,7 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
         items += declarations
     table, front_items = _Table(items), parse_declarations(front)
     defined = set().union(*(item.defines for item in front_items))
-    reached = table.collect_needed(
+    reached = table.collect_needed_declarations(
         set().union(*(item.used_names for item in front_items), kept_names) - defined
     )
     missing = sorted(kept_names - set(table.by_name))

@@ -12,7 +12,11 @@ from stacks import chain
 import lavender as lv
 from lavender import bench, report
 from lavender.lab.bench import recommendation, statistics
-from lavender.lab.bench.resampling import rank_calls_in_time, rank_calls_to_tolerance, select_calls
+from lavender.lab.bench.resampling import (
+    rank_calls_in_time,
+    rank_calls_to_tolerance,
+    select_calls_with_most_cases,
+)
 from lavender.lab.report.figures import build_figures
 from lavender.lab.report.verdict import build_verdict
 from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, info, record, records_of
@@ -209,7 +213,7 @@ def interleaved(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, re
 
 
 def race(records, tolerance=1e-6):
-    return rank_calls_to_tolerance(records, select_calls(records, "call"), tolerance)
+    return rank_calls_to_tolerance(records, select_calls_with_most_cases(records, "call"), tolerance)
 
 
 def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
@@ -276,7 +280,7 @@ def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
         each = [t + statistics.MEAN_TIME_SHIFT for t in charged[choice.solver]]
         assert choice.score == pytest.approx(math.prod(each) ** (1.0 / 3.0) - statistics.MEAN_TIME_SHIFT)
     assert max(found.shares) < 1.0
-    quick = rank_calls_in_time(records, select_calls(records, "call"), 1.0)
+    quick = rank_calls_in_time(records, select_calls_with_most_cases(records, "call"), 1.0)
     served = {(c.solver, c.solved, c.cases, c.worst) for _, c in quick.ranking}
     assert served == {("slow", 2, 3, 1.0), ("quick", 2, 3, 1.0)}
 
@@ -294,7 +298,7 @@ def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served
         return record("a", solver, min(times), 1e-2, residual_per_repeat=(1e-2,) * 20, **more)
 
     found = records_of(line("punctual", 1), line("late", 2))
-    ranking = rank_calls_in_time(found, select_calls(found, "call"), 1e-3).ranking
+    ranking = rank_calls_in_time(found, select_calls_with_most_cases(found, "call"), 1e-3).ranking
     assert {c.solver: c.solved for _, c in ranking} == {"punctual": 1, "late": 0}
 
 

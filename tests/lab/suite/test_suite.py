@@ -101,7 +101,7 @@ def test_sets_and_families_are_listed():
     listed = suite.families()
     assert all(summary.strip() for summary in listed.values())
     for name in listed:
-        if not suite.explain_missing_packages(suite.get_model_package(name)):
+        if not suite.explain_missing_packages(suite.get_package_name_of_case(name)):
             assert suite.case(name).problem.m > 0  # the listing is itself a valid name
 
 
