@@ -103,11 +103,11 @@ def run(
     if plot is not None:
         plot = check_figure_path(plot)
     files = {
-        name: path for name, path in (("trace", trace), ("plot", plot), ("film", film)) if path is not None
+        name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({resolve_destination(path) for path in files.values()}) < len(files):
         raise InputError(
-            f"two of {', '.join(f'--{name} {path}' for name, path in files.items())} name the same file; give each a "
+            f"two of {', '.join(f'{name} {path}' for name, path in files.items())} name the same file; give each a "
             "file of its own"
         )
     for path in files.values():

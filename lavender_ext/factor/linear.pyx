@@ -107,7 +107,8 @@ cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* inde
     """Bind the values of N and of its factor, after `analyse_blocks`; neither array needs initial values."""
     cdef supernodal_t* p = &f.factor
     cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s
-    p.wide, p.interrupt = wide, NULL
+    p.wide = wide
+    p.interrupt = NULL
     p.swap, p.local_row, p.head = index, index + p.n, index + 2 * p.n
     p.link, p.next_row = p.head + f.n, p.head + 2 * f.n
     f.nval = real

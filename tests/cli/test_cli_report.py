@@ -136,7 +136,7 @@ def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
     assert code in (0, None)
     assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "nncg" in shown
     plan = json.loads(lavender("explain", "stack(n=200)", "--json", "--tol", "1e-9")[1])
-    assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "anderson"
+    assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "direct"
 
 
 def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path, monkeypatch):

@@ -44,7 +44,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
         "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--repeats", 1, "--out", tmp_path / "out"
     )
     assert code == 0 and "held back" in out
-    assert "Add the line next to the model's own <option>: MuJoCo merges both." in " ".join(out.split())
+    assert "Add the line after the model's own <option>" in " ".join(out.split())
     assert len(out.splitlines()) <= 27
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page

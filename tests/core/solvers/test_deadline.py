@@ -16,7 +16,7 @@ import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.base.lazy_import import import_numerics
-from lavender.problem.derived import once
+from lavender.problem.derived import computed_once
 from lavender.problem.operators import Operators
 from lavender.solvers import admm
 from lavender.solvers.costs import (
@@ -279,7 +279,7 @@ def test_worlds_whose_turn_comes_too_late_keep_their_start(name, started, clock)
 
 def made_once(problem):
     """What was worked out of a problem and kept."""
-    return {name for name in vars(problem) if isinstance(getattr(type(problem), name, None), once)}
+    return {name for name in vars(problem) if isinstance(getattr(type(problem), name, None), computed_once)}
 
 
 def test_a_package_of_others_does_not_read_a_matrix_after_the_deadline(clock):

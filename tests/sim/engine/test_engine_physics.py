@@ -187,5 +187,5 @@ def test_a_box_grips_more_on_the_diagonal(more):
 
 
 def test_what_no_scene_of_boxes_has_is_told():
-    with pytest.raises(lv.InputError, match="no spin friction"):
+    with pytest.raises(lv.InputError, match="neither torsional nor rolling friction"):
         lv.Simulation(lv.Scene("spinner", friction_shape="box"))
