@@ -507,6 +507,8 @@ cdef class LinearSystem:
         self.interrupt.stopped = 0
         with nogil:
             lost = linear_factor(&self.f)
+        if self.interrupt.stopped:
+            self.f.factored = NO_FACTOR
         self.raise_error()
         return lost
 

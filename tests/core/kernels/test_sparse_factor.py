@@ -1,5 +1,8 @@
 """Sparse factors by panels: an order of all vertices in any graph, little fill, factors that solve to the same bits."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -224,3 +227,36 @@ def test_what_is_no_mirror_is_seen():
     assert not is_mirrored(*raw(sp.csr_array(a.T)))
     assert is_mirrored(*raw(sp.csr_array(a + a.T)))
     assert is_mirrored(*raw(sp.csr_array((4, 4))))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a timer that sends a signal is of POSIX")
+def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
+    """The grid takes 2.8e9 multiply-adds, and signals are checked after every 2e8: the handler runs inside the call."""
+    n = 30
+    line, one = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), sp.eye_array(n)
+    grid = (
+        sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
+    )
+    a = sp.csr_array(grid)
+    a.sort_indices()
+    system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))
+    system.analyse()
+
+    class Stopped(Exception):
+        pass
+
+    def stop(*_):
+        raise Stopped
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        with pytest.raises(Stopped):
+            system.factor(a.data)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert system.sign == 0  # The factor is incomplete.
+    assert system.factor(a.data) == 0
+    x = np.ones(system.n)
+    np.testing.assert_allclose(a @ system.solve(x), x, rtol=0, atol=1e-10)
