@@ -30,13 +30,13 @@ cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noe
 
 
 cdef inline int64_t factor_index_size(int64_t n, int64_t blocks, int64_t below) noexcept nogil:
-    """Return the number of int32 for the factor of n bodies, with these blocks of N, and `below` off-diagonal blocks of L."""
+    """Return the number of int32 for the factor of n bodies. N has `blocks` blocks, and L has `below` off-diagonal blocks."""
     return block_pattern_index_size(n, 6, blocks, below) + block_factor_index_size(n, 6)
 
 
 cdef inline int64_t order_index_size(int64_t n, int64_t k) noexcept nogil:
-    """Return the part of it for the order of n bodies and k elements."""
-    # Scratch of the order, four vectors of bodies, the pattern of N, elements.
+    """Return the number of these int32 that the elimination order of n bodies and k elements uses."""
+    # Scratch of the elimination order, four vectors over the bodies, the pattern of N, and the elements.
     return pattern_workspace_size(n, k) + 4 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 
 
@@ -57,7 +57,7 @@ cdef struct pattern_t:
 
 
 cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_t n, int64_t k) noexcept nogil:
-    """Assign places in index (aligned to 8 bytes) for the order of n bodies and k elements; return the next place."""
+    """Bind the pattern of n bodies and k elements to `index` (aligned to 8 bytes); return the first unused int32."""
     a.n, a.k = <int32_t>n, <int32_t>k
     a.scratch = index
     a.parent = index + pattern_workspace_size(n, k)
@@ -74,7 +74,7 @@ cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_
 
 
 cdef inline void bind_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Assign places in index (`index_workspace_size`) for s and a."""
+    """Bind the integers of s and a to `index` (`index_workspace_size` int32)."""
     bind_index_workspace(s, p.n_rows, bind_pattern_workspace(a, index, r.n_bodies, p.n_rows))
 
 
@@ -116,7 +116,7 @@ cdef inline int64_t body_workspace_size(const newton_t* s, const blocks_t* p, co
 
 
 cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
-    """List the runs of elements between the same bodies in group (n + 1); return their number."""
+    """List the groups of consecutive elements between the same two bodies in group (n + 1); return the number of groups."""
     cdef int32_t k, h = 0
     for k in range(e.n):
         if k == 0 or e.node[2 * k] != e.node[2 * k - 2] or e.node[2 * k + 1] != e.node[2 * k - 1]:
@@ -130,7 +130,7 @@ cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
 cdef inline void narrow_panel(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
                               double* panel) noexcept nogil:
     """Compress a panel (rows, 12) in place to the rows that are not fixed and `size` columns of each body.
-
+Compress a panel (rows, 12) in place: keep the rows that are not fixed, and the first `size` columns of each body.
     The two bodies of an element are exchanged if `swapped`.
     """
     cdef int32_t i, j, k

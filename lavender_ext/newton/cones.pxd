@@ -89,7 +89,7 @@ cdef inline void add_cone_transpose(const elements_t* e, int32_t i, int32_t g, c
 # Storage of duals. u1 (m): of the lower bound, or of the first component's cone. u2 (m): of the upper bound, or of the
 # other cones; their first numbers use the places of the normal and of the row after it, which u2 leaves free.
 cdef inline double* dual_normal(const elements_t* e, int32_t i, int32_t g, double* u1, double* u2) noexcept nogil:
-    """Return the place of the first number of a cone's dual."""
+    """Return the address of the first number of a cone's dual."""
     return u1 + e.ptr[i] if g == e.part[i] else u2 + e.ptr[i] + (g - e.part[i] - 1)
 
 
@@ -183,8 +183,8 @@ cdef inline void load_slack(const elements_t* e, int32_t i, int32_t g, const dou
         c[k] = (hz[q + k] - e.g[q + k]) / tangent_factor(a)
 
 
-cdef struct cone_weight_t:      # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]
-    double x                    # entry of the normal
+cdef struct cone_weight_t:      # G^-1 (T^-2 + delta)^-1 G^-T = x [1 h][1 h]^T + [0 0; 0 c]
+    double x                    # entry of the normal (x above)
     double h[4]                 # (n - 1)
     double c[4]                 # (n - 1, n - 1)
     double root[4]              # square root of c

@@ -6,7 +6,7 @@ import numpy as np
 
 cdef void list_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                     int32_t* indptr, int32_t* indices) noexcept nogil:
-    """Write the compressed rows of the graph (to, other) of n elements, columns ascending; with indices NULL indptr alone."""
+    """Write the compressed rows of a graph of n elements, columns ascending; if indices is NULL, write indptr only."""
     cdef int32_t i, j, q, r, width, at
     indptr[0] = 0
     for i in range(n):

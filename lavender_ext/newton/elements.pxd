@@ -27,7 +27,7 @@ cdef struct elements_t:
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
     const int32_t* node         # (n, 2) block columns of the bodies, the larger first, -1: static
     const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
-    int32_t n_groups            # runs of elements between the same two bodies, usually one manifold each
+    int32_t n_groups            # groups of consecutive elements between the same two bodies, usually one contact manifold each
     const int32_t* group        # (n_groups + 1) first element
     const double* panel         # (m, 2 s) K
     const double* theta         # (m)
@@ -35,8 +35,8 @@ cdef struct elements_t:
     const double* lower         # (m) scaled, read on bounded rows
     const double* upper         # (m)
     const int32_t* first        # first row of each friction component
-    const int32_t* size         # its rows, 1 or 2
-    const double* reach         # a_g, its friction coefficient in z
+    const int32_t* size         # number of rows of each friction component, 1 or 2
+    const double* reach         # a_g, friction coefficient of each component in z
     double* scaling             # (components, CONE_SCALING_SIZE) written by `compute_scaling`
 
 

@@ -25,12 +25,12 @@ cdef struct interior_t:         # an interior point; vectors have m entries
     double delta                # proximal weight
     double derivative_fraction  # of De Saxce's term, in B of steps.pxd; 0: the convex law
     double degree               # number of cones and bounds
-    double gap                  # G z . u / degree before the last step
-    double min_gap              # smallest gap before that
+    double gap                  # gap G z . u / degree before the last step
+    double min_gap              # smallest gap before the last step
     double max_gap              # largest gap so far
-    double length               # of the last step
-    double energy               # |F| after it, the judge's energy error (convex law)
-    double velocity             # the judge's velocity error
+    double length               # length of the last step
+    double energy               # |F| after the last step: the judge's energy error (convex law)
+    double velocity             # the judge's velocity error after the last step
 
 
 cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, double dual) noexcept nogil:

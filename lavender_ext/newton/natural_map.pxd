@@ -70,7 +70,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
 
 cdef inline void convex_error(const elements_t* e, const double* z, const double* hz, const double* speed,
                                   double* energy, double* velocity) noexcept nogil:
-    """|F| of the convex natural map, and the largest speed |f|, of a part by its norm."""
+    """Compute |F| of the convex natural map, and the largest speed |f| of a bounded row or friction component."""
     cdef int32_t i, j, k, g, nr
     cdef double total = 0.0, worst = 0.0, x
     cdef double s[6]

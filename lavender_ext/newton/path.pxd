@@ -71,7 +71,7 @@ cdef inline double exponential(double x) noexcept nogil:
 
 
 cdef inline double logarithm(double x) noexcept nogil:
-    """Return ln x to 1e-15 likewise: 2 artanh((m - 1) / (m + 1)) of x = m 2^k with m near 1; x > 0."""
+    """Return ln x of x > 0 to 1e-15, with the same bits on every machine: 2 artanh((m - 1) / (m + 1)) for x = m 2^k, m near 1."""
     cdef double k = 0.0, y, square, term, total = 0.0
     cdef int i, _i
     for _i in range(1100):
@@ -91,7 +91,7 @@ cdef inline double logarithm(double x) noexcept nogil:
     return 2.0 * total + k * 0.6931471805599453
 
 
-cdef enum:                      # stages of a path
+cdef enum:                      # stages of a path (table above)
     STARTING = 0
     STEPPING = 1
     CORRECTING = 2
@@ -107,36 +107,36 @@ cdef enum:
     N_PATHS = 3                 # ratios c that are tried
     MAX_PATH_FACTORISATIONS = 600   # Budget of one path; most end within 300.
     MAX_START_STEPS = 15        # Newton steps at one first tau.
-    MAX_TAU_RAISES = 3          # The first tau is raised at most so often: towers carry up to some hundred times g.
-    MAX_CORRECTIONS = 4         # Newton steps of one point; with more the step is halved instead.
+    MAX_TAU_RAISES = 3          # The first tau is raised at most this often: contacts of towers carry up to some hundred times g.
+    MAX_CORRECTIONS = 4         # Newton steps of one point; if more are needed, the step is halved instead.
     MAX_REPEATED_CORRECTIONS = 4    # Newton steps that correct the last point further.
     HALVINGS_TO_REPEAT = 2      # Halvings of a step before the last point is corrected further.
-    STEPS_TO_FULL_TOLERANCE = 6     # Steps after a return with the smaller tolerance.
-    TRIAL_FACTORISATIONS = 4    # Budget of damped Newton from a point of the path.
+    STEPS_TO_FULL_TOLERANCE = 6     # Steps after a return to a saved point for which the smaller tolerance applies.
+    TRIAL_FACTORISATIONS = 4    # Budget of damped Newton that starts from a point of the path.
 
-cdef enum:                      # coordinates: 4 i + FIRST_COORDINATE of element i (normal, or a row's lower bound), then its
-    LOG_TAU = 0                 # components (or the row's upper bound)
+cdef enum:                      # coordinates: 4 i + FIRST_COORDINATE is the normal of element i (or a row's lower bound). Its
+    LOG_TAU = 0                 # components (or the row's upper bound) follow.
     FIRST_COORDINATE = 1
     COORDINATES_PER_ELEMENT = 4
 
 
 cdef inline double friction_ratio_of(int32_t k) noexcept nogil:
     """Return c of the k-th path."""
-    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # Not ==, of which compilers make a table.
+    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # The comparisons are not ==, of which compilers would make a table.
 
 
 cdef inline double curve_tolerance() noexcept nogil:
-    """Change of (2) by a correction below which a point counts as on the curve."""
+    """Return the change of (2) by a correction below which a point counts as on the curve."""
     return 0.2
 
 
 cdef inline double first_step_length() noexcept nogil:
-    """First h, the change of the fastest coordinate in one step."""
+    """Return the first h, the change of the fastest coordinate in one step."""
     return 0.3
 
 
 cdef inline double path_compliance() noexcept nogil:
-    """Return the first compliance eps of the smoothed path, relative to d; it is divided by ten if the path cannot start."""
+    """Return the first compliance eps of the smoothed path, relative to d. If the path cannot start, eps is divided by ten."""
     return 1e-9
 
 
@@ -147,7 +147,7 @@ cdef inline double smooth_max(double x, double tau) noexcept nogil:
 
 
 cdef inline double smooth_max_slope(double x, double tau) noexcept nogil:
-    """Return p'(x); p'(-x) = 1 - p'(x)."""
+    """Return p'(x). It satisfies p'(-x) = 1 - p'(x)."""
     return smooth_max(x, tau) / sqrt(x * x + 4.0 * tau * tau)
 
 
@@ -335,7 +335,7 @@ cdef inline double largest_change(const newton_t* n, const double* dy, double dl
 
 
 cdef inline void begin_path(newton_t* n) noexcept nogil:
-    """Begin the next path from z = 0; its vectors are those of interior points and exchanges, which have ended."""
+    """Begin the next path from z = 0. Its vectors are those of interior points and exchanges, which have ended."""
     cdef path_t* x = &n.path
     cdef int32_t j, m = n.s.e.m
     x.z, x.t, x.b = n.ip.z, n.ip.u1, n.ip.hz
@@ -391,7 +391,7 @@ cdef inline double project_on_parameter(newton_t* n, double tau, double* change)
 
 
 cdef inline void add_step(newton_t* n, double* z, double* l, double dl) noexcept nogil:
-    """Add n.dz and dl to a point."""
+    """Add n.dz to z, and dl to log tau."""
     cdef int32_t j
     for j in range(n.s.e.m):
         z[j] += n.dz[j]
@@ -399,7 +399,7 @@ cdef inline void add_step(newton_t* n, double* z, double* l, double dl) noexcept
 
 
 cdef inline void compute_tangent(newton_t* n, double tau) noexcept nogil:
-    """Compute the tangent from the last b; its direction follows from the sign of the determinant.
+    """Compute the tangent from the last b, with the direction that follows from the sign of the determinant.
 
     If the sign is unknown, the parameter continues in its direction.
     """
@@ -414,7 +414,7 @@ cdef inline void compute_tangent(newton_t* n, double tau) noexcept nogil:
 
 
 cdef inline void save_point(newton_t* n) noexcept nogil:
-    """Save the last point, to which the path returns if steps fail; the older of two saved points is dropped."""
+    """Save the last point, to which the path returns if steps fail. Two points are saved; a third one replaces the older."""
     cdef path_t* x = &n.path
     cdef double* z = x.saved_z[0]
     cdef double* tangent = x.saved_t[0]
@@ -427,7 +427,7 @@ cdef inline void save_point(newton_t* n) noexcept nogil:
 
 
 cdef inline bint return_to_saved_point(newton_t* n) noexcept nogil:
-    """Return to the saved point with half the step and a smaller tolerance; False if there is none."""
+    """Return to the newest saved point with half the step and a smaller tolerance; return False if no point is saved."""
     cdef path_t* x = &n.path
     cdef double* z = x.saved_z[0]
     cdef double* tangent = x.saved_t[0]
@@ -509,7 +509,7 @@ cdef inline void accept_point(newton_t* n) noexcept nogil:
 
 
 cdef inline bint repeat_correction(newton_t* n) noexcept nogil:
-    """Correct the last point further, in n.u; return False if that fails."""
+    """Correct the last point further, and store the result in n.u; return False if that fails."""
     cdef path_t* x = &n.path
     cdef double tau = exponential(x.next), dl, change
     x.factors += 1
@@ -529,7 +529,7 @@ cdef inline bint repeat_correction(newton_t* n) noexcept nogil:
 
 
 cdef inline void start_path(newton_t* n) noexcept nogil:
-    """Take a Newton step at the first tau; if it does not converge, raise tau and begin anew."""
+    """Take a Newton step at the first tau. If the steps do not converge, raise tau and begin again."""
     cdef path_t* x = &n.path
     cdef double tau = exponential(x.l), change
     x.factors += 1
@@ -539,7 +539,7 @@ cdef inline void start_path(newton_t* n) noexcept nogil:
         x.raises += 1
         if x.raises > MAX_TAU_RAISES:
             pop_phase(n)
-        # The lowest contacts of a stack carry a multiple of the load that g suggests, and feel a compliance as much more.
+        # The lowest contacts of a stack carry a multiple of the load that g suggests, and a compliance acts on them as much more.
         x.l += logarithm(10.0)
         x.eps *= 0.1
         x.start, x.factors = x.l, 0

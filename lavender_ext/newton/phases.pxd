@@ -38,57 +38,57 @@ from lavender_ext.newton.system cimport (BARRIER, NATURAL, solve_natural, solve_
 
 cdef enum:                      # active set
     TYPICAL_INTERIOR_STEPS = 12     # Exchanges end if (3) predicts more steps than an interior point usually takes.
-    MAX_STALLED_EXCHANGES = 4       # They end if this many in a row do not lower the number of changes.
+    MAX_STALLED_EXCHANGES = 4       # Exchanges end if this many in a row do not lower the number of rows that change their bound.
 
 cdef enum:                      # interior points
     MAX_INTERIOR_STEPS = 1000       # Limit of one convex interior point, whatever the budget.
-    MAX_IDLE_INTERIOR_STEPS = 15    # It ends if this many steps halve neither residual nor gap.
-    MAX_STALLED_INTERIOR_STEPS = 3  # Below `roundoff_residual` it ends if this many steps do not halve the residual.
-    CERTIFICATE_REFINEMENTS = 3     # Solves of (4) with one factor.
-    MAX_CERTIFICATE_FACTORS = 4     # Factors of (4), each with fewer elements.
+    MAX_IDLE_INTERIOR_STEPS = 15    # An interior point ends if this many steps halve neither residual nor gap.
+    MAX_STALLED_INTERIOR_STEPS = 3  # Below `roundoff_residual` an interior point ends if this many steps do not halve the residual.
+    CERTIFICATE_REFINEMENTS = 3     # Solves of (4) with the same factor.
+    MAX_CERTIFICATE_FACTORS = 4     # Factors of (4); each factor has fewer elements than the one before.
     CONE_END_FACTORISATIONS = 12    # Budget of the damped Newton phase that ends an interior point of cones.
     MAX_HYBRID_STEPS = 60           # Limit of an interior point with Newton trials; more steps rarely help.
-    MAX_SHORT_STEPS = 4             # It ends after this many short steps in a row: the path has turned back.
-    TRIAL_INNER_STEPS = 2           # Newton steps of a trial to end De Saxce's interior point.
-    AUGMENTED_TRIAL_STEPS = 4       # Augmented Newton steps of a trial.
-    MAX_FAILED_AUGMENTED_STEPS = 2  # A trial ends if this many in a row do not halve the residual.
+    MAX_SHORT_STEPS = 4             # Such an interior point ends after this many short steps in a row: the path has turned back.
+    TRIAL_INNER_STEPS = 2           # Newton steps of one attempt to end De Saxce's interior point.
+    AUGMENTED_TRIAL_STEPS = 4       # Augmented Newton steps of one attempt.
+    MAX_FAILED_AUGMENTED_STEPS = 2  # An attempt ends if this many steps in a row do not halve the residual.
 
 cdef enum:                      # damped Newton
-    LINE_SEARCH_MEMORY = 6      # Steps that the non-monotone line search looks back.
-    MAX_STEP_HALVINGS = 7       # Halvings of one step; the best length is then taken.
+    LINE_SEARCH_MEMORY = 6      # Number of earlier steps that the non-monotone line search compares with.
+    MAX_STEP_HALVINGS = 7       # Largest number of halvings of one step. After them, the best length is taken.
     MAX_FREE_ITERATIONS = 20    # The phase is stuck after this many iterations in a row without a factorisation.
-    STRETCH_FACTORISATIONS = 12     # Factorisations between two checks of the gain of a phase.
-    MAX_STRETCHES = 1000        # Limit of one phase, whatever the budget.
+    STRETCH_FACTORISATIONS = 12     # Length of a stretch: factorisations between two checks that the phase still gains.
+    MAX_STRETCHES = 1000        # Largest number of stretches of one phase, whatever the budget.
     UNLIMITED = 2147483647
 
 
 cdef inline double roundoff_residual() noexcept nogil:
-    """Relative residual below which rounding may stall an interior point."""
+    """Return the relative residual below which rounding may stall an interior point."""
     return 1e-6
 
 
 cdef inline double short_step() noexcept nogil:
-    """Step length of an interior point below which a step counts as short."""
+    """Return the step length of an interior point below which a step counts as short."""
     return 0.05
 
 
 cdef inline double smallest_gap_ratio() noexcept nogil:
-    """Gap as a fraction of its maximum below which an interior point ends: rounding dominates its scaling."""
+    """Return the gap, relative to its maximum, below which an interior point ends because rounding dominates its scaling."""
     return 1e-24
 
 
 cdef inline double exchange_weight() noexcept nogil:
-    """Weight eps in the matrix of an exchange, which keeps dependent rows solvable; refinement removes its effect."""
+    """Return the weight eps in the matrix of an exchange. It keeps dependent rows solvable; refinement removes its effect."""
     return 1e-9
 
 
 cdef inline double augmented_shift() noexcept nogil:
-    """Shift of the augmented system's rows, relative to d: squared singular values below it count as zero."""
+    """Return the shift of the augmented system's rows, relative to d. Squared singular values below it count as zero."""
     return 1e-14
 
 
 cdef inline double smallest_alpha() noexcept nogil:
-    """Proximal weight below which a factorisation does not see it any more."""
+    """Return the smallest proximal weight; a factorisation loses smaller ones to rounding."""
     return 1e-12
 
 
@@ -160,14 +160,14 @@ cdef inline bint predicts_too_many(int32_t first, int32_t now, int32_t exchanges
 
 
 cdef inline void end_active_set(newton_t* n) noexcept nogil:
-    """Score the best z and end the phase."""
+    """Judge the best z and end the phase."""
     if not n.active.is_scored:
         score_point(n, n.active.best_z)
     pop_phase(n)
 
 
 cdef inline void step_active_set(newton_t* n) noexcept nogil:
-    """Make one exchange, until the judge accepts, no row changes, or (3) predicts too many."""
+    """Make one exchange. End the phase if the judge accepts, no row changes, or (3) predicts too many exchanges."""
     cdef active_set_t* x = &n.active
     cdef double residual
     cdef int32_t changed
@@ -192,7 +192,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
     changed = count_active_bound_changes(n.s.e, x.z, x.hz, x.bound)
     x.stalled = 0 if changed < x.fewest_changes else x.stalled + 1
     x.fewest_changes = changed if changed < x.fewest_changes else x.fewest_changes
-    # With the same active rows, further exchanges only refine away the weight; they go on while that gains.
+    # With the same active rows, further exchanges only remove the effect of eps; they continue while that lowers the residual.
     if x.best > n.tol and (not gains if changed == 0 else x.stalled >= MAX_STALLED_EXCHANGES
                            or predicts_too_many(x.first_changes, changed, x.exchanges)):
         end_active_set(n)
@@ -288,7 +288,7 @@ cdef inline void find_interior_certificate(newton_t* n) noexcept nogil:
 
 
 cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nogil:
-    """Score the best z and end the phase.
+    """Judge the best z and end the phase.
 
     On cones, damped Newton follows close to the solution, and else the search for a certificate.
     """
@@ -304,7 +304,7 @@ cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nog
 
 
 cdef inline void step_interior_point(newton_t* n) noexcept nogil:
-    """Take a step; bounded rows are exchanged each time the residual falls by a factor of ten."""
+    """Take an interior point step. Each time the residual falls by a factor of ten, exchange bounded rows."""
     cdef progress_t* k = &n.progress
     cdef double residual
     cdef bint gains
@@ -355,7 +355,7 @@ cdef inline void begin_damped_newton(newton_t* n, const double* z, int32_t law, 
 
 
 cdef inline void push_damped_newton(newton_t* n, int32_t limit) noexcept nogil:
-    """Start or continue the phase for `limit` factorisations."""
+    """Start or continue damped Newton for `limit` factorisations."""
     cdef damped_newton_t* x = &n.damped
     x.last = n.s.factorisations + limit if limit < UNLIMITED - n.s.factorisations else UNLIMITED
     x.free_iterations = x.stage = 0
@@ -449,14 +449,14 @@ cdef inline bint request_certificate_check(newton_t* n, const damped_newton_t* x
     big = norm_inf(n.direction, n.s.e.m)
     if not 0.0 < big < 1.0 / 0.0:
         return False
-    for j in range(n.s.e.m):            # Rounding leaves rows that take no part slightly beyond their bounds.
+    for j in range(n.s.e.m):            # Rounding leaves rows that do not act slightly beyond their bounds.
         n.direction[j] = n.direction[j] / big if fabs(n.direction[j]) > 1e-11 * big else 0.0
     n.needs_check = 1
     return True
 
 
 cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
-    """Take a Newton step of a proximal iteration, until the judge accepts, the limit is reached, or it is stuck."""
+    """Take a Newton step of a proximal iteration. End the phase if the judge accepts, the limit is reached, or it is stuck."""
     cdef damped_newton_t* x = &n.damped
     cdef int32_t factorisations
     cdef bint idle
@@ -498,14 +498,14 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_stretches(newton_t* n, int32_t length, double residual) noexcept nogil:
-    """Begin a damped Newton phase that must reach half of `residual` in `length` factorisations."""
+    """Begin a damped Newton phase whose first stretch of `length` factorisations must halve `residual`."""
     n.stretches.residual, n.stretches.length = residual, length
     n.stretches.is_running = n.stretches.stretches = 0
     push_phase(n, DAMPED_STRETCHES)
 
 
 cdef inline void step_stretches(newton_t* n) noexcept nogil:
-    """Continue the damped Newton phase as long as each stretch halves its residual."""
+    """Continue damped Newton by another stretch if the last stretch halved the residual; else end the phase."""
     cdef stretches_t* x = &n.stretches
     cdef double best
     if not x.is_running:
@@ -530,14 +530,14 @@ cdef inline void step_stretches(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_interior_with_newton(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
-    """Begin steps of De Saxce's interior point, or of an augmented one, with trials by Newton steps of `law`."""
+    """Begin steps of De Saxce's interior point, or of an augmented one, with attempts to finish by Newton steps of `law`."""
     begin_progress(n, 1e-5 if augmented else 1e-3)
     n.progress.law, n.progress.augmented = law, augmented
     push_phase(n, INTERIOR_WITH_NEWTON)
 
 
 cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
-    """Take a step, and try Newton steps each time the residual falls by a factor of ten."""
+    """Take an interior point step. Each time the residual falls by a factor of ten, attempt to finish by Newton steps."""
     cdef progress_t* k = &n.progress
     cdef double residual
     cdef bint succeeded
@@ -589,7 +589,7 @@ cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept n
 
 
 cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
-    """Take a Newton step on the augmented system, until the judge accepts or steps do not gain."""
+    """Take a Newton step on the augmented system. End the phase if the judge accepts or steps do not lower the residual."""
     cdef augmented_newton_t* x = &n.augmented
     cdef int32_t j
     cdef double residual

@@ -80,19 +80,19 @@ cdef struct active_set_t:
     int32_t first_changes       # rows whose active bound changed in the first exchange
     int32_t exchanges
     int32_t fewest_changes
-    int32_t stalled             # exchanges since the fewest changes
+    int32_t stalled             # exchanges since the number of changed rows was lowest
 
 
-cdef struct progress_t:         # of the steps of an interior point
+cdef struct progress_t:         # progress of an interior point's steps
     double* best_z
     double lowest               # relative residual of best_z
     double trial_residual       # Newton steps or exchanges are tried below this relative residual
-    int32_t idle                # steps since residual or gap halved
+    int32_t idle                # steps since the residual or the gap halved
     int32_t stalled             # steps since the residual halved, or short steps in a row
     int32_t steps
     int32_t trial_runs          # a trial is on the stack
     int32_t bounded_rows        # the problem has bounded rows alone
-    int32_t law                 # of the Newton steps
+    int32_t law                 # law that the Newton steps use
     int32_t augmented
 
 
@@ -103,88 +103,88 @@ cdef struct augmented_newton_t:
     int32_t steps_left
 
 
-cdef struct damped_newton_t:    # proximal iterations
+cdef struct damped_newton_t:    # state of the proximal iterations
     double* z
     double history[MAX_INNER_STEPS]     # |F_c| at each inner step
     double alpha                # proximal weight
-    double min_factor           # alpha falls at most by this factor, closer to 1 after a failure
+    double min_factor           # alpha is multiplied by at least this factor; failures raise it
     double earlier_best         # best residual when the iteration began
     int32_t law
     int32_t max_inner_steps
     int32_t failures
     int32_t idle                # iterations without progress at the smallest alpha
     int32_t is_stuck
-    int32_t stage               # of an iteration: 0 begin, 1 inner steps, 2 end
+    int32_t stage               # stage of a proximal iteration: 0 begin, 1 inner steps, 2 end
     int32_t inner_steps
-    int32_t is_solved           # the inner problem
+    int32_t is_solved           # the inner problem is solved
     int32_t first               # factorisations when the iteration began
     int32_t last                # factorisations at which the phase ends
     int32_t free_iterations     # iterations in a row without a factorisation
 
 
-cdef struct stretches_t:        # a damped Newton phase that continues while it gains
-    double residual             # half of this must be reached by the stretch
+cdef struct stretches_t:        # a damped Newton phase that continues as long as each stretch of it halves the residual
+    double residual             # residual at the start of the stretch, which must halve it
     int32_t is_running          # a stretch is on the stack
-    int32_t length              # factorisations of a stretch
+    int32_t length              # factorisations of one stretch
     int32_t stretches
 
 
 cdef struct de_saxce_t:
     double derivative_fraction
-    double next_fraction        # fraction of a second interior point; 0: none
-    double max_residual         # damped Newton does not end it above this relative residual
+    double next_fraction        # fraction of phi's derivative in a second interior point; 0: there is no second one
+    double max_residual         # damped Newton follows only if the relative residual is at most this
     int32_t stage
     int32_t augmented
 
 
 cdef struct path_t:             # a path of smoothed problems; its vectors belong to phases that have ended
     double* z                   # the last point
-    double l                    # log tau of it
-    double* t                   # tangent in z
-    double tl                   # and in log tau
+    double l                    # log tau of the last point
+    double* t                   # z part of the tangent
+    double tl                   # log tau part of the tangent
     double* b                   # -F_z^-1 F_tau of the last factor
-    double* saved_z[2]          # the two points before it
+    double* saved_z[2]          # the two points to which the path can return
     double* saved_t[2]
     double saved_l[2]
     double saved_tl[2]
     double saved_h[2]
     double friction_ratio       # c: tau of friction over tau of normals
-    double size                 # of g
+    double size                 # root mean square of g
     double eps                  # compliance
     double start                # first log tau
-    double h                    # length of a step
+    double h                    # length of a step (h of path.pxd)
     double next                 # log tau of the point that is corrected
-    double speed                # of the parameter along the tangent
-    double change               # of the coordinates by the last correction, infinite before the first
-    double first_change         # by the first correction of a point
-    double tolerance            # a point is on the curve if its correction changes less
+    double speed                # rate of the parameter along the tangent
+    double change               # largest change of a coordinate by the last correction; infinite before the first correction
+    double first_change         # largest change of a coordinate by the first correction of a point
+    double tolerance            # a point is on the curve if its correction changes the coordinates by less
     double trial_residual       # a damped Newton phase is tried below this relative residual
     int32_t stage
     int32_t parameter           # coordinate that parametrises the next step
-    int32_t sign                # of the determinant; 0: not known
-    int32_t halvings            # of the step in a row
+    int32_t sign                # sign of det F_z; 0: not known
+    int32_t halvings            # consecutive halvings of the step
     int32_t steps_since_return
-    int32_t factors             # of the present point
-    int32_t raises              # of the first tau
+    int32_t factors             # factorisations for the present point
+    int32_t raises              # number of times that the first tau was raised
     int32_t n_saved
-    int32_t paths               # begun so far
+    int32_t paths               # number of paths begun so far
     int32_t last                # factorisations at which the path ends
 
 
 cdef struct newton_t:           # bound to its workspace; it must not move
     system_t s
     scaled_t sc
-    linear_t linear             # of s, unless a host provides it
+    linear_t linear             # matrix of s, unless a host provides it
     problem_t problem
     double tol
     int32_t budget              # factorisations
     int32_t stop                # the caller has no time left
     int32_t needs_check         # the caller must check whether `direction` is a certificate
-    int32_t proven              # it is one
+    int32_t proven              # `direction` is a certificate
     int32_t is_cold             # the start is the zero impulse
     int32_t has_augmented       # the caller can factor the augmented system
-    int32_t disabled_phases     # bits
-    int32_t stage               # of the plan
+    int32_t disabled_phases     # bit set of the phases that are skipped
+    int32_t stage               # state of the plan (plan.pxd)
     int32_t has_saved_best
     int32_t counts[N_COUNTED]
     int32_t stack[MAX_PHASE_DEPTH]
@@ -336,7 +336,7 @@ cdef inline void compute_slack(newton_t* n, const double* z, double* slack) noex
 
 
 cdef inline void write_impulse(const newton_t* n, const double* z, double* lam) noexcept nogil:
-    """Write lambda (rows) of z."""
+    """Write the impulse lambda (rows) that belongs to z."""
     cdef int32_t j
     memcpy(lam, n.sc.fixed, n.problem.p.n_rows * sizeof(double))
     for j in range(n.s.e.m):
@@ -437,7 +437,7 @@ cdef inline bint is_over(newton_t* n) noexcept nogil:
 
 
 cdef inline void restore_earlier_best(newton_t* n) noexcept nogil:
-    """Continue from the best point before the last phase; its own best point counts again at the end."""
+    """Continue from the best point before the last phase, and save the phase's own best point for `restore_best_of_all`."""
     if n.best < n.earlier_best:
         n.has_saved_best = 1
         n.saved_best = n.best
@@ -460,13 +460,13 @@ cdef inline void store_earlier_best(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
-    """Begin a phase that is judged by its own progress."""
+    """Begin a phase whose best point is recorded separately from earlier points."""
     store_earlier_best(n)
     n.best = 1.0 / 0.0
 
 
 cdef inline double end_separate_best(newton_t* n, double* z) noexcept nogil:
-    """End it: return its lowest residual, copy its z unless NULL, and keep the better of both points as the best."""
+    """End such a phase: return its lowest residual, copy its z unless NULL, and keep the better of both points as the best."""
     cdef double best = n.best
     if z != NULL:
         copy_vector(n, z, n.best_z)
