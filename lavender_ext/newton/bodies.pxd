@@ -129,8 +129,8 @@ cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
 
 cdef inline void narrow_panel(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
                               double* panel) noexcept nogil:
-    """Compress a panel (rows, 12) in place to the rows that are not fixed and `size` columns of each body.
-Compress a panel (rows, 12) in place: keep the rows that are not fixed, and the first `size` columns of each body.
+    """Compress a panel (rows, 12) in place: keep the rows that are not fixed, and `size` columns of each body.
+
     The two bodies of an element are exchanged if `swapped`.
     """
     cdef int32_t i, j, k

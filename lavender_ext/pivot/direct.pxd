@@ -17,10 +17,10 @@ from lavender_ext.pivot.principal cimport pivoting_t
 
 
 cpdef enum:                     # results of a step, in addition to those of rounds (principal.pxd)
-    PASS_HALVED = 5             # A pass has halved the best residual; another follows.
-    PASS_ENDED = 6              # A pass has not halved it; its change `step` may be a certificate.
-    PASSES_USED = 7             # All passes are used up, or the last ones gained nothing.
-    CYCLING = 8                 # Exchanges are stuck and A is not symmetric, so that no energy decreases.
+    PASS_HALVED = 5             # A pass has halved the best residual; another pass follows.
+    PASS_ENDED = 6              # A pass has not halved the best residual. Its change `step` may be a certificate.
+    PASSES_USED = 7             # All passes are used up, or the last passes did not lower the residual.
+    CYCLING = 8                 # Exchanges are stuck. A is not symmetric, so there is no energy to descend on.
 
 
 cdef enum:                      # states
@@ -41,11 +41,11 @@ cdef struct direct_t:
     int32_t symmetric           # A is symmetric.
     double* start               # (m) N s
     double* x                   # (3 m) impulse that was judged last [N s], its slack [m/s], its error [N s]
-    double* best                # (3 m) the same of the smallest residual
+    double* best                # (3 m) impulse, slack and error with the smallest residual so far
     double* origin              # (m) N s, start of a step of descent
-    double* slope               # (m) m/s, w at the origin
-    double* step                # (m) N s, step of descent; after a pass, its change
-    double* scratch             # of the judge
+    double* slope               # (m) m/s, w at `origin`
+    double* step                # (m) N s, step of a descent; after a pass, the change of the impulse in this pass
+    double* scratch             # scratch memory of the judge
     int32_t* side               # (m) scratch of a step of descent
     score_t score               # of `best`
     double relative             # relative residual of `best`
@@ -53,16 +53,16 @@ cdef struct direct_t:
     double now                  # relative residual of `x`
     int32_t state
     int32_t is_over
-    int32_t rank                # of a singular A with all rows free; else 0
-    int32_t solved              # Exchanges have ended without a shift.
+    int32_t rank                # rank of a singular A with all rows free; otherwise 0
+    int32_t solved              # Exchanges have ended without a shift of the diagonal.
     int32_t swept               # The free rows were guessed by sweeps.
-    int32_t refined             # corrections
+    int32_t refined             # number of corrections of the free rows by refinement
     int32_t shifts
-    int32_t searches            # step lengths that were tried
-    int32_t next_shift          # index of the next shift of `get_proximal_shift`; N_SHIFTS: keep the present one
-    double larger_shift         # if positive, the next shift
-    int32_t passes              # begun
-    int32_t waited              # passes since the best residual was halved
+    int32_t searches            # number of step lengths that line searches tried
+    int32_t next_shift          # index of the next shift in `get_proximal_shift`; N_SHIFTS: the shift does not change any more
+    double larger_shift         # If this is positive, it is the next shift.
+    int32_t passes              # number of passes begun
+    int32_t waited              # number of passes since the best residual was last halved
     int32_t is_pass_over        # The next step begins a pass.
     double halved_from          # residual that the next pass has to halve
 

@@ -48,11 +48,11 @@ from lavender_ext.pivot.principal cimport (
 
 
 cdef enum:
-    MAX_CORRECTIONS = 100       # corrections of one refinement; each halves the residual
+    MAX_CORRECTIONS = 100       # Largest number of corrections in one refinement, each of which must halve the residual.
     MAX_PASSES = 100
-    MAX_WAITED_PASSES = 6       # passes without halving the best residual, after which no other follows
-    N_SHIFTS = 5                # shifts of a descent
-    MAX_STEP_LENGTHS = 41       # step lengths of a line search: 1, 1/2, ... 2^-40
+    MAX_WAITED_PASSES = 6       # Passes end after this many in a row that do not halve the best residual.
+    N_SHIFTS = 5                # Number of shifts that a descent uses.
+    MAX_STEP_LENGTHS = 41       # Largest number of step lengths in a line search: 1, 1/2, ... 2^-40.
 
 
 # -- workspace and begin -----------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ cdef int64_t count_direct_workspace_integers(const view_t* v) noexcept nogil:
 
 
 cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexcept nogil:
-    """Bind the arrays of t, whose fields that direct.pxd names are set."""
+    """Bind the arrays of t. The fields listed in direct.pxd must be set before."""
     cdef int64_t m = t.v.p.n_rows
     t.x, t.best = real, real + 3 * m
     t.start, t.origin, t.slope, t.step = real + 6 * m, real + 7 * m, real + 8 * m, real + 9 * m
@@ -96,7 +96,7 @@ cdef void begin_direct_solve(direct_t* t, const double* start) noexcept nogil:
 
 
 cdef void begin_bound_exchanges(direct_t* t) noexcept nogil:
-    """Begin with exchanges from the bounds in s.at; the best impulse is kept."""
+    """Begin with exchanges from the bounds in s.at; the best impulse so far is kept."""
     set_diagonal_shift(&t.s, 0.0)
     t.passes = t.is_over = 0
     t.state = EXCHANGE
@@ -105,12 +105,12 @@ cdef void begin_bound_exchanges(direct_t* t) noexcept nogil:
 # -- judging and refinement --------------------------------------------------------------------------------------
 
 cdef inline int32_t is_best_impulse_accurate(const direct_t* t) noexcept nogil:
-    """Return whether the best residual is at most `least`, or at a floor that excuses it."""
+    """Return whether the best residual is at most `least` or explained by rounding."""
     return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))
 
 
 cdef int32_t is_solved_to_rounding(const direct_t* t) noexcept nogil:
-    """Return `is_best_impulse_accurate`, or for a linear system whether only rounding is left."""
+    """Return `is_best_impulse_accurate`; for a linear system, also return True if only rounding is left."""
     return is_best_impulse_accurate(t) or (t.linear and is_at_floor(t.relative, t.floor))
 
 
@@ -121,7 +121,7 @@ cdef inline void clip_rows_to_bounds(const direct_t* t, const double* x, double*
 
 
 cdef void judge_iterate(direct_t* t) noexcept nogil:
-    """Judge s.x, clipped to its bounds, and keep it if it is the best."""
+    """Clip s.x to its bounds and judge it; keep it if its residual is the lowest so far."""
     cdef score_t score = make_empty_score()
     cdef double* x = t.x
     cdef double* w = x + t.s.n
@@ -136,7 +136,7 @@ cdef void judge_iterate(direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t refine_free_rows(direct_t* t) noexcept nogil:
-    """Correct the free rows while that halves the residual; return ROUNDS_USED if a row was exchanged, else SOLVED."""
+    """Correct the free rows as long as that halves the residual; return ROUNDS_USED if a row was exchanged, else SOLVED."""
     cdef double previous = INFINITY
     cdef int32_t _
     for _ in range(MAX_CORRECTIONS):
@@ -209,7 +209,7 @@ cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nog
 # -- passes with a shift -----------------------------------------------------------------------------------------
 
 cdef inline double get_proximal_shift(int32_t i) noexcept nogil:
-    """Return the i-th shift s. The last one is far above the rounding of a factor and far below a mass ratio of 1e8."""
+    """Return the i-th shift s. The last shift is far above the rounding of a factor and far below a mass ratio of 1e8."""
     return 1e-2 if i == 0 else 1e-4 if i == 1 else 1e-6 if i == 2 else 1e-8 if i == 3 else 1e-10
 
 
@@ -343,7 +343,7 @@ cdef inline double search_step_length(direct_t* t) noexcept nogil:
 
 
 cdef inline bint is_descent_minimum(const direct_t* t) noexcept nogil:
-    """Return whether the complete step was within the bounds, and no w pushes a row off its bound."""
+    """Return whether the complete step stayed within the bounds and no row at a bound has a w that pushes it off the bound."""
     cdef const pivoting_t* s = &t.s
     cdef int32_t i
     cdef double low, high, tolerance, y
@@ -528,7 +528,7 @@ cdef class Pivoting:
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
     def advance(self, int max_rounds):
-        """Do at most `max_rounds` rounds, refined and judged; return the result of the step (states in direct.pyx)."""
+        """Do at most `max_rounds` rounds, refine and judge; return the result of the step (table in direct.pyx)."""
         cdef int32_t code
         with nogil:
             code = step_direct_solve(&self.t, max_rounds)
@@ -536,17 +536,17 @@ cdef class Pivoting:
 
     @property
     def is_over(self):
-        """Whether the last step had a final result."""
+        """Whether the result of the last step was final."""
         return bool(self.t.is_over)
 
     @property
     def relative(self):
-        """Relative residual of the best impulse, inf before the first."""
+        """Relative residual of the best impulse; inf before the first impulse."""
         return self.t.relative
 
     @property
     def floor(self):
-        """Relative round-off floor of the best impulse."""
+        """Relative round-off limit of the best impulse."""
         return self.t.floor
 
     @property
@@ -562,7 +562,7 @@ cdef class Pivoting:
 
     @property
     def late(self):
-        """Whether a factor was not started."""
+        """Whether an outside factor was not started because of the deadline."""
         return bool(self.t.s.late)
 
     @property
@@ -589,11 +589,11 @@ cdef class Pivoting:
 
     @property
     def best(self):
-        """The best impulse with its residual as a `Judged`, None before the first."""
+        """The best impulse with its residual as a `Judged`; None before the first impulse."""
         cdef Py_ssize_t m = self.t.s.n, at
         if not self.t.relative < INFINITY:
             return None
-        at = 0 if self.t.best < self.t.x else 3 * m     # The two arrays change places.
+        at = 0 if self.t.best < self.t.x else 3 * m     # `best` and `x` exchange their memory, so the lower address decides.
         numbers = self.reals[at:at + 3 * m].copy()
         return make_judged(self.judged, numbers[:m], numbers[m:], &self.t.score, self.t.relative, self.t.floor)
 

@@ -17,27 +17,27 @@ cpdef enum:                     # results of `follow_lemke_paths`
 
 cdef struct dictionary_t:
     int32_t n_pairs
-    int32_t n                   # rows and columns of pairs in use; retired ones of free rows follow
-    int64_t width               # of a row of t
-    double* t                   # (n_pairs, width): column of z, values of the basic variables, columns of the nonbasic ones
+    int32_t n                   # rows, and columns of pairs, in use; the retired ones of free rows follow
+    int64_t width               # length of a row of t
+    double* t                   # (n_pairs, width): column of z, values of the basic variables, columns of the nonbasic variables
     int32_t* basic              # (n_pairs) variable of each row
-    int32_t* nonbasic           # (n_pairs + 2) variable of each column; the second column has none
-    int32_t* position           # (2 n_pairs + 1) row of a basic variable, -1 - column of a nonbasic one
+    int32_t* nonbasic           # (n_pairs + 2) variable of each column; the column of values has no variable
+    int32_t* position           # (2 n_pairs + 1) row of a basic variable; -1 - column of a nonbasic variable
     int32_t* initial            # (n) basic variables before the path
-    int32_t entering            # column of the entering variable; after a ray, the one without a limit, or NO_COLUMN
+    int32_t entering            # column of the entering variable; after a ray, the column that no row limits, or NO_COLUMN
 
 
 cdef struct lemke_t:
     dictionary_t d
-    direct_t* t                 # the rows: judges impulses, and exchanges at the end of the path
+    direct_t* t                 # solver of the rows: judges impulses, and makes the exchanges at the end of a path
     int32_t* row                # row of each pair; pair of each cap
-    int32_t n_bounded           # pairs of bounded rows; those of caps and of free rows follow
+    int32_t n_bounded           # number of pairs of bounded rows; pairs of caps and of free rows follow
     int32_t n_caps
     int32_t state
-    int32_t n_paths             # begun
+    int32_t n_paths             # number of paths begun
     int32_t n_pivots
     uint64_t random
-    int32_t max_pivots          # A path with so many pivots is given up.
+    int32_t max_pivots          # A path ends without a result after this many pivots.
 
 
 cdef int64_t lemke_workspace_doubles(const blocks_t* p) noexcept nogil

@@ -57,7 +57,7 @@ cdef enum:                      # states
     OVER = 3
 
 cdef enum:
-    NO_COLUMN = -1              # no variable enters: s = 0 is the solution
+    NO_COLUMN = -1              # no variable enters, because s = 0 is the solution
 
 cdef enum:                      # columns of the dictionary before those of the pairs
     COVER = 0                   # the column of z until z is basic
@@ -65,16 +65,16 @@ cdef enum:                      # columns of the dictionary before those of the 
     FIRST = 2                   # first column of a nonbasic variable of a pair
 
 cdef enum:
-    MAX_PATHS = 8               # covering vectors
-    PIVOTS_PER_PAIR = 20        # A path is given up after PIVOTS_PER_PAIR n + EXTRA_PIVOTS pivots.
+    MAX_PATHS = 8               # Largest number of paths, each with another covering vector c.
+    PIVOTS_PER_PAIR = 20        # A path ends without a result after PIVOTS_PER_PAIR n + EXTRA_PIVOTS pivots.
     EXTRA_PIVOTS = 200
-    FINISH_ROUNDS = 32          # rounds of exchanges in one step at the end of a path
+    FINISH_ROUNDS = 32          # Rounds of exchanges in one step at the end of a path.
 
 
 # -- the dictionary ----------------------------------------------------------------------------------------------
 
 cdef inline int32_t complementary_variable(const dictionary_t* d, int32_t variable) noexcept nogil:
-    """Return s_k of w_k, and w_k of s_k."""
+    """Return the complement of a variable: s_k for w_k, and w_k for s_k."""
     return variable - d.n_pairs if variable >= d.n_pairs else variable + d.n_pairs
 
 
@@ -175,7 +175,7 @@ cdef inline bint is_free_row(const blocks_t* p, int32_t i) noexcept nogil:
 
 
 cdef inline bint has_two_bounds(const blocks_t* p, int32_t i) noexcept nogil:
-    """Return whether row i has two bounds, which differ."""
+    """Return whether row i has two bounds that differ."""
     return p.lower[i] > -INFINITY and p.upper[i] < INFINITY and p.lower[i] != p.upper[i]
 
 
@@ -240,7 +240,7 @@ cdef inline void build_dictionary_without_cover(lemke_t* l) noexcept nogil:
         row = d.t + k * d.width
         for j in range(d.n + FIRST):
             row[j] = 0.0
-    # rows of A, and w at the base
+    # rows of A, and w at s = 0
     for i in range(p.n_rows):
         if pair_of[i] < 0:
             continue
@@ -291,7 +291,7 @@ cdef inline bint find_free_pivot(const lemke_t* l, int32_t* r, int32_t* c) noexc
     """Find the largest entry, relative to its row, in the rows of free w and the columns of free s."""
     cdef const dictionary_t* d = &l.d
     cdef int32_t i, j
-    cdef double size, best = 1e-11                      # Smaller entries are rounding.
+    cdef double size, best = 1e-11                      # Smaller entries count as rounding.
     for i in range(first_free_pair(l), d.n):
         size = norm_inf(d.t + i * d.width + FIRST, d.n)
         for j in range(first_free_pair(l) + FIRST, d.n + FIRST):
@@ -364,7 +364,7 @@ cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
         row[COVER] = 0.0 if i >= d.n else 1.0
         if i < d.n and l.n_paths > 0:
             row[COVER] = 0.2 + 1.6 * ((next_random(&l.random) >> 11) * 2.0**-53)
-    # first row that z limits; the last of equals is lexicographically smallest
+    # Find the first row that z limits. Of equal ratios, the last is lexicographically smallest.
     for i in range(d.n):
         d.initial[i] = d.basic[i]
         row, first_row = d.t + i * d.width, d.t + r * d.width
@@ -440,7 +440,7 @@ cdef inline void judge_path_impulse(lemke_t* l) noexcept nogil:
 
 
 cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil:
-    """Write the direction (m) of the ray that ended the path; rows with two bounds have none."""
+    """Write the direction (m) of the ray that ended the path; rows with two bounds have the direction 0."""
     cdef const dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
     cdef double size = 1.0
@@ -467,7 +467,7 @@ cdef int64_t lemke_workspace_integers(const blocks_t* p) noexcept nogil:
 
 
 cdef void bind_lemke_workspace(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil:
-    """Bind the arrays of l, for the rows of t, whose arrays are bound."""
+    """Bind the arrays of l for the rows of t. The arrays of t must be bound before."""
     cdef int32_t n = count_complementary_pairs(t.s.p)
     l.t = t
     l.d.t, l.d.width = real, n + FIRST
@@ -485,9 +485,9 @@ cdef void begin_lemke_solve(lemke_t* l) noexcept nogil:
 
 
 cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
-    """Do at most so many more pivots: DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
+    """Do at most `pivots` further pivots; return DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
 
-    Several calls give the bits of one.
+    Several short calls give the same bits as one long call.
     """
     cdef int32_t code, max_pivots = l.n_pivots + pivots
     while l.state != OVER:
@@ -545,14 +545,14 @@ cdef class Lemke:
         begin_lemke_solve(&self.l)
 
     def run(self, int pivots):
-        """Do at most so many more pivots: DONE, PIVOTS, RAY or LATE."""
+        """Do at most `pivots` further pivots; return DONE, PIVOTS, RAY or LATE."""
         cdef int32_t code
         with nogil:
             code = follow_lemke_paths(&self.l, pivots)
         return self.rows.raise_error(code)
 
     def judge(self):
-        """Judge the present impulse if a path was interrupted, and keep it in `rows` if its residual is the lowest."""
+        """Judge the present impulse of an interrupted path, and keep it in `rows` if its residual is the lowest so far."""
         judge_unfinished_path(&self.l)
 
     @property

@@ -9,12 +9,12 @@ from lavender_ext.factor.linear cimport linear_t
 cpdef enum:                     # results of rounds
     SOLVED = 0                  # no row is infeasible
     ROUNDS_USED = 1             # the rounds of the call are used up
-    SMALL_PIVOT = 2             # a pivot is too small for s = 0
+    SMALL_PIVOT = 2             # a pivot is too small for a factorisation without a shift (s = 0)
     INDEFINITE = 3              # a pivot is negative
     STUCK = 4                   # the number of infeasible rows no longer falls
 
 
-cdef enum:                      # where a row is
+cdef enum:                      # state of a row: free, or at one of its bounds
     FREE = 0
     AT_LOWER = -1
     AT_UPPER = 1
@@ -31,25 +31,25 @@ cdef struct pivoting_t:
     const int32_t* order        # (n) row that is eliminated first, second, ...; NULL: 0, 1, ...
     int32_t n
     int32_t natural             # The order is 0, 1, ...
-    linear_t linear             # A_FF + s D_FF: L D L^T, or L U if A is not symmetric; the caller sets `tiny`
-    int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
-    int32_t* place              # (n) place among the free rows, or -1
+    linear_t linear             # system A_FF + s D_FF, factored as L D L^T, or as L U if A is not symmetric; the caller sets `tiny`
+    int32_t* at                 # (n) state of each row: FREE | AT_LOWER | AT_UPPER
+    int32_t* place              # (n) index of each row among the free rows, or -1
     double* x                   # (n) N s
-    double* w                   # (n) m/s, (2)
-    double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
-    double* center              # (n) N s
+    double* w                   # (n) m/s, slack (2) of principal.pyx
+    double* f                   # (n) m/s, rounding of w: 2^-53 (|A| |x| + |b|)
+    double* center              # (n) N s, centre of the proximal term
     double* y                   # (n) scratch
-    double* size                # (n) d of the free rows, by place
+    double* size                # (n) d of the free rows, in the order of `place`
     int32_t n_free
     int32_t is_factored         # The factor belongs to the present free rows and shift.
     int32_t min_infeasible      # smallest number of infeasible rows so far
-    int32_t patience            # exchanges left without a smaller number
-    int32_t exchanged           # rows that changed between free and a bound so far
+    int32_t patience            # remaining exchanges without a new smallest number of infeasible rows, before rounds are stuck
+    int32_t exchanged           # number of changes of rows between free and a bound so far
     int32_t factorisations
     int32_t n_rounds
-    int32_t late                # An outside factor was not started.
-    void* outside               # owner of an outside factor of the rows with a place, numbered as in A; or NULL
-    outside_factor_t factor_outside     # returns the number of small pivots, -1: not started
+    int32_t late                # An outside factor was not started, because of the deadline.
+    void* outside               # owner of an outside factor, whose rows are the rows with a place >= 0, numbered as in A; or NULL
+    outside_factor_t factor_outside     # returns the number of small pivots; -1 if it was not started
     outside_solve_t solve_outside       # y (n_free) <- solution
 
 

@@ -23,7 +23,7 @@ from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, 
 
 
 cdef enum:
-    MAX_PATIENCE = 8            # exchanges without a smaller number of infeasible rows, after which rounds are stuck
+    MAX_PATIENCE = 8            # Rounds are stuck after this many exchanges without a new smallest number of infeasible rows.
 
 
 cdef inline void call_outside_factor(pivoting_t* s) noexcept nogil:
@@ -74,7 +74,7 @@ cdef inline void fill_band(pivoting_t* s) noexcept nogil:
         col -= at
         q = a.indptr[i]
         if in_place:
-            q = a.indptr[i + 1]                         # Places are rows: copy the upper half, from the right.
+            q = a.indptr[i + 1]                         # Every row keeps its place: copy the upper half, from the right.
             while q > a.indptr[i] and a.indices[q - 1] >= i:
                 q -= 1
                 col[a.indices[q]] = a.data[q]
@@ -118,7 +118,7 @@ cdef inline void solve_free_rows(pivoting_t* s, double* y) noexcept nogil:
 
 
 cdef void factor_all_rows(pivoting_t* s) noexcept nogil:
-    """Factor A with all rows free and no shift; L D L^T in natural order begins the solve of x = A^-1 b."""
+    """Factor A with all rows free and no shift. L D L^T in natural order begins the solve of x = A^-1 b at the same time."""
     cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE
@@ -316,7 +316,7 @@ cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32
     All rows free are tried only if their factor costs less than the sweeps, and `max_rounds` allows a round.
     """
     cdef int32_t i
-    # Multiply-adds: (band + 1)^2 / 2 per row of the factor, two per nonzero of a sweep.
+    # Multiply-adds: (band + 1)^2 / 2 per row of a factor, two per nonzero of a sweep.
     cdef bint is_cheap = s.band >= 0 and max_rounds > 0 and s.n > 0 and (
         (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
     if is_cheap and is_solved_with_all_rows_free(s):
@@ -331,20 +331,20 @@ cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32
 
 
 cdef void reset_exchange_patience(pivoting_t* s) noexcept nogil:
-    """Allow exchanges to begin anew."""
+    """Reset the number of exchanges that may follow without progress."""
     s.min_infeasible = s.n + 1
     s.patience = MAX_PATIENCE
 
 
 cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil:
-    """Set the shift, which makes the factor invalid and exchanges begin anew."""
+    """Set the shift. The factor becomes invalid, and the count of exchanges without progress is reset."""
     s.linear.shift = shift
     s.is_factored = 0
     reset_exchange_patience(s)
 
 
 cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
-    """Reset the state: no row at a bound, no factor, all counts 0."""
+    """Reset the state: every row is free, there is no factor, and all counts are 0."""
     cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE

@@ -24,28 +24,28 @@ from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.judge.tally cimport make_empty_tally, add_block_error, add_row_error, tally_t
 
 
-cdef struct descent_t:          # Newton steps under one law
-    int32_t idle_steps          # steps since the lowest error fell by a tenth
+cdef struct descent_t:          # state of the Newton steps under one law
+    int32_t idle_steps          # consecutive steps that did not lower the lowest error by a tenth
     int32_t steps
     int32_t slack_is_fresh      # s was recomputed from y, not updated along a step
     int32_t needs_matrix        # N must be formed again
     int32_t response_is_known   # lambda and V belong to the present s
-    int32_t center_moved        # since the last step
+    int32_t center_moved        # the centre has moved since the last step
     double softness             # rho as a fraction of d
     double best_error           # error of `best`, in multiples of the limits
     double lowest_error         # lowest error of this descent
-    double error_at_last_center     # energy error when the centre moved last, -1: not yet
+    double error_at_last_center     # energy error when the centre moved last; -1: it has not moved yet
     double sizes[3]             # norms of the gradient G at the last three steps
 
 
-cdef struct paused_t:           # an island whose step budget ended, to be continued
+cdef struct paused_t:           # an island whose step budget ended; the next call continues it
     int32_t island              # -1: no island is paused
-    int32_t worst               # worst outcome of the islands before it
+    int32_t worst               # worst outcome of the islands before the paused one
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)
     int32_t stage               # CONVEX_STAGE, COULOMB_STAGE or NEXT_ROUND, under Coulomb's law
     int32_t rounds              # completed rounds of Coulomb friction
-    double island_error         # error of `island_best`, including points at which a call ended
-    double best_error           # the same without those points, so that calls do not change the path
+    double island_error         # error of `island_best`, including impulses at which a call ended
+    double best_error           # error of `island_best` without those impulses, so that interruptions do not change the path
 
 
 cdef struct flow_t:
@@ -68,31 +68,31 @@ cdef struct flow_t:
     const int32_t* vptr         # (k + 1) V of each block: the diagonal for bounded rows, else a square matrix
     int32_t island              # the present island
     int32_t is_over_rows        # its steps are over rows: y, u, grad and step are indexed by rows (`normal.pxd`)
-    int32_t is_zero             # its y is 0
-    double* theta               # (m) theta', > 0
+    int32_t is_zero             # y of the island is 0
+    double* theta               # (m) theta' of `newton.pxd` (2), > 0
     double* inv_theta           # (m) 1 / theta'
     double* sqrt_theta          # (m) theta'^1/2
-    double* rho                 # (m) >= 0
-    double* y                   # (max(n, m)) y, or mu over rows
-    double* u                   # Y^T lambda, or A lambda
-    double* grad                # G, or h
-    double* step                # p, or pi
+    double* rho                 # (m) proximal weight of `newton.pxd` (2), >= 0
+    double* y                   # (max(n, m)) y; mu of `normal.pxd` if over rows
+    double* u                   # Y^T lambda; A lambda if over rows
+    double* grad                # gradient G; h of `normal.pxd` if over rows
+    double* step                # step p; pi of `normal.pxd` if over rows
     double* s                   # (m) Y y - b + phi
     double* q                   # (m) Y p
-    double* phi                 # (m)
-    double* center              # (m)
-    double* lam                 # (m)
-    double* trial               # (m)
+    double* phi                 # (m) lowering of the normals under Coulomb's law, `newton.pxd` (3)
+    double* center              # (m) centre c of the proximal terms
+    double* lam                 # (m) impulse lambda
+    double* trial               # (m) impulse at the last point that was evaluated on a line
     double* best                # (m) best impulse of one descent
     double* island_best         # (m) best impulse of one island under the problem's own law
-    double* paused_start        # (m) start of a paused descent: phi, under Coulomb's law the impulse
-    double* w                   # (m)
+    double* paused_start        # (m) start of a paused descent: phi; in COULOMB_STAGE the impulse
+    double* w                   # (m) slack w of the point that was evaluated last
     double* e                   # (m)
     double* v                   # V at s
-    double* factored_v          # V in `normal`
+    double* factored_v          # V with which `normal` was formed
     double* normal              # N of the present island in the pattern of L; under Coulomb's law a full matrix
-    double* factor              # its factor
-    linear_t linear             # N, S or I + A V
+    double* factor              # factor of `normal`
+    linear_t linear             # linear system of N, S or I + A V
     double* weighted_y          # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
@@ -101,9 +101,9 @@ cdef struct flow_t:
     int32_t wide                # as in `core/method.pxd`
     int32_t* row_list           # (m) rows of an island over rows
     int32_t n_unknowns          # columns of the island, or rows if it is over rows
-    const int32_t* unknowns     # (n_unknowns) their indices
+    const int32_t* unknowns     # (n_unknowns) indices of these columns or rows
     int32_t* places             # (m) index within the island of each free row
-    int32_t* columns            # (m) offset of its column of A
+    int32_t* columns            # (m) offset of each free row's column of A
     int32_t* picked_columns     # (m) scratch
     int32_t* transpose_offset   # offsets of the rows of Y^T, for each panel
     int32_t* panel_of_column    # (m) panel of each row; -1 - panel if its column of A is not formed

@@ -163,7 +163,7 @@ cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t
             added += ASSEMBLY_WEIGHT * 0.5 * v * nc
             normal += nc * (28.0 + 2.0 * nc + 0.5 * v)
     formed = rows * (values / 6.0 + (rows + rows * rows / 24.0 if f.bounded_rows_only else 3.0 * rows + rows * rows / 6.0))
-    applies = f.bounded_rows_only or (f.law != COULOMB and rows <= size)    # `pivots` has `size` places.
+    applies = f.bounded_rows_only or (f.law != COULOMB and rows <= size)    # `pivots` has `size` entries.
     if not applies or formed > normal or rows * (rows + size) > 1e9:
         need.work += added
         return False
@@ -192,7 +192,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
-    f.law = p.law if has_friction(p) else CONE          # Without friction the convex problem is the problem.
+    f.law = p.law if has_friction(p) else CONE          # Without friction, the laws do not differ.
     f.p.law = f.law
     f.softness = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
     f.g = g
@@ -215,7 +215,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     at += panels
     index_panels(f, need)
     find_islands(f, w, w + n, need)
-    f.linear.swap = w                                     # The scratch of `find_islands` is free again.
+    f.linear.swap = w                                     # The memory that `find_islands` used as scratch is free again.
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
@@ -239,7 +239,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
         values = lptr[size] - lptr[0] + size
-        if f.law == COULOMB:                            # Its N is not symmetric and is a full matrix.
+        if f.law == COULOMB:                            # Under Coulomb's law, N is not symmetric and is stored as a full matrix.
             values = <double>size * size
             need.work += values * size / 3.0
         elif size > 0:

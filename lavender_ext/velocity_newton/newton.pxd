@@ -54,9 +54,9 @@ cdef enum:                      # stages of a round of Coulomb friction
     COULOMB_STAGE = 2
 
 cdef enum:
-    MAX_IDLE_STEPS = 30         # An island is stuck if this many steps in a row do not lower the error by a tenth.
-    MAX_LINE_EVALUATIONS = 24   # Evaluations of one line search.
-    MAX_COULOMB_ROUNDS = 12     # Problems that more rounds would solve are solved faster by other phases.
+    MAX_IDLE_STEPS = 30         # An island is stuck if this many consecutive steps do not lower its lowest error by a tenth.
+    MAX_LINE_EVALUATIONS = 24   # Largest number of evaluations in one line search.
+    MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 
 # -- line searches ----------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
     if fabs(at_high) <= enough or at_high < 0.0 or at_high != at_high:
         return high if at_high == at_high else 0.0
     t = high
-    while n < MAX_LINE_EVALUATIONS:                                 # Regula falsi with halved ends (Dowell, Jarratt 1971).
+    while n < MAX_LINE_EVALUATIONS:                                 # Illinois variant of regula falsi (Dowell, Jarratt 1971).
         t = low - at_low * (high - low) / (at_high - at_low)
         if not low < t < high:
             t = 0.5 * (low + high)
@@ -177,7 +177,7 @@ cdef inline void move_proximal_centre(const flow_t* f, int32_t island) noexcept 
 
 
 cdef inline void set_theta_to_maximum(double* theta, int32_t first, int32_t end) noexcept nogil:
-    """Set theta of rows [first, end) to the largest of these."""
+    """Set theta of rows [first, end) to the largest theta among these rows."""
     cdef double big = 0.0
     cdef int32_t k
     for k in range(first, end):
@@ -411,7 +411,7 @@ cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const do
     """Set y = Y^T lam, and the centre and the best impulse to lam."""
     cdef int32_t a, c
     copy_rows(f, island, lam, f.lam)
-    copy_rows(f, island, lam, f.best)                   # `best` must be set even if all later errors overflow.
+    copy_rows(f, island, lam, f.best)                   # `best` must contain an impulse even if all later errors overflow.
     move_proximal_centre(f, island)
     f.is_zero = not multiply_y_transpose(f, island, lam, f.u)
     for a in range(f.n_unknowns):
@@ -438,7 +438,7 @@ cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double*
 
 
 cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Run the rounds of Coulomb's law (file header), continuing where a call ended.
+    """Run the rounds of Coulomb's law (file header); a call continues where the last one ended.
 
     Between calls `impulse` holds the best impulse, and `paused_start` the start of the paused descent: phi, or in the
     second stage the impulse.
@@ -476,7 +476,7 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
         if x.best_error <= 1.0:
             return REACHED
         if n == MORE:
-            x.best_error = least                        # The point at which a call ends must not change the path.
+            x.best_error = least                        # An impulse at which a call ends must not change the path.
             return MORE
         if x.stage == COULOMB_STAGE:
             compute_normal_shifts(f, island, impulse)
@@ -567,7 +567,7 @@ cdef inline int32_t solve_islands(flow_t* f, double* impulse) noexcept nogil:
         f.paused.worst, f.paused.cold = REACHED, f.law == COULOMB and is_zero_impulse(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
-        if end == MORE:                                 # N and the arrays belong to this island.
+        if end == MORE:                                 # N and the arrays still belong to the paused island.
             return MORE
         if end > f.paused.worst:
             f.paused.worst = end

@@ -22,21 +22,21 @@ from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
-    """out = f x."""
+    """Compute out = f x."""
     cdef int32_t i
     for i in range(n):
         out[i] = f * x[i]
 
 
 cdef inline void add_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
-    """out += f x."""
+    """Add f x to out."""
     cdef int32_t i
     for i in range(n):
         out[i] += f * x[i]
 
 
 cdef inline void scale_row_2(double* out, const double* x, const double* y, double f, double g, int32_t n) noexcept nogil:
-    """out = f x + g y."""
+    """Compute out = f x + g y."""
     cdef int32_t i
     for i in range(n):
         out[i] = f * x[i] + g * y[i]
@@ -44,7 +44,7 @@ cdef inline void scale_row_2(double* out, const double* x, const double* y, doub
 
 cdef inline void scale_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
                          int32_t n) noexcept nogil:
-    """out = f x + g y + h z."""
+    """Compute out = f x + g y + h z."""
     cdef int32_t i
     for i in range(n):
         out[i] = (f * x[i] + g * y[i]) + h * z[i]
@@ -52,7 +52,7 @@ cdef inline void scale_row_3(double* out, const double* x, const double* y, cons
 
 cdef inline void add_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
                        int32_t n) noexcept nogil:
-    """out += f x + g y + h z."""
+    """Add f x + g y + h z to out."""
     cdef int32_t i
     for i in range(n):
         out[i] += (f * x[i] + g * y[i]) + h * z[i]
@@ -60,9 +60,9 @@ cdef inline void add_row_3(double* out, const double* x, const double* y, const 
 
 cdef inline int32_t multiply_block_by_v(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y,
                                         int32_t n) noexcept nogil:
-    """Append the non-zero rows of V Y of block i to the n rows of `weighted_y`; return their new number.
+    """Append the non-zero rows of V Y of block i to the n rows of `weighted_y`; return the new number of rows.
 
-    `row` is the block's first row within its panel. `line`, after the columns, stores the row of Y of each.
+    `row` is the block's first row within its panel. `line` receives, after its columns, the row of Y of each appended row.
     """
     cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c
     cdef const double* v = f.v + f.vptr[i]
@@ -96,7 +96,7 @@ cdef inline void weighted_row(const flow_t* f, const double* y, int32_t nc, int3
     cdef int32_t r = 3
     cdef const double* t = f.weighted_y
     cdef double* line = f.line
-    cdef const double* at = line + nc                   # row of Y of each row of `weighted_y`
+    cdef const double* at = line + nc                   # index of the row of Y for each row of `weighted_y`
     cdef double f0 = y[<int32_t>at[0] * nc + a], f1, f2
     if n == 1:
         scale_row(line, t, f0, end)
@@ -180,7 +180,7 @@ cdef inline bint is_v_unchanged(const flow_t* f, int32_t island) noexcept nogil:
 
 
 cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
-    """Store V, with which N is formed."""
+    """Store the V with which N is formed."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.vptr[end_block_of_run(f, a)]
@@ -265,7 +265,7 @@ cdef inline void solve_row_step(flow_t* f) noexcept nogil:
     for a in range(f.n_free):
         k = f.unknowns[f.places[a]]
         f.step[k] += x[a]
-        f.q[k] = -f.theta[k] * z[a] if f.bounded_rows_only else -z[a]   # (2) and (3) without the terms that cancel.
+        f.q[k] = -f.theta[k] * z[a] if f.bounded_rows_only else -z[a]   # In (2) and (3), the other terms cancel.
 
 
 # -- N -----------------------------------------------------------------------------------------------------------

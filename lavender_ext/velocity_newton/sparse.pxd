@@ -14,7 +14,7 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
-    FIRST_ROW_ENTRIES = 24      # Entries per row of L in the first workspace above MAX_DENSE_COLUMNS columns.
+    FIRST_ROW_ENTRIES = 24      # Entries per row of L in the first workspace, if there are more than MAX_DENSE_COLUMNS columns.
     MAX_DENSE_COLUMNS = 200     # Up to this many columns the first workspace holds a full triangle.
     COLUMN_SEARCH_WORK = 8      # Skipping one column in the search for a row's places takes the time of this many multiply-adds.
 
