@@ -6,15 +6,15 @@ from lavender_ext.sweep.serial cimport Sweeps, sweep_context_t, sweep_run_t
 
 
 cdef struct acceleration_t:
-    sweep_context_t* sweeps     # prepared blocks are read if sweeps are exact or under the cone law
+    sweep_context_t* sweeps     # sweeps of the iteration; prepared blocks are read if sweeps are exact or under the cone law
     blocks_t cone               # the blocks under the cone law
-    int32_t convex              # number of first iterations under the cone law
-    int32_t iterations          # number of iterations done
+    int32_t convex              # number of iterations at the beginning that use the cone law
+    int32_t iterations          # number of iterations done so far
     int32_t memory
-    int32_t keeps               # nncg: beta > 1 drops p only if p points against the sweep
-    double* control             # (CONTROL) of accelerate/mixing.pxd
-    double* gram                # (MAX_MEMORY, MAX_MEMORY)
-    double* work                # nncg 3 (m + n_v); anderson (4 + 2 memory) m
+    int32_t keeps               # nncg: with beta > 1, p is dropped only if it points against the sweep
+    double* control             # (CONTROL) indices of accelerate/mixing.pxd, or of accelerated.pyx for nncg
+    double* gram                # (MAX_MEMORY, MAX_MEMORY) products of differences, for anderson
+    double* work                # workspace: 3 (m + n_v) doubles for nncg, (4 + 2 memory) m for anderson
 
 
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

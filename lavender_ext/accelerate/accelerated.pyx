@@ -158,7 +158,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
         control[NORM] = norm
         c.iterations += 1
         if c.iterations == c.convex:
-            control[NORM] = 0.0                         # the law changes: restart
+            control[NORM] = 0.0                         # Restart, because the law changes.
     if n > 0:
         for i in range(m + n_v):
             q[i] = beta * p[i]
@@ -201,7 +201,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
             compute_sweep_velocities(c.sweeps, lam)
         c.iterations += 1
         if c.iterations == c.convex:
-            clear_mixing_memory(&mixing)                             # the law changes
+            clear_mixing_memory(&mixing)                             # The law changes, so earlier sweeps are not combined.
 
 
 cdef void restart_acceleration(void* context, const double* lam) noexcept nogil:

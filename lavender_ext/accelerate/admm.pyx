@@ -42,24 +42,24 @@ from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_stric
 
 
 cdef enum:
-    RHO_UPDATE_INTERVAL = 20    # iterations between updates of rho; later a quarter of the iterations done
-    MAX_CONVEX_ITERATIONS = 200     # iterations without the shift
+    RHO_UPDATE_INTERVAL = 20    # Iterations before the first update of rho. Later ones follow after a quarter of the iterations done.
+    MAX_CONVEX_ITERATIONS = 200     # Largest number of iterations without De Saxce's shift.
     # Largest c of a block that its bounds hold at zero impulse, over the largest c of the others. Below, a block that the others
     # can make act would keep a wrong c; above 1e6, rho and the mixing lose the digits of the others (|b| up to 1e60 tried).
     MAX_INACTIVE_RATIO = 10000
 
 
-cdef struct factor_t:           # factor of B + rho, or of the body form
+cdef struct factor_t:           # factor of B + rho, or of the body form (2)
     linear_t* linear
-    const int32_t* k_ptr        # K by rows over bodies, else NULL
+    const int32_t* k_ptr        # K by rows if the factor is over bodies; otherwise NULL
     const int32_t* k_col
     const double* k_val
-    const double* e             # (m) E
+    const double* e             # (m) diagonal of E in (2)
 
 
 cdef struct admm_t:
     const blocks_t* blocks
-    double* root                # (m) sqrt d
+    double* root                # (m) sqrt(d)
     double* c                   # (m)
     double rho
     double alpha
@@ -69,7 +69,7 @@ cdef struct admm_t:
     double* x                   # (m)
     double* g                   # (m)
     double* before              # (m) z of the previous iteration
-    double* work                # (velocities) scratch over bodies
+    double* work                # (velocities) scratch of a solve over bodies
     double done                 # number of iterations
     double next                 # number of iterations at the next update of rho
     int32_t mixed               # 1 if u was mixed

@@ -20,7 +20,7 @@ cdef enum:
 cdef enum:                      # indices in `control`
     LAST_NORM = 0               # |g| of the last evaluation
     N_DIFFERENCES = 1           # number of differences in memory
-    NEXT_SLOT = 2               # slot of the next difference
+    NEXT_SLOT = 2               # index of the difference that the next one replaces, in the ring buffers
     HAS_PREVIOUS = 3            # 1 if v and g of the previous evaluation are stored
     N_UNMIXED = 4               # number of following evaluations without mixing
     LOWEST_NORM = 5             # lowest |g| so far, 0 before any

@@ -17,7 +17,7 @@ cdef enum:
 
 
 cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
-    """Return 1 / p, or 0 for a small pivot, and count it."""
+    """Return 1 / p, or 0 for a small pivot, and count small and negative pivots."""
     if p < out.least * size:
         out.least = p / size
     if not p > tiny * size:
@@ -57,7 +57,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
                 x[j - 1] -= off * r * x[j]
             r = (c[2 * j - 2] if j - 1 > h else 0.0) - off * off * r
             j -= 1
-    # Both chains subtract from the diagonal of row h, which is unchanged until here.
+    # Both chains also subtract from the diagonal of row h. The code below does both subtractions.
     off = c[2 * h]
     if h > 0:
         off += p
@@ -123,7 +123,7 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
 
 
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
-    """Return the number of columns of full height, which come first; 0 without rows (width 0)."""
+    """Return the number of columns that have all `width` rows; they come first. It is 0 without rows (width 0)."""
     return n - width + 1 if n >= width > 0 else 0
 
 
@@ -138,7 +138,7 @@ cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* s
     if width == 2:
         ldl_factor_2(n, c, size, tiny, x, out)
         return
-    if width == 6:                                      # chains of joints with three rows: constant loop bounds
+    if width == 6:                                      # Chains of joints with three rows have this width: constant loop bounds.
         ldl_columns(0, full, 6, 6, c, size, tiny, x, out)
     else:
         ldl_columns(0, full, width, width, c, size, tiny, x, out)

@@ -11,7 +11,7 @@ from lavender_ext.factor.supernodal cimport begin_supernodes, factor_supernode, 
 
 
 cdef inline void fill_panels(const block_matrix_t* f, int32_t lu) noexcept nogil:
-    """Copy the blocks of N to the panels of its factor, and zeros elsewhere."""
+    """Copy the blocks of N to the panels of its factor, and set all other entries of the panels to 0."""
     cdef const supernodal_t* p = &f.factor
     cdef int32_t k, q, r, c, i, s = f.s
     cdef int64_t ld, b = s * s

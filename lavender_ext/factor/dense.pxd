@@ -16,7 +16,7 @@ from lavender_ext.factor.tiles cimport axpy_subtract
 
 
 cdef enum:
-    PANEL_COLUMNS = 48          # Columns of a panel of a dense factor: 48 columns of 300 rows stay in the second cache.
+    PANEL_COLUMNS = 48          # Columns of a panel of a dense factor: 48 columns of 300 rows fit the second-level cache.
 
 
 cdef inline int64_t panel_offset(int32_t n, int32_t k) noexcept nogil:
@@ -42,13 +42,13 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, con
     while k < n:
         w = PANEL_COLUMNS if k + PANEL_COLUMNS <= n else n - k
         panel = l + panel_offset(n, k)
-        # copy the columns of the panel
+        # Copy the columns of the panel.
         for j in range(w):
             for t in range(j, n - k):
                 panel[<int64_t>j * (n - k) + t] = a[<int64_t>(k + j) * n + k + t]
             for t in range(j):
                 panel[<int64_t>j * (n - k) + t] = 0.0
-        # subtract the earlier panels
+        # Subtract the earlier panels.
         p = 0
         while p < k:
             gemm_subtract_lower(wide, n - k, w, PANEL_COLUMNS, l + panel_offset(n, p) + (k - p), n - p, panel, n - k)
@@ -98,10 +98,10 @@ cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, 
         lost = lu_panel(wide, w, n - k, n - k, a + <int64_t>k * (n + 1), n, swap + k, min_pivot, upper)
         if lost:
             return lost
-        # exchange the rows of the earlier columns
+        # Exchange the rows of the earlier columns.
         for j in range(k):
             swap_entries(a + <int64_t>j * n + k, w, swap + k)
-        # exchange the rows of the later columns, solve for their rows of U, and subtract (2)
+        # Exchange the rows of the later columns, solve for their rows of U, and subtract (2).
         j0 = k + w
         while j0 < n:
             columns = LU_STRIP if j0 + LU_STRIP <= n else n - j0

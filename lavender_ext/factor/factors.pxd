@@ -12,11 +12,11 @@ cdef extern from *:
     #endif
     #endif
     """
-    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil       # whether four lanes are one instruction (`tiles.pxd`)
+    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil       # whether the processor has one instruction for four lanes (`tiles.pxd`)
 
 
 cdef struct pivots_t:
-    int32_t small               # number of pivots of at most tiny size_i: their rows and columns are left out
+    int32_t small               # number of small pivots (at most tiny size_i), whose rows and columns are left out of the solution
     int32_t negative            # number of negative pivots, which are used
     double least                # smallest p_i / size_i
     int32_t first_small         # index of the first small pivot, or -1
@@ -40,27 +40,27 @@ cdef struct interrupt_t:        # checks for signals during a factorisation, whi
 cdef struct supernodal_t:
     int32_t n                   # rows
     int32_t supernodes
-    int32_t wide                # four lanes are one instruction
+    int32_t wide                # use one instruction for four lanes
     # pattern
-    const int32_t* order        # (n) row at each position, or NULL: as they stand
-    const int32_t* position     # (n) position of each row, or NULL
-    const int32_t* first        # (supernodes + 1) position of the first column
-    const int32_t* supernode_of     # (n) supernode of a position
+    const int32_t* order        # (n) row at each position; NULL: rows keep their order
+    const int32_t* position     # (n) position of each row, or NULL likewise
+    const int32_t* first        # (supernodes + 1) position of the first column of each supernode
+    const int32_t* supernode_of     # (n) supernode of each position
     const int32_t* row_ptr      # (supernodes + 1) rows below a supernode: positions, ascending
     const int32_t* row_indices
-    const int64_t* value_offset     # (supernodes + 1) of a panel in `values`
-    const int64_t* upper_offset     # (supernodes + 1) of the rows of U beside a panel in `upper`
+    const int64_t* value_offset     # (supernodes + 1) offset of each panel in `values`
+    const int64_t* upper_offset     # (supernodes + 1) offset in `upper` of the rows of U that belong to each panel
     # factor
     double* values
-    double* upper               # L U only
+    double* upper               # rows of U; L U only
     double* scratch             # (`supernodal_scratch_size`)
     int32_t* swap               # (n) L U: index within the panel of the row that each pivot row was exchanged with
     # state of a factorisation
-    int32_t* local_row          # (n) index of a position in the present panel
-    int32_t* head               # (supernodes) first descendant that updates a supernode next,
-    int32_t* link               # (supernodes) and the next one
-    int32_t* next_row           # (supernodes) first row of a supernode that has not updated its supernode
-    interrupt_t* interrupt      # or NULL
+    int32_t* local_row          # (n) row index of each position within the present panel
+    int32_t* head               # (supernodes) first of the descendants that update a supernode next
+    int32_t* link               # (supernodes) next descendant in the same list
+    int32_t* next_row           # (supernodes) first row of a supernode whose update has not been done
+    interrupt_t* interrupt      # checks for signals, or NULL
 
 
 cdef struct sparse_t:
@@ -68,20 +68,20 @@ cdef struct sparse_t:
     const int32_t* indptr       # (n + 1) A in compressed rows, columns ascending
     const int32_t* indices
     double* data
-    int32_t* tptr               # (n + 2) A^T; L U only
+    int32_t* tptr               # (n + 2) A^T in compressed rows; L U only
     int32_t* tind
     double* tdata
-    double* scale               # (n) by position: D^-1/2 of L U, else the smallest accepted pivots
+    double* scale               # (n) by position: diagonal of D^-1/2 for L U, otherwise the smallest accepted pivots
     double* y                   # (n) scratch of a solve
 
 
 cdef struct block_matrix_t:
     int32_t n                   # block rows
     int32_t s                   # rows of a block, 1 to 6
-    const int32_t* nptr         # (n + 1) blocks of row k of N, columns <= k, the diagonal last
+    const int32_t* nptr         # (n + 1) blocks of row k of N: columns <= k, the diagonal block last
     const int32_t* nind
     double* nval                # lower blocks of N, row-major
     double* mval                # upper blocks of N, transposed; L U only
-    const int64_t* lower_offset     # of each block in the factor's `values`
-    const int64_t* upper_offset     # of the mirror of each block: in `values` if both are in one supernode, else in `upper`
+    const int64_t* lower_offset     # offset of each block in the factor's `values`
+    const int64_t* upper_offset     # offset of each block's mirror: in `values` if both are in one supernode, otherwise in `upper`
     supernodal_t factor

@@ -26,12 +26,12 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
     cdef int32_t* integers = scratch + 2 * n            # 8 n + 1
     cdef int32_t* head = integers + 8 * n + 1           # n + 1
     cdef int32_t* size = head + n + 1
-    cdef int32_t* lists = size + n                      # the rest
+    cdef int32_t* lists = size + n                      # remaining integers of `scratch`
     cdef int32_t i
     for i in range(n):
         size[i] = 1
     memcpy(integers, ptr, (n + 1) * sizeof(int32_t))
-    if ptr[n]:                                          # near may be NULL without neighbours
+    if ptr[n]:                                          # `near` may be NULL if there are no neighbours.
         memcpy(lists, near, ptr[n] * sizeof(int32_t))
     minimum_degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, integers, outside, head, order)
     apply_postorder(n, ptr, near, order, rank, nptr, nind, parent, integers)

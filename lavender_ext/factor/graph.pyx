@@ -10,7 +10,7 @@ from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
 
 def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
-    """Return the vertices (n,) in an elimination order; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
+    """Return the vertices (n,) in an elimination order. near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i itself."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
     cdef double[::1] scratch = np.empty(order_workspace_size(n, all_) // 2 + 1)
     order_array = np.empty(n, np.int32)
@@ -65,9 +65,9 @@ def bodies_in(Data p, order):
     cdef int32_t i, b, c, q, t, last = -1, size = 0, n = 0, k = p.blocks.n_blocks
     cdef int32_t[::1] given = np.arange(g.n, dtype=np.int32) if order is None else np.argsort(order).astype(np.int32)
     cdef int32_t[:, ::1] marks = np.full((4, g.n + 1), -1, np.int32)
-    cdef int32_t* before = &marks[0, 0]                 # the velocity before each
-    cdef int32_t* on = &marks[1, 0]                     # number of panels that contain it
-    cdef int32_t* both = &marks[2, 0]                   # number of panels that also contain the one before
+    cdef int32_t* before = &marks[0, 0]                 # (nv) velocity that precedes each velocity in the order, or -1
+    cdef int32_t* on = &marks[1, 0]                     # (nv) number of panels that contain each velocity
+    cdef int32_t* both = &marks[2, 0]                   # (nv) number of panels that contain both the velocity and the preceding one
     cdef int32_t* seen = &marks[3, 0]
     body_array, column_array = np.full((k, 2), -1, np.int32), np.empty(g.n, np.int32)
     cdef int32_t[:, ::1] body = body_array

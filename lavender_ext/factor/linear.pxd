@@ -37,43 +37,43 @@ cdef enum:                      # factorisations
     NO_FACTOR = 0
     CHOLESKY = 1                # L L^T, L D L^T or L^T D L
     LU = 2
-    CHOLESKY_OR_LU = 3          # of DENSE: L U if L L^T loses a pivot
+    CHOLESKY_OR_LU = 3          # DENSE only: L L^T, then L U if L L^T loses a pivot
     FALLBACK = 4
 
 
 cdef struct fallback_t:         # factorisation by the caller
     void* at
     int32_t (*factor)(void* at) noexcept nogil              # factor the matrix; return whether that succeeded
-    void (*solve)(void* at, double* x) noexcept nogil       # in place
+    void (*solve)(void* at, double* x) noexcept nogil       # solves in place
 
 
 cdef struct linear_t:
     int32_t kind
     int32_t n
-    int32_t by                  # the next factorisation: CHOLESKY, LU or CHOLESKY_OR_LU
-    int32_t wide                # four lanes are one instruction
+    int32_t by                  # factorisation that the next `linear_factor` computes: CHOLESKY, LU or CHOLESKY_OR_LU
+    int32_t wide                # use one instruction for four lanes
     double cost                 # multiply-adds of L L^T, L D L^T or L^T D L
-    const double* d             # (n) metric, or NULL
+    const double* d             # (n) diagonal of the metric D, or NULL
     double shift
     double tiny                 # A pivot of at most tiny d is lost.
-    # the last factorisation
+    # result of the last factorisation
     int32_t factored            # CHOLESKY, LU, FALLBACK or NO_FACTOR
-    pivots_t pivots             # `small` are the lost ones
-    # DENSE, BAND, TREE
+    pivots_t pivots             # statistics of the pivots; `small` counts the lost ones
+    # fields of DENSE, BAND and TREE
     double* matrix              # (n, n), L U overwrites it; (n, width), overwritten; entries left of the diagonal, overwritten
     double* lower               # DENSE: (`cholesky_workspace_size`) L L^T
     double* scale               # (n) DENSE with d: D^-1/2 or smallest pivots; may be d itself. TREE: 1 / D
     int32_t* swap               # (n) DENSE: row exchanges of L U
-    int32_t width               # BAND
+    int32_t width               # BAND: number of stored diagonals
     double* ahead               # BAND: a right-hand side that the factorisation solves with L, for one solve; or NULL
     double* diagonal            # (n) TREE: diagonal of A, then D
-    const int32_t* lptr         # (n + 1) TREE: rows of L
+    const int32_t* lptr         # (n + 1) TREE: first entry of each row of L
     const int32_t* lidx
-    # ROWS, BLOCKS
+    # fields of ROWS and BLOCKS
     sparse_t rows
     block_matrix_t blocks
     double largest              # max |A_ij| of the last L U of ROWS
-    const fallback_t* fallback  # or NULL
+    const fallback_t* fallback  # factorisation by the caller, or NULL
 
 
 cdef inline double backward_tolerance() noexcept nogil:
@@ -98,7 +98,7 @@ cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const
 
 
 cdef inline int64_t block_pattern_index_size(int64_t n, int64_t s, int64_t blocks, int64_t below) noexcept nogil:
-    """Return the number of int32 that `analyse_blocks` needs, for blocks of N and `below` off-diagonal blocks of L."""
+    """Return the number of int32 that `analyse_blocks` needs if N has `blocks` blocks and L `below` off-diagonal blocks."""
     return 2 * (2 * blocks + 2 * (n + 1)) + n * s + 5 * (n + 1) + below + 1 + s * below + 1
 
 
@@ -123,7 +123,7 @@ cdef int32_t linear_sign(const linear_t* f) noexcept nogil
 cdef class LinearSystem:
     cdef linear_t f
     cdef fallback_t calls
-    cdef interrupt_t interrupt                          # of ROWS: a signal's exception ends a factorisation
+    cdef interrupt_t interrupt                          # for ROWS: a signal's exception ends a factorisation
     cdef readonly object indptr, indices                # pattern of ROWS
     cdef readonly object data                           # (nnz) entries of the last factor of ROWS
     cdef object analysis, numbers, upper, splu, other, error, held

@@ -29,7 +29,7 @@ BACKWARD_TOLERANCE = backward_tolerance()
 
 
 cdef enum:
-    MAX_REFINEMENTS = 1         # Refinements of a solution with L U of ROWS before the fallback.
+    MAX_REFINEMENTS = 1         # Largest number of refinements of a solution with L U of ROWS; after them the fallback is used.
 
 
 # -- analyse and bind ----------------------------------------------------------------------------------------
@@ -75,13 +75,13 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
     p.first, p.supernode_of, p.row_ptr, p.row_indices = first, supernode_of, row_ptr, row_indices
     p.value_offset, p.upper_offset = value_offset, panel_upper_offset
     f.n, f.s, f.nptr, f.nind, f.lower_offset, f.upper_offset = n, s, nptr, nind, lower_offset, upper_offset
-    # places of the blocks of N
+    # Find the places of the blocks of N.
     for k in range(n):
         for q in range(nptr[k], nptr[k + 1]):
             j = nind[q] * s
             i = supernode_of[j]
             ld = panel_width(p, i) + rows_below(p, i)
-            if k * s < first[i + 1]:                    # both blocks are in the diagonal block of the supernode
+            if k * s < first[i + 1]:                    # Both blocks are in the diagonal block of the supernode.
                 lower_offset[q] = value_offset[i] + (k * s - first[i]) + (j - first[i]) * ld
                 upper_offset[q] = value_offset[i] + (j - first[i]) + (k * s - first[i]) * ld
                 continue
@@ -148,7 +148,7 @@ cdef inline void scale_dense(const linear_t* f) noexcept nogil:
 
 
 cdef inline void factor_dense(linear_t* f) noexcept nogil:
-    """Factor a full matrix: L L^T unless LU alone is allowed, L U if that is not allowed or loses a pivot."""
+    """Factor a full matrix by L L^T, unless only LU is allowed; use L U if L L^T is not allowed or loses a pivot."""
     cdef int32_t i
     cdef const double* min_pivot = NULL
     if f.by & CHOLESKY:
@@ -170,7 +170,7 @@ cdef inline void factor_dense(linear_t* f) noexcept nogil:
 
 
 cdef inline void factor_band(linear_t* f) noexcept nogil:
-    """Factor a band, and begin the solve of `ahead`."""
+    """Factor a band; if `ahead` is set, begin its solve at the same time."""
     cdef int32_t i
     if f.shift != 0.0:
         for i in range(f.n):
@@ -193,14 +193,14 @@ cdef inline void factor_rows(linear_t* f) noexcept nogil:
 
 
 cdef inline void use_fallback(linear_t* f) noexcept nogil:
-    """Replace the factor by the one of the caller's fallback; without a fallback, or if it fails, no factor is left."""
+    """Replace the factor by the caller's fallback. Without a fallback, or if it fails, there is no factor afterwards."""
     f.factored = NO_FACTOR
     if f.fallback != NULL and f.fallback.factor(f.fallback.at):
         f.factored, f.pivots.small = FALLBACK, 0
 
 
 cdef int32_t linear_factor(linear_t* f) noexcept nogil:
-    """Factor A + shift D; return the number of lost pivots. BAND also counts negative ones in `pivots`."""
+    """Factor A + shift D; return the number of lost pivots. For BAND, `pivots` also contains the number of negative pivots."""
     cdef int32_t lost
     no_pivots(&f.pivots)
     if f.kind == DENSE:
@@ -223,7 +223,7 @@ cdef int32_t linear_factor(linear_t* f) noexcept nogil:
 
 
 cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
-    """Overwrite x (n) with the solution for it by the last factor; infinite if there is none."""
+    """Overwrite x (n) with the solution of the system with right-hand side x; infinite if there is no factor."""
     cdef int32_t j
     if f.factored == FALLBACK:
         f.fallback.solve(f.fallback.at, x)
@@ -254,12 +254,12 @@ cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
 
 
 cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil:
-    """Overwrite x (n) with A^-T x, after L U of a full matrix without d."""
+    """Overwrite x (n) with A^-T x. This requires L U of a full matrix without d."""
     dense_lu_solve_transposed(f.n, f.matrix, f.swap, x)
 
 
 cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcept nogil:
-    """Compute y = A x, without the shift; of ROWS, and of DENSE unless L U has overwritten it."""
+    """Compute y = A x, without the shift, for ROWS, or for DENSE if L U has not overwritten the matrix."""
     cdef int32_t i, q
     cdef double s
     for i in range(f.n):
@@ -273,7 +273,7 @@ cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcep
 
 
 cdef inline bint has_backward_error(const linear_t* f, const double* r, const double* x, double* error) noexcept nogil:
-    """Compute error = r - A x; return whether it exceeds (3)."""
+    """Compute error = r - A x; return whether it exceeds the limit (3)."""
     cdef int32_t i
     linear_multiply(f, x, error)
     for i in range(f.n):
@@ -284,7 +284,7 @@ cdef inline bint has_backward_error(const linear_t* f, const double* r, const do
 
 
 cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil:
-    """Solve A x = r; refine L U of ROWS until (3) holds, by the fallback if it does not; return whether it holds.
+    """Solve A x = r. Refine L U of ROWS until (3) holds, then use the fallback if necessary; return whether (3) holds.
 
     scratch has n doubles; x must not be r.
     """
@@ -415,7 +415,7 @@ cdef class LinearSystem:
         self.f.rows.indices = &index[0] if index.shape[0] else NULL
 
     cdef int bind(self, bint lu) except -1:
-        """Allocate what the next factorisation needs in addition to the last ones."""
+        """Allocate the memory that the next factorisation needs and earlier ones did not."""
         cdef int32_t n = self.f.n
         cdef int64_t size
         cdef double[::1] x
@@ -488,7 +488,7 @@ cdef class LinearSystem:
             D > 0; default 1.
         """
         cdef const double[::1] metric
-        cdef const double[::1] x = data.reshape(-1)         # a view
+        cdef const double[::1] x = data.reshape(-1)         # a view of `data`
         cdef int32_t lost, n = self.f.n
         self.bind(lu)
         if x.shape[0] != (<int64_t>n * n if self.f.kind == DENSE else len(self.indices)):
@@ -553,17 +553,17 @@ cdef class LinearSystem:
 
     @property
     def uses_fallback(self):
-        """Whether the last factor is that of the fallback."""
+        """Whether the fallback computed the last factor."""
         return self.f.factored == FALLBACK
 
     @property
     def order(self):
-        """(n,) row eliminated first, second, ... of compressed rows."""
+        """(n,) rows of a matrix in compressed rows, in the order of their elimination."""
         self.analyse()
         return self.analysis[0][:self.f.n]
 
     def lost_rows(self):
-        """Return the rows of compressed rows whose pivots the last L L^T rejected, ascending; their columns of L are 0."""
+        """Return the rows (ascending) whose pivots the last L L^T of compressed rows rejected; their columns of L are 0."""
         cdef const supernodal_t* f = &self.f.rows.factor
         cdef int32_t i, k
         cdef int64_t ld

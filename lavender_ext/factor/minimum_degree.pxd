@@ -19,16 +19,16 @@ cdef enum:
 
 cdef struct quotient_t:
     int32_t n
-    int32_t free                # end of the used part of `list`
-    int32_t* list               # lists of vertices (adjacent elements first) and of elements
-    int32_t* at                 # (n) beginning of each list
-    int32_t* length             # (n)
-    int32_t* elements           # (n) number of elements in a vertex's list
+    int32_t free                # first unused entry of `list`
+    int32_t* list               # lists of the neighbours of vertices (adjacent elements first) and of elements
+    int32_t* at                 # (n) first entry of each list
+    int32_t* length             # (n) length of each list
+    int32_t* elements           # (n) number of elements at the beginning of a vertex's list
     int32_t* kind               # (n)
-    int32_t* degree             # (n) bound (2) of a vertex; weight of an element's list
-    int32_t* head               # (weight + 1) first vertex of a degree
+    int32_t* degree             # (n) bound (2) of a vertex's degree; for an element, the weight of its list
+    int32_t* head               # (weight + 1) first vertex of each degree
     int32_t* next               # (n) next vertex of the same degree
-    int32_t* before             # (n) previous one, or -1
+    int32_t* before             # (n) previous vertex of the same degree, or -1
     int32_t* pivot_of           # (n) last pivot whose list contains the vertex
     int64_t* outside            # (n) weight of an element outside the pivot's list, plus `stamp`
 
@@ -54,13 +54,13 @@ cdef inline void insert_degree(quotient_t* g, int32_t i) noexcept nogil:
 
 
 cdef inline void compact(quotient_t* g) noexcept nogil:
-    """Move the lists in use to the front, in their order; meanwhile the first entry of each is -1 - its owner."""
+    """Move the lists in use to the front, in their order. Meanwhile, the first entry of each list is -1 - its owner."""
     cdef int32_t i, j, q = 0, to = 0, k
     for i in range(g.n):
         if g.kind[i] != GONE and g.length[i] > 0:
             j = g.list[g.at[i]]
             g.list[g.at[i]] = -1 - i
-            g.at[i] = j                                 # the first entry, until the list is moved
+            g.at[i] = j                                 # j is the first entry of the list until the list is moved
     while q < g.free:
         if g.list[q] >= 0:
             q += 1
@@ -76,7 +76,7 @@ cdef inline void compact(quotient_t* g) noexcept nogil:
 
 
 cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t workspace) noexcept nogil:
-    """Write (1) as the list of p, which becomes an element; its weight is computed later."""
+    """Write the union (1) as the list of p, which becomes an element. Its weight is computed later."""
     cdef int32_t k, q, i, e, need = 0, begin
     for k in range(g.elements[p]):
         need += g.length[g.list[g.at[p] + k]]
@@ -198,7 +198,7 @@ cdef inline void minimum_degree_order(int32_t n, const int32_t* size, int32_t wo
                 if g.kind[e] != ELEMENT:
                     continue
                 if outside[e] == stamp:
-                    g.kind[e] = GONE                    # its list is a part of the list of p
+                    g.kind[e] = GONE                    # The list of e is a subset of the list of p.
                     continue
                 deg += <int32_t>(outside[e] - stamp)
                 list[j] = e
@@ -210,7 +210,7 @@ cdef inline void minimum_degree_order(int32_t n, const int32_t* size, int32_t wo
                     deg += size[e]
                     list[j] = e
                     j += 1
-            if deg == 0:                                # it has no neighbours outside the list of p, and is eliminated next
+            if deg == 0:                                # No neighbours are outside the list of p: the vertex is eliminated next.
                 g.kind[i] = GONE
                 order[count] = i
                 count += 1

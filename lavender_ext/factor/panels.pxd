@@ -13,8 +13,8 @@ from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, solve_th
 
 
 cdef enum:
-    CHOLESKY_STRIP = 3          # Columns of (1) that are finished together: as many as a tile of `gemm_subtract_nt` has.
-    LU_STRIP = 12               # Columns of (2) that are finished together: four tiles.
+    CHOLESKY_STRIP = 3          # Columns of (1) that are finished together, which is the width of a tile of `gemm_subtract_nt`.
+    LU_STRIP = 12               # Columns of (2) that are finished together, which is the width of four tiles.
 
 
 cdef inline int32_t cholesky_panel(int32_t wide, int32_t width, int32_t rows, double* a,
@@ -30,11 +30,11 @@ cdef inline int32_t cholesky_panel(int32_t wide, int32_t width, int32_t rows, do
     cdef double* y
     while j0 < width:
         n = CHOLESKY_STRIP if j0 + CHOLESKY_STRIP <= width else width - j0
-        # subtract the earlier columns
+        # Subtract the earlier columns.
         gemm_subtract_nt(wide, rows - j0, n, j0, a + j0, rows, a + j0, rows, a + j0 + <int64_t>j0 * rows, rows)
         for j in range(n):
             diagonal[j] = a[(j0 + j) + <int64_t>(j0 + j) * rows]
-        # factor the diagonal block
+        # Factor the diagonal block.
         for j in range(j0, j0 + n):
             y = a + <int64_t>j * rows
             for t in range(j0, j):
@@ -48,7 +48,7 @@ cdef inline int32_t cholesky_panel(int32_t wide, int32_t width, int32_t rows, do
             y[j] = x
             for t in range(j + 1, j0 + n):
                 y[t] *= x
-        # solve for the rows below
+        # Solve for the rows below.
         y = a + j0 + <int64_t>j0 * rows
         if n == 3:
             solve_three_columns(rows - j0 - 3, y, y + rows, y + 2 * <int64_t>rows)
@@ -114,7 +114,7 @@ cdef inline int32_t lu_panel(int32_t wide, int32_t width, int32_t rows, int32_t 
     cdef double* z
     while j0 < width:
         n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
-        # exchange the rows of the strip, solve for its rows of U, and subtract the earlier columns
+        # Exchange the rows of the strip, solve for its rows of U, and subtract the earlier columns.
         for j in range(j0, j0 + n if j0 else 0):
             y = a + j * lda
             swap_entries(y, j0, swap)
@@ -123,7 +123,7 @@ cdef inline int32_t lu_panel(int32_t wide, int32_t width, int32_t rows, int32_t 
                     axpy_subtract(j0 - t - 1, y[t], a + (t + 1) + t * lda, y + t + 1)
                 scratch[t * n + j - j0] = y[t]
         gemm_subtract_nonzeros(wide, rows - j0, n, j0, a + j0, lda, scratch, a + j0 + j0 * lda, lda)
-        # factor the strip
+        # Factor the strip.
         for j in range(j0, j0 + n):
             y = a + j * lda
             best = j

@@ -14,7 +14,7 @@ from lavender_ext.factor.supernodal cimport (begin_supernodes, factor_supernode,
 
 
 cdef inline void fill_supernode(const sparse_t* s, int32_t i, int32_t lu, const double* d, double shift) noexcept nogil:
-    """Copy the entries of A + shift D in the columns of supernode i to its panel, and for L U those of its rows."""
+    """Copy the entries of A + shift D in the columns of supernode i to its panel; for L U also the entries in its rows."""
     cdef const supernodal_t* f = &s.factor
     cdef int32_t base = f.first[i], after = f.first[i + 1], c, q, p, row
     cdef int64_t own = after - base, beside = rows_below(f, i), ld = own + beside

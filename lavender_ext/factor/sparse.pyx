@@ -44,7 +44,7 @@ def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
         for q in range(indptr[i], indptr[i + 1]):
             j = indices[q]
             if cursor[j] == indptr[j + 1] or indices[cursor[j]] != i:
-                return False                            # Rows are visited in order, so that entry i of row j is next.
+                return False                            # Rows are visited in order, so the next entry of row j must be i.
             cursor[j] += 1
     return True
 

@@ -20,12 +20,12 @@ from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_
 
 
 cdef inline double interrupt_check_interval() noexcept nogil:
-    """Return the number of multiply-adds between two checks: 0.03 s to 0.2 s."""
+    """Return the number of multiply-adds between two checks for signals, which take 0.03 s to 0.2 s."""
     return 2e8
 
 
 cdef inline bint is_stopped(const supernodal_t* f, double work) noexcept nogil:
-    """Count `work` multiply-adds; return whether a check, perhaps an earlier one, ended the factorisation."""
+    """Count `work` multiply-adds; return whether this check, or an earlier one, ended the factorisation."""
     cdef interrupt_t* c = f.interrupt
     if c == NULL:
         return False
@@ -53,7 +53,7 @@ cdef inline int64_t supernodal_scratch_size(const supernodal_t* f, bint lu) noex
         needed = <int64_t>panel_width(f, i) * LU_STRIP if lu else 0
         largest = max(largest, max(needed, <int64_t>rows_below(f, i)))
         run = 0
-        for j in range(f.row_ptr[i], f.row_ptr[i + 1]):     # A run of rows of one supernode updates it together.
+        for j in range(f.row_ptr[i], f.row_ptr[i + 1]):     # Consecutive rows of one supernode update it together.
             run = run + 1 if j > f.row_ptr[i] and f.supernode_of[f.row_indices[j]] == f.supernode_of[f.row_indices[j - 1]] else 1
             needed = <int64_t>run * (f.row_ptr[i + 1] - j + run - 1)
             largest = max(largest, needed)
@@ -117,7 +117,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
             gemm_subtract_lower(f.wide, m, n, width, a, rows, f.scratch, m)
             add_scratch(f, q, end, 0, n, columns, base, ld, panel)
         return
-    # columns of L U
+    # update of the columns of L (and of the diagonal block of U)
     u = f.upper + f.upper_offset[k] + r
     if is_run:
         gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, panel + ld * low + low, ld)
@@ -125,7 +125,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
         memset(f.scratch, 0, sizeof(double) * m * n)
         gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.scratch, m)
         add_scratch(f, q, end, 0, n, columns, base, ld, panel)
-    # rows of U
+    # update of the rows of U
     if m > n:
         panel = f.upper + f.upper_offset[i]
         low = f.local_row[f.row_indices[q + n]]
@@ -138,7 +138,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
 
 
 cdef inline void begin_supernodes(const supernodal_t* f) noexcept nogil:
-    """Begin a factorisation: no supernode has updated another one."""
+    """Begin a factorisation; no supernode has updated another one yet."""
     cdef int32_t i
     for i in range(f.supernodes):
         f.head[i] = -1
@@ -155,7 +155,7 @@ cdef inline void set_local_rows(const supernodal_t* f, int32_t i) noexcept nogil
 
 
 cdef inline void link_descendant(const supernodal_t* f, int32_t i, int32_t q) noexcept nogil:
-    """Link supernode i to the later supernode of its row q, if it has such a row."""
+    """Link supernode i to the later supernode that contains its row q, if there is such a row."""
     cdef int32_t k
     if q < f.row_ptr[i + 1]:
         k = f.supernode_of[f.row_indices[q]]
@@ -190,7 +190,7 @@ cdef inline int32_t lu_supernode(const supernodal_t* f, int32_t width, int32_t b
     if below == 0:
         return lost
     swap_columns(u, width, below, swap)
-    while j0 < width:                                   # solve with L
+    while j0 < width:                                   # Solve with L.
         n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
         gemm_subtract_nt(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
         for j in range(j0 + 1, j0 + n):

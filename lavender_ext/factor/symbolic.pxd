@@ -7,7 +7,7 @@ cdef enum:
 
 
 cdef inline double max_zero_fraction() noexcept nogil:
-    """Return the fraction of a panel that may be stored zeros: with more, their products cost more than larger panels save."""
+    """Return the fraction of a panel that may be stored zeros. Products with more zeros cost more than larger panels save."""
     return 0.1
 
 
@@ -143,7 +143,7 @@ cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_
             for q in range(lptr[j], lptr[j + 1]):
                 below += size[lind[q]]
         if j > 0 and lptr[j] > lptr[j - 1] and lind[lptr[j - 1]] == j:
-            # Every column of the supernode gets the rows below j, and has its own rows already.
+            # Every column of the supernode gets the rows below j. The supernode's own rows are stored already.
             more_zeros = zeros + width * (below + own - before)
             entries = 0.5 * (width + own) * (width + own + 1.0) + (width + own) * below
             if more_zeros <= (4.0 if width < NARROW_SUPERNODE_COLUMNS else 1.0) * max_zero_fraction() * entries:
@@ -187,7 +187,7 @@ cdef inline double list_supernode_rows(int32_t supernodes, const int32_t* starts
         upper_offset[i + 1] = upper_offset[i] + <int64_t>width * below
         for j in range(first[i], first[i] + width):
             supernode_of[j] = i
-        # half of the sum of the squares of the columns' heights
+        # The work is half of the sum of the squares of the columns' heights.
         work += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
     first[supernodes] = starts[group[supernodes]]
     return work

@@ -17,21 +17,22 @@ cdef enum:                      # result code of a call
 
 
 cdef struct small_rules_t:      # settings
-    int32_t rows                # maximum rows of a call, except for a call by islands
-    int32_t swept               # maximum sweeps before the first factorisation
+    int32_t rows                # largest number of rows of a call, unless the call solves island by island
+    int32_t swept               # largest number of sweeps before the first factorisation
     double warm                 # pivots start from an impulse with at most this relative residual
-    bint pivots                 # solve bounded rows
-    # Another method follows, which solves friction: a start that is a solution is returned, a start worse than 0 replaced.
+    bint pivots                 # solve problems in which all rows are bounded
+    # Another method follows, which also solves friction. Then a start that is a solution is returned, and a start with a
+    # larger residual than the zero impulse is replaced by the zero impulse.
     bint follows
 
 
 cdef struct small_problem_t:
-    view_t v                    # problem for the judge
-    view_t over                 # problem to solve: A for bounded rows
+    view_t v                    # problem that the judge reads
+    view_t over                 # problem that is solved; for bounded rows, A in compressed rows
     double zero_residual[3]     # E0, V0, relative residual of the zero impulse
     int32_t band                # half bandwidth of A for bounded rows; m - 1 if A is not symmetric
     int32_t split               # number of joint blocks, which are swept before the contacts
-    bint pivots, linear, symmetric      # all rows bounded; all rows free; A symmetric
+    bint pivots, linear, symmetric      # all rows are bounded; all rows are free; A is symmetric
     const int32_t* at           # offsets into `prepared` if blocks are solved exactly (`prepare_exact_blocks`), else NULL
     const double* prepared
     score_t score               # score of the result

@@ -48,16 +48,16 @@ cdef object new = np.empty
 
 
 cdef enum:
-    ACTIVE_SET_SWEEPS = 2       # sweeps that predict which rows are free
-    MAX_PASS_EXCHANGES = 32     # rounds of exchanges of one pass
-    LEMKE_PIVOTS_PER_ROW = 8    # limit of Lemke's paths
+    ACTIVE_SET_SWEEPS = 2       # number of sweeps that predict which rows are free
+    MAX_PASS_EXCHANGES = 32     # largest number of rounds of exchanges in one pass
+    LEMKE_PIVOTS_PER_ROW = 8    # largest number of pivots of Lemke's paths, per row
     EXCHANGE_NS_PER_ROW = 50    # estimated cost [ns] of a round of exchanges per row, in addition to its factorisation
     FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
 cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
-    """Return whether every row has fixed bounds only: no friction."""
+    """Return whether every row has fixed bounds only, so that there is no friction."""
     cdef int32_t i
     for i in range(p.n_blocks):
         if not has_independent_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
@@ -66,7 +66,7 @@ cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
 
 
 cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexcept nogil:
-    """Compute a small problem's remaining fields in `workspace`, which it keeps; return False without memory.
+    """Compute a small problem's remaining fields in `workspace`, which must stay allocated; return False if memory is exhausted.
 
     Both views and the residual of the zero impulse are given.
     """
@@ -80,7 +80,7 @@ cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexc
     if s.pivots:
         s.symmetric = measure_asymmetry_and_bandwidth(s.over.a, s.over.p.d, p.n_rows, workspace.index, band) <= 1e-14
         s.band = max(band[0], band[1]) if s.symmetric else p.n_rows - 1
-    elif p.law == CONE or s.v.a != NULL:                # the units of a given matrix may differ within a contact
+    elif p.law == CONE or s.v.a != NULL:                # The units of a given matrix may differ within a contact.
         n = <int64_t>index_prepared_numbers(p, workspace.index) + 1
         if not grow_workspace_to(workspace, 0, n):
             return False
@@ -135,7 +135,7 @@ cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* ru
 
 
 cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint tol_suffices) noexcept nogil:
-    """Return whether the residual is below tol and exchanges have ended, or are at rounding.
+    """Return whether the residual is below tol and exchanges have ended or reached rounding.
 
     With `tol_suffices`, solved bounded rows need not be refined to rounding.
     """
@@ -143,7 +143,7 @@ cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint t
 
 
 cdef inline int32_t count_remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
-    """Return the rounds of the next step: at most MAX_PASS_EXCHANGES, and `max_rounds` in total."""
+    """Return the number of rounds of the next step: at most MAX_PASS_EXCHANGES, and at most `max_rounds` in total."""
     cdef double remaining = max_rounds - t.s.n_rounds
     return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
 
@@ -156,7 +156,7 @@ cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bin
     cdef int32_t code
     begin_direct_solve(t, start)
     code = step_direct_solve(t, count_remaining_rounds(t, max_rounds))
-    # singular: passes with a shift
+    # If A is singular, passes with a shift follow.
     if t.symmetric and t.state == PASS and (code == SMALL_PIVOT or t.linear):
         code = PASS_HALVED
         while code == PASS_HALVED and t.s.n_rounds < max_rounds:
@@ -577,7 +577,7 @@ cdef class Islands(Small):
         two[1].n_numbers = -1
         with nogil:
             for i in range(self.count):
-                # copy the island's data
+                # Copy the island's data.
                 x, last = &two[i % 2], &two[1 - i % 2]
                 m, k = size[i, 0], size[i, 1]
                 if over_bodies:
@@ -601,14 +601,14 @@ cdef class Islands(Small):
                     good = solve_subproblem(&x.s, o, r, &work[0], &order[0])
                     if not good:
                         break
-                    # check for Ctrl-C
+                    # Check for Ctrl-C.
                     read = JOINT_ROW_DOUBLES * m if over_bodies else size[i, 2]
                     unchecked += <int64_t>(o.factored - factored) + read * (o.swept - swept)
                     if unchecked > INTERRUPT_CHECK_WORK:
                         unchecked = 0
                         with gil:
                             PyErr_CheckSignals()
-                # write the result back
+                # Write the result back.
                 for j in range(k):
                     q = block[first + j]
                     memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))

@@ -19,34 +19,34 @@ from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 
 
 cdef enum:
-    MIXING_MEMORY = 5           # sweeps that Anderson mixing combines
-    MIN_CHECK_INTERVAL = 4      # The residual is checked after this many sweeps, later after half as many as are done.
-    FIRST_FACTORISATIONS = 12   # Newton's method may do this many factorisations before sweeps continue.
-    RESUMED_SWEEP_RATIO = 8     # Sweeps then continue to this multiple of `max_sweeps` in total.
-    MAX_SUBPROBLEM_FACTORISATIONS = 120    # maximum factorisations of one subproblem
-    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if tol is reached at the present rate within this multiple of the remaining checks.
-    SWEEP_NS_PER_ROW = 15       # cost of a sweep with its mixing [ns] per row, plus 1 ns per entry of A
-    SWEEP_NS_PER_BODY_ROW = 32  # or this per row over bodies
-    FACTOR_NS_PER_ROW = 150     # cost of a factorisation with its steps [ns] per row,
-    CUBED_ROWS_PER_NS = 10      # plus the cube of the rows divided by this
+    MIXING_MEMORY = 5           # number of sweeps that Anderson mixing combines
+    MIN_CHECK_INTERVAL = 4      # Sweeps before the first check of the residual. Later checks follow after half as many as are done.
+    FIRST_FACTORISATIONS = 12   # Newton's method does at most this many factorisations before sweeps continue.
+    RESUMED_SWEEP_RATIO = 8     # The sweeps after them end at this multiple of `max_sweeps` in total.
+    MAX_SUBPROBLEM_FACTORISATIONS = 120    # largest number of factorisations of one subproblem
+    EXTRAPOLATION_FACTOR = 4    # Sweeps continue if the present rate reaches tol within this multiple of the remaining checks.
+    SWEEP_NS_PER_ROW = 15       # estimated cost of a sweep with its mixing [ns] per row of A; in addition 1 ns per entry of A
+    SWEEP_NS_PER_BODY_ROW = 32  # estimated cost of a sweep with its mixing [ns] per row over bodies
+    FACTOR_NS_PER_ROW = 150     # estimated cost of a factorisation with its steps [ns] per row; in addition
+    CUBED_ROWS_PER_NS = 10      # the cube of the number of rows divided by this [1/ns]
 
 
 cdef struct subproblem_t:
-    view_t v                    # over A or bodies
+    view_t v                    # problem over A or over bodies
     double* lam                 # (m) N s, start
     double* answer              # (m) N s, result
     int32_t split               # number of joint blocks, which are swept before the contacts
     const int32_t* at           # offsets into `prepared` if blocks are solved exactly (`prepare_exact_blocks`), else NULL
     const double* prepared
-    double relative_at_zero     # relative residual of the zero impulse; -1: not known, as for an island
-    double e0                   # its reference energy, sqrt J
-    double v0                   # its reference velocity, m/s
+    double relative_at_zero     # relative residual of the zero impulse; -1: not known, which is the case for an island
+    double e0                   # energy error of the zero impulse, the reference, sqrt J
+    double v0                   # velocity error of the zero impulse, the reference, m/s
 
 
 cdef struct friction_run_t:     # settings and counters of a run over one or several subproblems
     double tol
-    int32_t max_sweeps          # sweeps before and during the alternation: an eighth of the limit
-    int32_t first               # sweeps before the first factorisation
+    int32_t max_sweeps          # largest number of sweeps before and during the alternation: an eighth of the limit
+    int32_t first               # number of sweeps before the first factorisation
     int32_t wide
     int64_t swept               # counters over all subproblems
     int64_t undone
@@ -54,7 +54,7 @@ cdef struct friction_run_t:     # settings and counters of a run over one or sev
     double factored             # multiply-adds of the factorisations
     double remaining_cost       # ns, estimated cost that may still be spent; inf without a limit
     int32_t factorised          # number of subproblems that used factorisations
-    int32_t longest             # maximum sweeps plus factorisations of one subproblem
+    int32_t longest             # largest number of sweeps plus factorisations of one subproblem
 
 
 cdef struct alternation_t:      # state of one subproblem

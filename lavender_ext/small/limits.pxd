@@ -14,7 +14,7 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.py
-    double entry                # ns per entry that a step reads
+    double entry                # number of factorisations if some row is not free
     double work                 # ns per multiply-add of a factorisation
     double count                # factorisations, if some row is not free
     double row                  # ns per independent row of a step
@@ -24,13 +24,13 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double sweep_cone           # ns per multiply-add of such a sweep under the cone law
     double sweep_entry          # ns per multiply-add of such a sweep under another law
     double sweeps               # number of such sweeps
-    double values               # maximum number of entries of one island's N
-    double max_cost             # ns, maximum of the permitted cost
-    double coulomb_rows         # maximum rows of an island under Coulomb's law,
-    double cone_rows            # the same under the cone law with a rigid contact; both apply only if
+    double values               # largest number of entries of one island's N
+    double max_cost             # ns, largest cost that may be permitted
+    double coulomb_rows         # largest number of rows of an island under Coulomb's law
+    double cone_rows            # the same under the cone law with a rigid contact; both limits apply only if
     double dense                # there are fewer than this many rows per velocity
-    double columns              # and no row has more entries: the velocities may then be of bodies (`graph.bodies_in`)
-    double steps                # maximum steps of all islands together
+    double columns              # and no row has more than this many entries: velocities may then belong to bodies (`graph.bodies_in`)
+    double steps                # largest number of steps of all islands together
 
 
 cdef inline double estimate_newton_step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l,

@@ -7,14 +7,14 @@ from lavender_ext.core.view cimport rows_t
 
 
 cdef enum:
-    MAX_PACKED_BLOCKS = 32767   # Little is gained with twice as many blocks: their records do not fit the caches.
+    MAX_PACKED_BLOCKS = 32767   # Larger problems are not packed: their records exceed the caches, and little time is gained.
 
 
 cdef struct packed_t:           # the records of an order; all pointers are into the workspace
     int32_t n_records
     int32_t n_stages
     bint single                 # The records are for one sweep at a time, and impulses remain outside of them.
-    int32_t* lane               # (k) LANES * offset of the record in pairs + lane of each block, in the sequence of the order
+    int32_t* lane               # (k) LANES * (offset of the record in pairs) + lane of each block, in the sequence of the order
     pair_t* first               # first record
     pair_t* last                # last record
     pair_t* last_joint          # if `single`: last record of joints

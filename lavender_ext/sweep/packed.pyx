@@ -31,7 +31,7 @@ from lavender_ext.sweep.records cimport (
 )
 
 
-cdef enum:                      # doubles of workspace: a record for every block, and four int32
+cdef enum:                      # doubles of workspace: a record and four int32 for every block
     WORKSPACE_PER_CONTACT = 27
     WORKSPACE_PER_CONTACT_ROW = 29
     WORKSPACE_PER_JOINT = 14
@@ -40,10 +40,10 @@ cdef enum:                      # doubles of workspace: a record for every block
     EXTRA_WORKSPACE = 16
 
 cdef enum:
-    SLOT_LIMIT = 32768          # more than the number of slots; `place` of a block is SLOT_LIMIT * stage + slot
+    SLOT_LIMIT = 32768          # a number above the number of slots; `place` of a block is SLOT_LIMIT * stage + slot
     MIN_BLOCKS_PER_SLOT = 2     # Orders with fewer blocks per slot are not packed: pairs would be half empty.
-    BLOCKS_PER_SLOT = 6         # T is extended until slots have at most this many blocks: enough pairs to hide the latency.
-    MAX_SHORTENING_ROUNDS = 3   # number of times that levels are computed again to shorten T
+    BLOCKS_PER_SLOT = 6         # T is extended until slots have at most this many blocks on average: enough pairs to hide the latency.
+    MAX_SHORTENING_ROUNDS = 3   # largest number of times that levels are computed again to shorten T
 
 
 cdef struct plan_t:             # temporary arrays of `pack_blocks_in_order`
@@ -142,7 +142,7 @@ cdef inline int32_t delay_wide_bodies(const blocks_t* p, const rows_t* r, const 
 cdef inline bint sort_blocks_by_slot(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t t, plan_t* x) noexcept nogil:
     """Replace levels by slot and stage, and sort the blocks by slot and kind; return False if most blocks are UNPACKED."""
     cdef int32_t i, slot, count, start = 0, stage, kind, unpacked = 0, n = p.n_blocks
-    cdef int32_t kinds = 0                              # bit set of the kinds that occur
+    cdef int32_t kinds = 0                              # bit set of the kinds of the blocks
     for i in range(t):
         x.slot_end[i] = 0
     for i in range(n):
@@ -156,7 +156,7 @@ cdef inline bint sort_blocks_by_slot(const blocks_t* p, const rows_t* r, const i
         kinds |= 1 << kind
     if 2 * unpacked > n:
         return False
-    # counting sort by slot, one kind after the other
+    # Counting sort by slot, one kind after the other.
     for i in range(t):
         count = x.slot_end[i]
         x.slot_end[i] = start
@@ -228,7 +228,7 @@ cdef inline void append_records_of_slot(const blocks_t* p, const rows_t* r, cons
     cdef int32_t i, block, waiting = -1, partner, n_unpaired = 0
     for i in range(begin, end):
         block = x.by_slot[i]
-        if x.kind[block] < 0:                           # is in a record of the slot before
+        if x.kind[block] < 0:                           # The block is in a record of the slot before.
             continue
         if x.kind[block] == UNPACKED or LANES == 1:
             append_packed_record(p, r, order, lam, x, block, -1, out)
@@ -258,7 +258,7 @@ cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int3
     """
     cdef int32_t n = p.n_blocks, i, t, n_levels = 0, begin = 0, end, next_end
     cdef plan_t x
-    # temporary arrays
+    # Bind the temporary arrays.
     x.next_level = <int32_t*>workspace
     x.first_level = x.next_level + r.n_bodies
     x.start_level = x.first_level + r.n_bodies
@@ -271,7 +271,7 @@ cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int3
     workspace += 2 * n
     if not 0 < n <= MAX_PACKED_BLOCKS:
         return 0
-    # levels and T
+    # Compute levels and T.
     for i in range(r.n_bodies):
         x.start_level[i] = 0
     t = compute_schedule_levels(p, r, order, r.n_joints if single else n, &x, &n_levels)
@@ -284,7 +284,7 @@ cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int3
             t = min(n // BLOCKS_PER_SLOT, n_levels)
     if n < MIN_BLOCKS_PER_SLOT * t or not sort_blocks_by_slot(p, r, order, t, &x):
         return 0
-    # records, which begin at a multiple of 16 bytes
+    # Write the records, which begin at a multiple of 16 bytes.
     out.first = <pair_t*>(workspace + ((<uintptr_t>workspace >> 3) & 1))
     out.last = out.last_joint = out.first_contact = out.first
     out.end = <double*>out.first
@@ -390,7 +390,7 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
         code = (<int64_t*>record)[CODE * LANES]
         kind = decode_record_kind(code)
         n = count_record_rows(kind)
-        # impulses, lanes that are due
+        # Load the impulses, and find the lanes that are due.
         impulses = record + HEADER_SIZE
         write_offset = <int64_t*>record + WRITE_OFFSET * LANES
         due = all_lanes
@@ -402,14 +402,14 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
             if due != all_lanes:
                 mask_inactive_lanes(record, n, due, unused, held_offset, saved)
                 write_offset = held_offset
-        # update
+        # Update the blocks.
         if due:
             relax_record(p, r, record, kind, impulses, v, write_offset, lam)
         if packed.single:
             store_record_impulses(record, n, outside, lam)
         elif due != all_lanes:
             restore_inactive_lanes(record, n, due, saved)
-        # next record
+        # Go to the next record.
         if record == span.end:
             return
         record += -decode_previous_record_size(code) if span.backwards else decode_record_size(code)

@@ -39,18 +39,18 @@ cdef inline void relax_rows_block(const blocks_t* p, const row_form_t* form, int
     cdef double slack[2]
     cdef double impulse[2]
     cdef friction_components_t components
-    # rows with bounds (2)
+    # Update bounded rows by (2).
     if has_independent_rows(p, i):
         for row in range(first, p.ptr[i + 1]):
             impulse[0] = lam[row] - compute_row_slack(form, p, panel, row, lam, v) * get_row_step(form, p, row)
-            if row_form_t is not damped_csr_t:          # SOR is for free rows.
+            if row_form_t is not damped_csr_t:          # SOR runs on free rows only, which have no bounds.
                 impulse[0] = clip(impulse[0], p.lower[row], p.upper[row])
             set_row_impulse(form, panel, row, impulse[0], lam, v)
         return
-    # normal
+    # Update the normal.
     impulse[0] = project_normal_update(lam[first], compute_row_slack(form, p, panel, first, lam, v), get_row_step(form, p, first))
     set_row_impulse(form, panel, first, impulse[0], lam, v)
-    # friction components (3)
+    # Update the friction components by (3).
     get_friction_components(p, i, &components)
     for component in range(components.n):
         row = first + components.first[component]
@@ -110,7 +110,7 @@ cdef void sweep_bodies(const blocks_t* p, const rows_t* r, const int32_t* order,
 
 
 cdef void sweep_bodies_in_sequence(const blocks_t* p, const rows_t* r, double* lam, double* v) noexcept nogil:
-    """Sweep over all blocks of bodies in the given order."""
+    """Sweep over all blocks of bodies in the order of the problem."""
     cdef int32_t order[64]
     cdef int32_t first, k, n
     for first in range(0, p.n_blocks, 64):

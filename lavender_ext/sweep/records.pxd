@@ -39,8 +39,8 @@ cdef enum:                      # kinds; NORMAL, DISK, SPIN, ROLL and ROLL_SPIN 
     N_KINDS = 31
 
 cdef enum:                      # int64 entries of the header, one for each lane
-    READ_OFFSET = 0             # bodies a and b; of an UNPACKED block its number
-    WRITE_OFFSET = 2            # bodies a and b
+    READ_OFFSET = 0             # offsets for bodies a and b; for an UNPACKED block its number
+    WRITE_OFFSET = 2            # offsets for bodies a and b
     OWNER = 4                   # set by the caller: the stage of the block, or the index of its first row
     CODE = 5
 
@@ -170,7 +170,7 @@ cdef inline void write_block_record(const blocks_t* p, const rows_t* r, int32_t 
     for lane in range(LANES):
         body = get_block_bodies(r, i if lane == 0 else j)
         for side in range(2):
-            # After the last body: zeros that are read for static bodies, then six unused doubles that are written for them.
+            # After the last body: six zeros that are read for static bodies, then six unused doubles that are written for them.
             header[(READ_OFFSET + side) * LANES + lane] = VELOCITY_BYTES * <int64_t>(
                 body[side] if body[side] >= 0 else r.n_bodies)
             header[(WRITE_OFFSET + side) * LANES + lane] = VELOCITY_BYTES * <int64_t>(

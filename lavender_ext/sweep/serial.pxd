@@ -41,10 +41,10 @@ cdef enum:                      # status of a packing
 
 cdef struct packing_t:          # blocks in pairs, which are packed in the first run that is long enough
     packed_t packed
-    double* workspace           # (packed_workspace_size) or NULL
+    double* workspace           # (`packed_workspace_size`) memory of the records, or NULL
     int32_t status
-    int32_t min_sweeps          # number of sweeps of such a run
-    bint single                 # The run is one sweep at a time, because something is done between sweeps.
+    int32_t min_sweeps          # Blocks are packed in the first run of at least this many sweeps.
+    bint single                 # The run calls one sweep at a time, because the caller does something between sweeps.
     bint backwards              # if `single`: the order is the reverse of the packed one
 
 
@@ -62,11 +62,11 @@ cdef struct sweep_context_t:    # everything that a sweep needs except lam
     packing_t* packing          # NULL: blocks are not packed
     bint exact                  # Every block is solved exactly instead of relaxed.
     const int32_t* start        # (k) first index in `prepared` of each block, if blocks may be solved exactly
-    const double* prepared      # diagonal blocks (local/gauss_seidel.pyx)
+    const double* prepared      # diagonal blocks, prepared by local/gauss_seidel.pyx
     double fallbacks            # number of blocks without an exact solution, which were relaxed instead
     int32_t method              # SWEEPS | SOR | JACOBI
     double omega                # relaxation factor of SOR and JACOBI
-    double* w                   # (m) slacks of JACOBI
+    double* w                   # (m) slacks before the sweep, for JACOBI
 
 
 ctypedef void (*forget_t)(void* context, const double* lam) noexcept nogil

@@ -34,10 +34,10 @@ from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKE
 
 
 cdef enum:
-    MIN_SWEEPS_TO_PACK = 8      # sweeps of a run that packs its blocks; packing costs two to four sweeps
-    MIN_SWEEPS_TO_PACK_MANY = 16    # the same for single sweeps, and from MANY_BLOCKS on
-    MANY_BLOCKS = 4000          # The records of so many blocks do not fit the second-level cache.
-    RESTART_SWEEPS = 64         # sweeps of a stalled run after its restart from the best iterate
+    MIN_SWEEPS_TO_PACK = 8      # Blocks are packed in runs of at least this many sweeps; packing costs two to four sweeps.
+    MIN_SWEEPS_TO_PACK_MANY = 16    # Smallest run for packing if sweeps are called one by one, or from MANY_BLOCKS blocks on.
+    MANY_BLOCKS = 4000          # The records of this many blocks do not fit the second-level cache.
+    RESTART_SWEEPS = 64         # Number of sweeps of a stalled run after its restart from the best iterate.
 
 
 cdef bint pack_blocks_of_long_run(sweep_context_t* c, const double* lam, int64_t sweeps) noexcept nogil:
@@ -61,7 +61,7 @@ cdef void compute_sweep_velocities(const sweep_context_t* c, const double* lam) 
 
 
 cdef inline void update_order_for_sweep(sweep_context_t* c, bint first) noexcept nogil:
-    """Reverse or shuffle the order for the next sweep; `first`: no sweep was before."""
+    """Reverse or shuffle the order for the next sweep; `first`: the next sweep is the first one."""
     update_sweep_order(c.mode, first, c.order, 0, c.split, c.rng)
     update_sweep_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
     if c.packing != NULL and c.mode == SYMMETRIC and not first:
@@ -128,7 +128,7 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
                         double tol, int32_t* done) noexcept nogil:
     """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
     cdef int32_t status, more
-    x.context.w = test.e                                # The stopping test does not need its errors between checks.
+    x.context.w = test.e                                # The stopping test needs its errors during checks only; JACOBI uses the array.
     if test.total == 0:
         compute_sweep_velocities(&x.context, lam)
     if x.packing.single:
@@ -144,15 +144,15 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
 cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
     """Run one sweep over blocks p, which are those of `c` or differ in their law; `first`: no sweep was before."""
     cdef int32_t i
-    # all slacks before the sweep (3)
+    # Compute all slacks before the sweep (3).
     if c.method == JACOBI:
         for i in range(p.n_rows):
             c.w[i] = csr_row_dot(c.csr, i, lam) - p.b[i]
         sweep_jacobi(p, c.w, c.omega, lam)
         return
-    # order
+    # Set the order.
     update_order_for_sweep(c, first)
-    # blocks
+    # Sweep over the blocks.
     if c.method == SOR:
         sweep_matrix_sor(p, c.csr, c.omega, c.order, lam)
     elif ALL_SWEEPS and exact:
