@@ -23,8 +23,9 @@ from lavender_ext.derivative.linear import CASES, Linear, write_body_wrenches
 
 # Solutions with a larger relative residual (without the part that rounding explains) are not differentiated.
 MAX_ACCEPTED_RESIDUAL = 1e-8
-MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of the largest are rounding.
-MAX_NULL_COSINE = 1e-3  # A right-hand side has no solution if its cosine with a null vector of G^T is larger.
+MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of its largest entry count as rounding.
+# A right-hand side counts as unsolvable if its cosine with a null vector of G^T is larger.
+MAX_NULL_COSINE = 1e-3
 # Blocks within this many estimated errors of another state are reported by `switching`; the estimate is of first order.
 SWITCHING_ERRORS = 10.0
 UNIT_ROUNDOFF = 2.0**-53
@@ -408,7 +409,7 @@ class Derivative:
         dj = self._body_chain.compute_jacobian_change(data) if p.rows is not None else data.get("J")
         if p.rows is not None and "J" in data:
             dj = data["J"] if dj is None else dj + data["J"]
-        momentum = None  # This is dJ^T lambda - dM v'.
+        momentum = None  # This is dJ^T lambda - dM v' of equation (2).
         if dj is not None:
             dw += dj @ self._velocity
             momentum = dj.T @ self._impulse

@@ -18,13 +18,15 @@ from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import free_part
 
-MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
+# G counts as singular if its smallest pivot divided by its largest pivot is below this.
+MIN_PIVOT_RATIO = 1e-12
 # Shift of each diagonal entry of a singular G, relative to the entry: eps of equation (6) in `lavender.gradient`.
 SHIFT_OF_SINGULAR = 1e-11
 # Number of proximal steps of (6). Each divides the error of a component by 1 + pivot / shift: eight steps leave 2^-8 if
 # its pivot is as large as the shift, and 1e-16 if it is 100 times as large.
 MAX_PROXIMAL_STEPS = 8
-MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by up to this fraction of its largest entry.
+# The iteration (6) ends if a step changes x by at most this fraction of its largest entry.
+MIN_PROXIMAL_CHANGE = 1e-14
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
 MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
 # Systems of up to this many rows are also dense if a contact slides, or if A is sparse and not symmetric.

@@ -54,11 +54,11 @@ __all__ = [
 
 UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
-# |z| counts as rounding up to this fraction of b.y at most: the floor of a solution (2) is then above 1e-6.
+# |z| counts as rounding if it is at most this fraction of b.y. The floor of a solution (2) is then above 1e-6.
 MAX_ROUNDING_SLACK = 1e-10
 SAFE_SUM_RATIO = 1e3  # A sum above this multiple of its rounding bound is not recomputed exactly.
 MAX_POLISHED_SLACK = (
-    1e-6  # |z| up to this fraction of its terms is a solver's rounding; larger z is not polished.
+    1e-6  # Up to this fraction of the sum of its terms, |z| counts as rounding; larger z is not polished.
 )
 MAX_EXACT_ROWS = (
     16  # Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
@@ -74,8 +74,10 @@ LEAST_SQUARES_TIME = (
 LEAST_SQUARES_SHIFT = (
     1e-14  # Shift of the normal equations, relative to their trace: above the rounding of a factor.
 )
-LEAST_SQUARES_ITERATIONS = 6  # Each one divides the error by 1 + (singular value)^2 / shift.
-PRODUCT_COLUMNS = 8  # OpenBLAS starts threads for products of more than 262,144 multiply-adds.
+# Number of iterations. Each divides the error by 1 + (singular value)^2 / shift.
+LEAST_SQUARES_ITERATIONS = 6
+# Columns per product. OpenBLAS starts threads for products of more than 262,144 multiply-adds.
+PRODUCT_COLUMNS = 8
 
 
 @dataclass(frozen=True)
@@ -230,7 +232,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
         name = problem.row_name(int(vanished[0]))
         return Proof(y, 0.0, f"products of {name} vanish in float64: its row of A is not zero")
     unscaled, y = y, y / _round_down_to_power_of_two(y)
-    # b.y and the sum of the absolute values of its terms
+    # Compute b.y and the sum of the absolute values of its terms.
     gain, gain_size = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
         return Proof(y, 0.0, f"b.y = {gain:.2e} is not positive")

@@ -54,7 +54,7 @@ UNIT_ROUNDOFF = 2.0**-53
 MAX_ISLAND_ROWS = 600  # Larger islands have no bound: dense products of 600 rows take about 0.1 s.
 MAX_MATRIX_ENTRIES = 4e6  # No bound is computed if A has more entries than this, because A is formed.
 MAX_UNCERTAINTY_STEPS = (
-    8  # Every row counts as uncertain after this many rounds that each found further uncertain rows.
+    8  # Every row counts as uncertain if this many rounds have each found further uncertain rows.
 )
 MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5); each doubles the assumed bound of |dy|.
 MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger.
@@ -304,7 +304,8 @@ class _Island:
         out = x.copy()
         for block, components in self.contacts:
             block_norm, friction = _norm(x[block]), 0.0
-            normal_change = block_norm if self.is_cone else x[block[0]]  # change of the projection's normal
+            # This is the change of the projection's normal component.
+            normal_change = block_norm if self.is_cone else x[block[0]]
             for c in components:
                 size = _norm(x[c.rows])
                 friction += c.coefficient * size

@@ -69,9 +69,7 @@ from lavender_ext.judge import measure
 
 # [-] A relative residual above this is never attributed to rounding to float64.
 MAX_EXCUSED_RESIDUAL = 1e-5
-MAX_REST_VELOCITY = (
-    1e-9  # m/s. With a smaller V0 a problem is at rest: the zero impulse counts as its solution.
-)
+MAX_REST_VELOCITY = 1e-9  # m/s. If V0 is smaller, the zero impulse counts as the problem's solution.
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to the next number.
 
 # at_floor(relative, floor) tests the residual of one island. Solvers and the judge call the same kernel, which states
@@ -80,7 +78,7 @@ at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
 DEFAULT_THRESHOLD = (
-    1e-6  # m/s, default of `threshold`. The sensors of robots do not measure smaller velocity errors.
+    1e-6  # m/s. Default of `threshold`: sensors of robots do not measure smaller velocity errors.
 )
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",

@@ -312,7 +312,8 @@ class Solution:
             rest = attributes.get("_rest")
             if rest is not None:
                 function, arguments = rest
-                attributes.update(function(*arguments))  # Two threads may do this; their values are equal.
+                # Two threads may compute these fields; their values are equal.
+                attributes.update(function(*arguments))
                 attributes.pop("_rest", None)
             if name in attributes:
                 return attributes[name]
@@ -353,7 +354,7 @@ class Solution:
     @property
     def is_contradicted(self) -> bool:
         """Whether the judge's figures exclude what `status` claims."""
-        # Fields that `late` postponed belong to claims that were checked: they need not be computed here.
+        # Fields that `late` postponed belong to claims that have been checked, so they are not computed here.
         return self.__dict__.get("claim_check") == CONTRADICTED
 
     @property

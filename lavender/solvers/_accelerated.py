@@ -24,8 +24,8 @@ from lavender_ext.core.order import SYMMETRIC
 
 SWEEPS = ("pgs", "blocks")
 MAX_MEMORY = 16
-# Iterations without progress before an accelerated sweep stalls. With large mass ratios, the residual of a conjugate
-# gradient first rises for hundreds of iterations.
+# An accelerated sweep stalls after this many iterations without progress. With large mass ratios, the residual of
+# a conjugate gradient first rises for hundreds of iterations.
 ACCELERATED_PATIENCE = 500
 # Sweeps use the rows of A instead of body velocities up to this many entries per row and in total. Measured: rows of A
 # are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570

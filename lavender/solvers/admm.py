@@ -52,12 +52,13 @@ from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
 
-_START_RHO = 0.1  # First penalty; B has unit diagonal, so its scale is 1. Measured.
-# Iterations without progress before it stalls. With large mass ratios, the residual rises while rho is adapted.
+_START_RHO = 0.1  # First penalty rho. B has unit diagonal, so its scale is 1. The value was measured.
+# The solver stalls after this many iterations without progress.
+# With large mass ratios, the residual rises while rho is adapted.
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# `prepare` scales the problem if that is estimated to cost up to this [ns]; otherwise `run` does.
+# `prepare` scales the problem if scaling is estimated to cost at most this [ns]; otherwise `run` does.
 MAX_SETUP_SCALING_COST = 5e6
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
@@ -73,8 +74,9 @@ class AdmmState:
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
         get_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
-        self.deadline = Deadline()  # No step starts that is expected to end later.
-        self.factorisations = self.reported = 0  # Number of factorisations, and of those in earlier claims.
+        self.deadline = Deadline()  # No step starts that is expected to end after this deadline.
+        # Number of factorisations, and their number in earlier claims.
+        self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
         self.is_scaled = self.is_analysed = False
@@ -108,7 +110,7 @@ class AdmmState:
         self.splitting = admm.Splitting(self.data, self.memory, _START_RHO, self.relaxation)
         self.matrix: Any = None
         self.system: Any = None  # Linear system of the matrix.
-        self.lu = self.full = False  # Whether L U is used, and whether its matrix is full.
+        self.lu = self.full = False  # Whether the factor is L U, and whether its matrix is full.
         if _is_over_bodies(problem):
             form = problem.velocity_form()
             # The form is scaled with D = diag d of the judge.
@@ -129,7 +131,7 @@ class AdmmState:
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _estimate_first_factor_cost(self) -> float:
-        """Estimate the cost [ns] of the first factor from the structure; later ones cost as much as the one before."""
+        """Estimate the cost [ns] of the first factor from the structure; later factors cost as much as the last one."""
         problem, rates = self.problem, RATES
         if self.is_over_bodies:
             assert problem.rows is not None
@@ -150,11 +152,11 @@ class AdmmState:
 
     @property
     def sweeps_per_decade(self) -> float:
-        """Iterations in which the residual falls tenfold; NaN if it does not fall."""
+        """Number of iterations in which the residual falls tenfold; NaN if it does not fall."""
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
     def _factor(self) -> tuple[Any, ...]:
-        """Return the factor for the present rho in the format of the kernel, and measure its time."""
+        """Return the factor for the present rho in the format of the kernel, and measure the time to compute it."""
         self._check_deadline()
         watch = Stopwatch()
         factor = self._make_factor()
@@ -181,7 +183,7 @@ class AdmmState:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
             matrix, shift = mirror_pattern(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
-            # The pattern is analysed each time, because entries may cancel for some values of rho.
+            # The pattern is analysed for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
             extra = (*get_sorted_csr_arrays(k), e)
         done = _factor_system(system, matrix, shift, self.lu)
@@ -190,7 +192,7 @@ class AdmmState:
             self.lu = True
             done = _factor_system(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
-            # Row exchanges across supernodes are needed.
+            # L U by supernodes cannot exchange rows across supernodes, which is needed here.
             if self.deadline.passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
                 raise TooLate
             self.full = True
@@ -210,7 +212,7 @@ def _is_over_bodies(problem: Problem) -> bool:
 def _estimate_scaling_cost(problem: Problem) -> float:
     """Estimate the cost of scaling [ns]."""
     rates = RATES
-    if _is_over_bodies(problem):  # J, the square root of M^-1, and their product.
+    if _is_over_bodies(problem):  # The cost is that of J, of the square root of M^-1, and of their product.
         return float(3.0 * rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m)
     entries, form = problem.max_entries, estimate_formation_cost(problem)
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # One product of dense matrices.
@@ -270,7 +272,7 @@ class ADMM(Solver):
     needs_scipy = True
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the cost of `prepare`; later set-up starts in `set_deadline` or `run` if it fits the limit."""
+        """Estimate the cost of `prepare`; the remaining set-up runs in `set_deadline` if it fits, otherwise in `run`."""
         return Cost(partial(_estimate_setup_cost, problem))
 
     def prepare(self, problem: Problem) -> AdmmState:
@@ -280,7 +282,7 @@ class ADMM(Solver):
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
-        """Start no step that is expected to end after `deadline`; do the set-up that ends before it."""
+        """Start no step that is expected to end after `deadline`. Do the set-up now if it ends before."""
         state.deadline = deadline
         with suppress(TooLate, _Breakdown, *BREAKDOWN):  # `run` meets the same error and reports it.
             state.open()

@@ -70,7 +70,7 @@ from lavender.solvers.steps import (
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
-MAX_ALTERNATIONS = 12  # Largest number of rounds of alternation; the total cost ends most of them earlier.
+MAX_ALTERNATIONS = 12  # Largest number of rounds of alternation. The total cost ends most solves earlier.
 # A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp is always
 # installed.
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
@@ -110,9 +110,9 @@ class Tree:
     """
 
     remaining_cost = 0.0  # Cost [ns] that remains for the alternation.
-    compiled_call_failed = False  # The compiled call over velocities of J and M has failed.
-    started_from_zero = False  # That call started from the zero impulse.
-    sweeps_failed = False  # Sweeps did not improve the residual in the alternation.
+    compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
+    started_from_zero = False  # Whether that call started from the zero impulse.
+    sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
     best = nan
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -130,12 +130,12 @@ class Tree:
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
-        """States of Newton's method after its analysis; empty if it is refused or too late."""
+        """States of Newton's method after its analysis, by form; empty if it is refused or too late."""
         is_possible = get("newton").refuses(self.problem) is None and not self.is_late
         return self.prepare_newton("newton") if is_possible else {}
 
     def prepare_newton(self, name: str) -> dict[str, NewtonState]:
-        """Return {name: state} of Newton's method in this form after its analysis; empty if that breaks down."""
+        """Return {name: state} of Newton's method in this form after its analysis; empty if the analysis fails."""
         try:
             return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
         except BREAKDOWN:
@@ -167,7 +167,8 @@ class Tree:
     @property
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
-        found = {name: state.cost for name, state in self.states.items()}  # `Newton.cost` with the state.
+        # `state.cost` is `Newton.cost` for this state.
+        found = {name: state.cost for name, state in self.states.items()}
         if self.can_pivot:
             found["direct"] = self.direct
         failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
@@ -282,7 +283,7 @@ class Tree:
         return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
 
     def factorisations(self, times: float) -> Iterator[Stage]:
-        """Yield stages of the factorising solvers, whose costs are at most this multiple of the cheapest one's."""
+        """Yield stages of the factorising solvers; each costs at most this multiple of the cheapest solver's cost."""
         budget = times * self.newton
         for name, cost in self.solver_costs.items():
             if cost <= budget:
@@ -311,7 +312,7 @@ class Tree:
         p = self.problem
         setup = 0.0
         if p.generalized is not None:
-            # A of J and M is formed if no stage did, and factored; the cost does not depend on cached data.
+            # If no stage formed A of J and M, form and factor it now. The cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
         if setup <= cost:
@@ -346,7 +347,7 @@ class Auto(Solver):
     """Select and combine other solvers; the solution's message and `stages` name them."""
 
     def prepare(self, problem: Problem) -> AutoState:
-        """Return the state of a new solve: nothing is prepared."""
+        """Return the state of a new solve. Nothing is prepared."""
         return AutoState(problem)
 
     def start_workers(self, state: AutoState, time_limit: float) -> None:
@@ -409,7 +410,7 @@ class Auto(Solver):
                     log.note(name, claim, log.best)
                 solve(log, tree)
         except KeyboardInterrupt:
-            log.interrupted = True  # The best impulse is returned all the same.
+            log.interrupted = True  # The best impulse is returned even after an interruption.
         except BREAKDOWN as error:
             log.failure = format_error(error)
         impulse[:] = log.result if log.best > tol else log.impulse
@@ -470,13 +471,13 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: Tree) -> None:
-    """Run the stages of the tree until one solves the problem or no stage remains; then search for a certificate."""
+    """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         Sweeps("anderson", log).finish()
         return
     lines = iter(tree)
-    while not log.done():  # Checked before the tree computes the costs of the next stage.
+    while not log.done():  # This is checked before the tree computes the costs of the next stage.
         stage = next(lines, None)
         if stage is None:
             break
@@ -521,7 +522,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
 
 
 def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
-    """Return whether a factorising solver can have a result in time after work of this cost [ns], or all have ended."""
+    """Return whether, after work of this cost [ns], a factorising solver can end in time, or all have ended."""
     if "states" not in vars(tree):
         return tree.has_time("newton", tree.min_newton_cost, cost)
     unfinished = [name for name in tree.states if name not in steps or not steps[name].over]

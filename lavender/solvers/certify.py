@@ -41,18 +41,19 @@ from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import residuals_by_island
 
-# Linear programs are used up to this many rows of all islands together.
+# Linear programs are used if all islands together have at most this many rows.
 CERTIFICATE_ROWS = 3000
 LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
-MAX_RELAXATION_STEPS = 150  # Largest number of factorisations for a proof of the convex relaxation,
-MAX_SOFTENED_STEPS = 300  # and for the solution of a problem with additional compliance.
+# Largest number of factorisations to prove that the convex relaxation has no solution.
+MAX_RELAXATION_STEPS = 150
+MAX_SOFTENED_STEPS = 300  # Largest number of factorisations to solve a problem with additional compliance.
 TRIED_COMPLIANCES = 1e-4, 1e-2  # Additional compliances that are tried, as multiples of d.
-# Compliances that replace the rigid rows in turn, as multiples of d: the solutions then approach the motion with the
-# smallest violation.
+# Compliances of the rigid rows, as multiples of d, which are tried one after the other. The solutions approach the
+# motion with the smallest violation.
 NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
 VIOLATION_TOLERANCE = 1e-6  # Relative residual to which the problems with these compliances are solved.
-# Rows of a direction below this fraction of its largest entry in the metric of D are set to zero.
+# Rows of a direction are set to zero if they are below this fraction of its largest entry in the metric of D.
 NEGLIGIBLE_ROW_FRACTION = 1e-6
 
 
@@ -103,7 +104,7 @@ def find_conflict(problem: Problem, tol: float, deadline: Deadline | None = None
     tries = [
         (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
     ]
-    if contacts:  # Other contacts may conflict, too; this proof does not contain them.
+    if contacts:  # Other contacts may conflict, too, but this proof does not contain them.
         tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
     for rows, names in tries:
         for fraction in TRIED_COMPLIANCES:
@@ -191,7 +192,8 @@ def certify_by_least_violation(log: SolveLog) -> None:
             is Status.INTERRUPTED
         ):
             raise KeyboardInterrupt
-        for y in (lam - before, lam):  # The second one if rows had larger impulses with the previous eps.
+        # The second one helps if rows had larger impulses with the previous eps.
+        for y in (lam - before, lam):
             y = drop_negligible_rows(np.where(has_compliance, 0.0, y), d)
             outside = (np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))
             if not outside.any():

@@ -191,7 +191,7 @@ def get_sweep_rate(problem: Problem) -> str:
 
 
 def count_dense_work(m: int) -> float:
-    """Return the multiply-adds of one factor of a full matrix of m rows."""
+    """Return the number of multiply-adds of one factor of a full matrix of m rows."""
     return m**3 / 3.0
 
 
@@ -209,12 +209,12 @@ def get_loose_limit(problem: Problem) -> float:
 
 
 def is_formed(problem: Problem) -> bool:
-    """Return whether A is known, or has no rows."""
+    """Return whether A is known already, or has no rows."""
     return problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__
 
 
 def estimate_formation_cost(problem: Problem, known: bool | None = None) -> float:
-    """Estimate the cost to form A of J and M or of bodies [ns], 0 if it is known; `known` replaces this check."""
+    """Estimate the cost to form A of J and M or of bodies [ns]; 0 if A is known. `known` replaces this check."""
     if is_formed(problem) if known is None else known:
         return 0.0
     if problem.rows is None:

@@ -92,8 +92,8 @@ class DirectState:
 class Direct(Solver):
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
-    patience: ClassVar[bool] = True  # Continue if pivoting on one shift is stuck.
-    exact: ClassVar[bool] = True  # Solve to rounding, whatever the tolerance.
+    patience: ClassVar[bool] = True  # Whether the solver continues if pivoting with one shift is stuck.
+    exact: ClassVar[bool] = True  # Whether the solver solves to rounding, whatever the tolerance.
 
     def fallback(self) -> Solver:
         """Return Lemke's method, which continues if exchanges cycle on friction written as bounded rows."""
@@ -155,7 +155,7 @@ class Direct(Solver):
 
 @dataclass(frozen=True)
 class SufficientDirect(Direct):
-    """Direct solver for `auto` with only free rows: a solution that meets the tolerance is not refined."""
+    """Direct solver for `auto`. If all rows are free, it does not refine a solution that meets the tolerance."""
 
     exact: ClassVar[bool] = False
 
@@ -184,7 +184,7 @@ def _factor_general(problem: Problem, why: str) -> DirectState:
 
 
 class _Run:
-    """One call of `run`: the best judged iterate so far, and the work done."""
+    """State of one call of `run`: the best judged iterate so far, and the work done."""
 
     def __init__(
         self,
@@ -196,7 +196,7 @@ class _Run:
         solver: Direct,
     ) -> None:
         self.patient = solver.patience
-        # A relative residual up to this value is sufficient, whatever the round-off floor is.
+        # The solver stops at a relative residual up to this value, whatever the round-off floor is.
         self.sufficient_residual = REFINEMENT_RESIDUAL if solver.exact else max(REFINEMENT_RESIDUAL, tol)
         self.state, self.problem, self.impulse = state, state.problem, impulse
         self.max_iter, self.tol = max_iter, tol
@@ -205,7 +205,7 @@ class _Run:
         self.late = False  # No round was started, because it would have ended after the deadline.
         self.iterations = 0
         self.work: dict[str, int] = {}
-        self.reported: dict[str, int] = {}  # Work of the rows in earlier runs.
+        self.reported: dict[str, int] = {}  # Work of the rows that earlier runs have reported.
         self.notes = [state.note] if state.note else []
 
     # -- judging ---------------------------------------------------------------------------------
@@ -236,7 +236,8 @@ class _Run:
         """Copy the best iterate to the impulse."""
         pivot = self.state.pivot
         if pivot is not None and pivot.rows.relative < self.best:
-            self.offer(pivot.rows.best)  # An error or Ctrl-C ended the run between two rounds.
+            # This iterate is left if an error or Ctrl-C ended the run between two rounds.
+            self.offer(pivot.rows.best)
         if self.best_pass is not None:
             self.impulse[:] = self.best_pass.impulse
 
@@ -311,7 +312,7 @@ class _Run:
         return self.make_final_claim()
 
     def general(self, why: str) -> Claim:
-        """Solve a linear system again by LU that reveals the rank."""
+        """Solve a linear system again by an LU factorisation that reveals the rank."""
         before = self.work | self.pivot_work
         before.pop("rank", None)  # The rank is not a count; the new decomposition gives it.
         self.state = _factor_general(self.problem, why)
@@ -408,7 +409,7 @@ class _Run:
         length = np.sqrt(self.problem.d)
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
         if np.any(np.sign(y) * pull > CERTIFICATE_TOLERANCE * (length @ np.abs(y)) * length):
-            return None  # An unbounded impulse along y meets b.y, up to more than rounding.
+            return None  # A large impulse along y supplies b.y, so y proves nothing.
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")

@@ -34,14 +34,15 @@ from lavender_ext.factor.sparse import free_part, is_mirrored
 PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
 # Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
 MAX_COMPILED_FACTOR_ROWS = 64
-MAX_COMPILED_BAND = 40  # Largest half bandwidth for which the compiled band factor is the fastest.
-MIN_DENSE_FRACTION = 0.1  # From this fraction of nonzeros, dense Cholesky is faster than sparse.
-MAX_PANELS_FRACTION = 0.25  # Up to this fraction of nonzeros, panels are considered for a linear system.
+MAX_COMPILED_BAND = 40  # Up to this half bandwidth, the compiled band factor is the fastest.
+MIN_DENSE_FRACTION = 0.1  # Above this fraction of nonzeros, dense Cholesky is faster than sparse Cholesky.
+MAX_PANELS_FRACTION = 0.25  # Panels are considered for a linear system up to this fraction of nonzeros.
 MAX_DENSE_ROWS = 6000  # Largest dense matrix: 288 MB.
 # Use vectors of four numbers if the processor has them; the bits are the same.
 USE_WIDE_LANES = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")
 MAX_DENSE_RANK_ROWS = (
-    2000  # Up to this many rows, the rank of a singular asymmetric matrix is computed densely.
+    # Up to this many rows, the rank of a singular asymmetric matrix is computed with a dense decomposition.
+    2000
 )
 
 
@@ -61,7 +62,7 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
         return "band", band, None
     nnz = len(problem._compressed[1])
     if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
-        # Only one factor is needed: the cheapest one is chosen.
+        # If only one factor is needed, the cheapest factorisation is chosen.
         narrow = estimate_band_factor_cost(m, band)
         full = RATES["dense call"] + estimate_dense_factor_cost(m)
         if estimate_panel_factor_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
@@ -101,7 +102,7 @@ class Factor(Protocol):
     """Interface of a factorisation of A_FF + shift D_FF for changing free sets F."""
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor the rows with place >= 0, in order; return how many pivots are not above PIVOT_TOLERANCE d.
+        """Factor the rows with place >= 0, in order; return the number of pivots that do not exceed PIVOT_TOLERANCE d.
 
         There must be at least one such row.
         """

@@ -17,7 +17,7 @@ from lavender.problem.ordering import Order, rank_bodies
 from lavender_ext.core.blocks import view_blocks
 from lavender_ext.core.problem import Data
 
-# From this many contacts, the copy is faster, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
+# The copy is faster from this many contacts on, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
 # times as fast at 10,000 contacts, twice as fast at 100,000).
 MIN_CONTACTS_FOR_COPY = 8_000
 

@@ -37,7 +37,7 @@ from lavender_ext.pivot.lemke import DONE, LATE, RAY
 RAY_MESSAGE = (
     "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
 )
-MAX_LEMKE_ROWS = 2000  # Largest number of rows: a dictionary of 32 MB.
+MAX_LEMKE_ROWS = 2000  # Largest number of rows; the dictionary then has 32 MB.
 
 
 def _count_dictionary_rows(problem: Problem) -> tuple[int, int]:
@@ -98,7 +98,7 @@ class Lemke(Solver):
     def _follow_paths(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
-        """Do at most `max_iter` pivots, `chunk` of them between two checks of the clock, and return the claim."""
+        """Do at most `max_iter` pivots and return the claim; the clock is checked after each `chunk` pivots."""
         rows, message = state.rows, ""
         certificate: FloatArray | None = None
         while True:

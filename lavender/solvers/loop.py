@@ -40,13 +40,14 @@ from lavender_ext.judge.measure import are_bit_identical
 from lavender_ext.judge.stopping_test import StoppingTest
 
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
-# A chunk uses at most this fraction of the remaining time, at the speed of the chunk before.
+# A chunk may use this fraction of the remaining time, estimated from the speed of the previous chunk.
 CHUNK_TIME_FRACTION = 0.7
-# Largest number of iterations of the first chunk: 10 ms at 40 us each; compiled sweeps of few rows are faster.
+# Largest number of iterations of the first chunk: at 40 us each it takes 10 ms; compiled sweeps of few rows are faster.
 FIRST_CHUNK_ITERATIONS = 256
 Callback = Callable[[int, FloatArray, Residual], Any]
-Record = tuple[int, float, float, float, float]  # iterations, time [s], relative, energy, velocity
-# Impulses whose relative distance to their bounds is at most this are within them: projections round as much.
+# The fields are iterations, time [s], relative residual, energy error and velocity error.
+Record = tuple[int, float, float, float, float]
+# An impulse outside its bounds by at most this relative distance counts as inside: projections round as much.
 BOUND_ROUNDING = 1e-12
 EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 
@@ -119,7 +120,7 @@ class Loop:
                 return claim
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        # The impulse may be an intermediate result.
+        # The impulse array may contain an intermediate result.
         self.impulse[:] = combine_best_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
 
@@ -141,7 +142,7 @@ class Loop:
 
     def run_chunks(self, max_iter: int) -> Claim:
         """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
-        # The first guess is a nanosecond per unit of work, with a limit for solvers in Python; then time is measured.
+        # The first estimate is a nanosecond per unit of work, limited for solvers in Python. Later ones are measured.
         chunk = min(FIRST_CHUNK_ITERATIONS, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
         claim = EMPTY_CLAIM
@@ -227,7 +228,8 @@ class Loop:
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
         self.recording_time += watch.seconds
-        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then steps of an eighth.
+        # Record at 1, 2, ... 16 iterations, then after each eighth more.
+        self.next_record = self.done + max(1, self.done >> 3)
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
     def _add_to_total_work(self, claim: Claim) -> Claim:

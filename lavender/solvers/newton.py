@@ -62,10 +62,11 @@ from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED
 
 FORMS = ("auto", "velocity", "impulse")
-# The row form is used if the velocity form is estimated to cost more than this multiple of it.
+# The row form is used if the velocity form is estimated to cost more than this multiple of the row form.
 VELOCITY_MAX_COST_RATIO = 10.0
 MAX_FORMED_ROWS = (
-    3000  # If the velocity form fails, A is formed and the row form continues up to this many rows.
+    # If the velocity form fails, A is formed and the row form continues if A has at most this many rows.
+    3000
 )
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
@@ -74,7 +75,8 @@ _ENDS = {
     OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["stuck"]: Status.STALLED,
 }
-# The row form starts from the result of the velocity form up to this relative residual, else from the default start.
+# The row form starts from the result of the velocity form if its relative residual is at most this,
+# otherwise from the default start.
 WARM_START_MAX_RESIDUAL = 1e-3
 
 
@@ -207,7 +209,7 @@ class Newton(Solver):
                 problem, (max_cost - fixed) / (estimate_velocity_cost(problem, 1.0) - fixed)
             )
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
-            bodies = find_bodies(problem)  # Interior points over bodies are then faster.
+            bodies = find_bodies(problem)  # In this case, interior points over bodies are faster.
         if bodies is None and kernel is not None:
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
@@ -399,7 +401,7 @@ def _run_stages(
             steps = INTERRUPT_CHECK_INTERVAL / max(system.seconds, 1e-6)
             time_left, watch = deadline.remaining(), Stopwatch()
             if time_left is not None:
-                # The time of the first factorisation is only estimated, so only one is run.
+                # The time of the first factorisation is only estimated, so the first call runs a single one.
                 steps = (
                     min(steps, STAGE_TIME_FRACTION * time_left / max(system.seconds, 1e-9))
                     if solve.done
@@ -410,7 +412,7 @@ def _run_stages(
                     solve.request_stop()
             try:
                 end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
-            except TooLate:  # The best iterate is returned.
+            except TooLate:  # The best iterate is returned if the next factorisation would end too late.
                 late, end = True, OUTCOMES["spent"]
                 solve.request_stop()
             if solve.done > before:
@@ -423,7 +425,7 @@ def _run_stages(
             elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
                 break
     except KeyboardInterrupt:
-        interrupted = True  # The best iterate is returned all the same.
+        interrupted = True  # The best iterate is returned even after an interruption.
         solve.request_stop()
         solve.step(1, impulse)
     if interrupted:
@@ -434,7 +436,7 @@ def _run_stages(
         return Status.MAX_ITERATIONS, None
     if end == OUTCOMES["spent"]:
         if max_total and not late:
-            return Status.STALLED, certificate  # All `max_total` factorisations were used.
+            return Status.STALLED, certificate  # All `max_total` factorisations have been used.
         return (Status.TIME_LIMIT if late and solve.done < last else Status.MAX_ITERATIONS), None
     return _ENDS[end], certificate
 

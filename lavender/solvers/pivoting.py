@@ -32,7 +32,7 @@ from lavender_ext.pivot.direct import Pivoting
 
 # Smallest and largest number of symmetric Gauss-Seidel sweeps that guess the free rows.
 MIN_GUESS_SWEEPS, MAX_GUESS_SWEEPS = 2, 24
-# These sweeps may cost this fraction of a factor; a multiply-add of a sweep takes a nanosecond.
+# The sweeps that guess the free rows may cost this fraction of a factor. A multiply-add of a sweep takes a nanosecond.
 GUESS_COST_FRACTION = 0.5
 
 
@@ -42,12 +42,12 @@ class TimedFactor:
     def __init__(self, inner: Factor, seconds: float) -> None:
         self.inner = inner
         self.seconds = (
-            seconds  # Time [s] of the next factor: estimated for the first, then that of the last one.
+            seconds  # Time [s] of the next factor: an estimate at first, then the time of the last factor.
         )
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor as `Factor.factor`, also for zero rows; return -1 if it was not started."""
+        """Factor like `Factor.factor`, also without any free row; return -1 if the factorisation was not started."""
         if n_free == 0:
             return 0
         if self.deadline.passed(self.seconds):
@@ -90,7 +90,7 @@ class PivotState:
             None if factor is None else TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
         )
         get_reference(problem)
-        # Time [s] of one round with a compiled factor: estimated for all rows free, then that of the last round.
+        # Time [s] of one round with a compiled factor: an estimate with all rows free, then the time of the last round.
         sweep_cost = RATES["symmetric sweep entry"] * problem.csr_data.work  # With its slack [ns].
         self.seconds = 1e-9 * (estimate_band_factor_cost(problem.m, band) + sweep_cost)
         self.rows = Pivoting(
@@ -137,7 +137,8 @@ class PivotState:
         if left is None or self.outside is not None:  # `TimedFactor` checks the clock itself.
             return self.rows.advance(max_rounds), max_rounds == 0
         n = int(left / self.seconds)
-        n = min(max_rounds, max(1, n // 2) if n else 0)  # Half of the rounds that fit; the caller continues.
+        # Do half of the rounds that fit; the caller continues.
+        n = min(max_rounds, max(1, n // 2) if n else 0)
         code = self.rows.advance(n)
         if self.rows.n_rounds > before:
             self.seconds = watch.seconds / (self.rows.n_rounds - before)

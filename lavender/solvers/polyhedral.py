@@ -93,8 +93,8 @@ def as_rows(problem: Problem) -> AsRows:
         A number of the converted problem is out of range.
     """
     c, d, contact = problem.cones, problem.d, problem.cones.is_contact
-    entries: list[tuple[int, int, float]] = []  # Entries of E.
-    couplings: list[tuple[int, int, float]] = []  # Couplings of s.
+    entries: list[tuple[int, int, float]] = []  # Entries of E in (1) or (2).
+    couplings: list[tuple[int, int, float]] = []  # Couplings of s in (1).
     low: list[float] = []
     high: list[float] = []
     for i, sides in _list_rows_bounded_by_normals(problem):
@@ -127,7 +127,7 @@ def as_rows(problem: Problem) -> AsRows:
     try:
         rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
     except InputError as error:
-        # The problem itself is valid; only sums of its entries are out of range.
+        # The problem itself is valid. Only sums of its entries are out of range.
         raise OverflowError("A or b, times coefficients of friction, is out of range") from error
     return AsRows(problem, rows, e)
 

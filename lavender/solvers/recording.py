@@ -21,9 +21,7 @@ from lavender.solvers.small import SmallCall
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-MIN_SAMPLED_COST = (
-    100.0  # [ns] Smallest limit of the counted cost with which the compiled call is made again.
-)
+MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
 SAMPLED_COST_RATIO = 1.25  # Ratio of consecutive limits of the counted cost.
 
 

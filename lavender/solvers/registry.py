@@ -28,7 +28,7 @@ from lavender.solvers.decisions import DECISIONS
 __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
-# Up to this many rows, the overhead of Python dominates a solve: the compiled call `SolverSpec.small` is tried first.
+# The overhead of Python dominates a solve up to this many rows, so the compiled call `SolverSpec.small` is tried first.
 SMALL_ROWS = int(DECISIONS.small_rows)
 # Modules whose SPECS are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
@@ -121,7 +121,7 @@ class Solver:
         """
         raise NotImplementedError
 
-    needs_scipy = False  # whether `prepare` uses parts of SciPy that may not be imported yet
+    needs_scipy = False  # Whether `prepare` uses parts of SciPy that may not have been imported yet.
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
         """Estimate the costs [ns] from the size of the problem, and from the state that `prepare` returned if given.
@@ -131,7 +131,7 @@ class Solver:
         return Cost()
 
     def start_workers(self, state: Any, time_limit: float) -> None:
-        """Start worker processes for a solve with a limit [s]; this time does not count."""
+        """Start worker processes for a solve with a limit [s]. The time to start them does not count."""
 
     def set_deadline(self, state: Any, deadline: Deadline) -> None:
         """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
@@ -293,7 +293,7 @@ class SolverSpec:
             )
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
-            if kind.type == "bool" and not isinstance(value, bool):  # as __future__ leaves annotations
+            if kind.type == "bool" and not isinstance(value, bool):  # Annotations are strings here.
                 check_bool(f"{name} of solver {self.name!r}", value)
         object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
@@ -343,7 +343,7 @@ class SolverSpec:
         check_problem(problem)
         law, operator = problem.law, problem.operator
         if operator == "rows" and problem.cones.has_ellipse:
-            operator = "matrix"  # of `problem.disk`, which is what solvers get
+            operator = "matrix"  # Solvers get `problem.disk`, which is a matrix problem.
         if (
             law in self.laws
             and law not in ("linear", "lcp", *self.box_friction_laws)
@@ -447,7 +447,7 @@ def load_table(table: str) -> None:
     for spec in import_locked(table).SPECS:
         registered.pop(
             spec.name, None
-        )  # a solver that `get` registered by name moves to its place in the table
+        )  # A solver that `get` registered by name moves to its place in the table.
         _add_own(spec)
 
 
@@ -465,7 +465,7 @@ def load_all() -> None:
 @cache
 def fill() -> None:
     """Fill `registered` with the built-in solvers and the plug-ins."""
-    from importlib.metadata import entry_points  # takes a tenth of the time of `import lavender`
+    from importlib.metadata import entry_points  # This import takes a tenth of the time of `import lavender`.
 
     for table in TABLES:
         load_table(table)
@@ -475,7 +475,8 @@ def fill() -> None:
             spec = spec if isinstance(spec, SolverSpec) else spec()
             _add(spec, replace=False)
             object.__setattr__(spec, "from_entry_point", True)
-        except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
+        # A plug-in may raise any error, which must not prevent the use of lavender.
+        except Exception as error:
             warnings.warn(
                 f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4
             )

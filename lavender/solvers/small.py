@@ -44,12 +44,14 @@ NO_WORK_MESSAGES = {
     Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
 }
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
-WARM_START_MAX_RESIDUAL = 1e-3  # Newton's method starts from an iterate up to this relative residual.
+# Newton's method starts from an iterate if its relative residual is at most this.
+WARM_START_MAX_RESIDUAL = 1e-3
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-# From this many rows per velocity, the matrix N is full, and small compared with the data from which it is formed.
+# If an island has at least this many rows per velocity, the matrix N is full, and small compared with the data
+# of which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
 VELOCITIES_OF_TWO_BODIES = 12.0
-# Largest numbers of steps of all islands of velocities, within the default limits of each solver.
+# Largest number of Newton steps of all islands of velocities, within the default limits of each solver.
 NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 
@@ -131,7 +133,7 @@ def _make_call(problem: Problem) -> Small | None:
         return None
     if bounded or count == 1:
         return Small(data, problem.csr_data if bounded else data)
-    # Islands are taken from the bodies if these have fewer unknowns than rows, else from A.
+    # Islands are those of the bodies if the bodies have fewer unknowns than rows, otherwise those of A.
     bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
     return Islands(data, data if bodies else problem.csr_data, label, count)
 
@@ -234,7 +236,7 @@ class SmallCall:
 
     def failed_claims(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
         """Return (solver name, claim) for each solver that ran in a failed call, from its counts."""
-        if counts is None or not any(counts):  # None: the start is the result.
+        if counts is None or not any(counts):  # If the counts are None, the start is the result.
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]

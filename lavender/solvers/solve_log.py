@@ -42,15 +42,17 @@ class SolveLog:
         self.best, self.impulse = (
             np.inf,
             problem._start,
-        )  # Smallest relative residual, and its impulse (m,) [N s].
-        self.result = problem._start  # (m,) [N s]: best impulse of each island, until one impulse meets tol.
+        )  # Smallest relative residual, and the impulse (m,) [N s] with this residual.
+        # (m,) [N s]: the best impulse of each island, until one impulse meets tol.
+        self.result = problem._start
         self.bad_start: FloatArray | None = None  # (m,) [N s]: a start that is worse than the zero impulse.
-        self.judged: Any = None  # The judge's pass over `impulse`, if it was made.
+        self.judged: Any = None  # The judge's pass over `impulse`, if one was made.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
-        self.certificate: FloatArray | None = None  # (m,)
-        self.direction: FloatArray | None = None  # (m,): not a certificate, but it bounds the impulses.
+        self.certificate: FloatArray | None = None  # (m,) Proof that no solution exists, if one was found.
+        # (m,) Direction that bounds the impulses but is not a certificate.
+        self.direction: FloatArray | None = None
         self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
@@ -59,7 +61,7 @@ class SolveLog:
         self.offer(start, is_start=True)
         if self.best > 1.0:
             self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
-            self.offer(self.problem._start, is_start=True)  # The zero impulse is better.
+            self.offer(self.problem._start, is_start=True)  # The zero impulse has the residual 1.
 
     def offer(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s], unless `judged` belongs to it, and store it in islands in which it is the best.

@@ -34,11 +34,11 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "nncg": ("nncg", NNCG_OPTIONS),
     "admm": ("admm", {}),
 }
-MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations of one call.
+MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions use at least this relative residual as tol.
-# Upper bound of the time [s] of an iteration per estimated cost [ns].
+# Upper bound of the ratio of an iteration's time [s] to its estimated cost [ns].
 ITERATION_TIME_PER_COST = 4e-9
-# Sweeps use a formed A only if this multiple of the cost to form it remains.
+# Sweeps use a formed A only if at least this multiple of the cost to form it remains.
 FORMATION_COST_RATIO = 4.0
 
 
@@ -46,7 +46,7 @@ def make_solver(name: str, problem: Problem) -> Any:
     """Create the solver of a step."""
     solver, options = METHODS[name]
     if name == "direct" and problem.law == "linear":
-        return SufficientDirect()  # It does not refine below tol.
+        return SufficientDirect()  # This solver does not refine a solution that meets tol.
     # Sweeps solve blocks exactly under the cone law, and if the rows of a contact may have different units.
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
     if exact and "sweep" in get(solver).options:
@@ -211,7 +211,7 @@ class Sweeps(Iterations):
         """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
         first = int(DECISIONS.first_sweeps)
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
-        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps.
+        if self.time_fraction == 1.0:  # Checks would cost as much as these first sweeps.
             loop.tol = 0.0
             claim = loop.run_chunks(min(n, first))
             if claim.status is not Status.MAX_ITERATIONS:

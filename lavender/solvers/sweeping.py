@@ -27,7 +27,7 @@ STATUS = {
     STALLED: Status.STALLED,
     AT_FLOOR: Status.ROUNDOFF_LIMIT,
 }
-SWEEP_PATIENCE = 64  # A run does not stall before this many sweeps without a better check.
+SWEEP_PATIENCE = 64  # A run stalls only after this many sweeps without a better check.
 
 
 def create_stopping_test(problem: Problem, data: Any, patience: int) -> StoppingTest:
@@ -44,7 +44,7 @@ class SweepState:
     ) -> None:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
-        self.order = self.plan = order  # `plan` is the order of the problem's own blocks.
+        self.order = self.plan = order  # `plan` contains the order of the problem's own blocks.
         get_reference(problem)
         data.share_reference(problem.metric)  # Residuals in every form are relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)

@@ -21,7 +21,7 @@ from lavender_ext.judge.measure import all_finite
 if TYPE_CHECKING:
     pass
 
-COST_PER_SECOND = 0.9e9  # Largest estimated cost [ns] of a compiled call per second of its time limit.
+COST_PER_SECOND = 0.9e9  # A compiled call may have this estimated cost [ns] per second of its time limit.
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
 
@@ -50,7 +50,8 @@ def solve_small(
     if not 0.0 < tol < math.inf or problem.has_singular_program:
         return None, None
     if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
-        return None, None  # Islands may take long: they are solved after the checks of the clock.
+        # Solving the islands may take long, so they are solved after the checks of the clock.
+        return None, None
     fraction = 1.0
     if limit < math.inf:
         fraction = time_fraction(problem, limit)
@@ -72,9 +73,9 @@ def solve_small(
     status = CONVERGED
     if judged.relative > tol:
         if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
-            return None, counts  # Time remains, or rounding hides b next to such impulses.
+            return None, counts  # Either time remains, or rounding hides b next to such large impulses.
         status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol)
-    # The caller may change an impulse array of their own later.
+    # The caller may change their own array later.
     start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)
     solution = Solution.late(
@@ -96,7 +97,7 @@ def compute_postponed_fields(
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
     """Return the fields of the solution of a compiled call that `Solution.late` postpones."""
-    if spec.small is None:  # A world of `solve_many`.
+    if spec.small is None:  # The solution belongs to a world of `solve_many`.
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
         claim = spec.small.claim(problem, counts, start, judged.relative, status)

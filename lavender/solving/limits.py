@@ -52,7 +52,8 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
         and problem.cones.has_ellipse
         and deadline.passed(1e-9 * estimate_judge_setup_cost(problem))
     ):
-        return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
+        # Even the couplings of bodies, which give the number of entries of A, would take too long.
+        return True
     refusal = estimate_refusal_cost(problem) if spec.external else 0.0
     needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
     if (

@@ -94,7 +94,7 @@ def finish(
     elif tol < relative and (
         (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
         or (status is ROUNDOFF_LIMIT and judged._float64_relative < math.inf)
-    ):  # The claim is only true for the first pass of the judge, without refinement.
+    ):  # The claim was true for the first pass of the judge, but is not for the pass with refinement.
         status = STALLED
         message = _joined(
             message,
@@ -289,7 +289,7 @@ def decide_empty_rows(
     cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
     if not len(empty):
         return None
-    # Friction rows are bounded by the normal impulse.
+    # Friction rows have no fixed bounds: the normal impulse bounds them.
     nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if (
         problem.law == "cone"

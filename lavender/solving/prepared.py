@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
     from lavender.solvers.registry import SolverOptions
 
-# `auto` judges its last iterate and selects the best one of each island in as many passes of the judge.
+# `auto` judges its last iterate and selects the best iterate of each island in as many passes of the judge.
 SELECTION_PASSES = 3
 SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
 JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
@@ -157,8 +157,8 @@ class Prepared:
     solver: Any = None  # Created when it is first needed.
     setup_time = 0.0  # [s]
     _is_fresh = True  # No solve has used the state yet.
-    _failure = ""  # Reason why there is no state, or empty.
-    _is_late = False  # There is no state, because building it would have exceeded the time limit.
+    _failure = ""  # Reason why no state exists, or empty.
+    _is_late = False  # Whether no state exists because building it would have exceeded the time limit.
 
     def _prepare_solver(self, deadline: Deadline) -> None:
         """Create the solver and its state."""
@@ -168,7 +168,7 @@ class Prepared:
         try:
             self._set_up(self.problem, True, deadline)
         except BaseException:
-            self.solver = None  # The next call tries again.
+            self.solver = None  # After a failure, the next call tries again.
             raise
         self._is_fresh = True
         self.setup_time += watch.seconds
@@ -399,7 +399,7 @@ class Prepared:
             original, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
             self.setup_time = watch.seconds
-            # Assigned last: a problem does not replace the old one if its set-up raises an error.
+            # These are assigned last, so that a problem does not replace the old one if its set-up raises an error.
             self._original, self.problem = original, problem
         self._is_fresh = False
 
@@ -457,7 +457,7 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
         return ForeignSolver(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:
         return solver
-    # Imported here, because it imports the table of solvers.
+    # This module is imported here, because it imports the table of solvers.
     from lavender.solvers.polyhedral import ThroughRows
 
     return ThroughRows(solver)

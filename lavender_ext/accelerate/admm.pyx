@@ -42,7 +42,7 @@ from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_stric
 
 
 cdef enum:
-    RHO_UPDATE_INTERVAL = 20    # Iterations before the first update of rho. Later ones follow after a quarter of the iterations done.
+    RHO_UPDATE_INTERVAL = 20    # Iterations before the first update of rho; later updates follow after a quarter of those done.
     MAX_CONVEX_ITERATIONS = 200     # Largest number of iterations without De Saxce's shift.
     # Largest c of a block that its bounds hold at zero impulse, over the largest c of the others. Below, a block that the others
     # can make act would keep a wrong c; above 1e6, rho and the mixing lose the digits of the others (|b| up to 1e60 tried).

@@ -29,7 +29,7 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double coulomb_rows         # largest number of rows of an island under Coulomb's law
     double cone_rows            # the same under the cone law with a rigid contact; both limits apply only if
     double dense                # there are fewer than this many rows per velocity
-    double columns              # and no row has more than this many entries: velocities may then belong to bodies (`graph.bodies_in`)
+    double columns              # and no row has more than this many entries: velocities may then be of bodies (`graph.bodies_in`)
     double steps                # largest number of steps of all islands together
 
 

@@ -128,7 +128,7 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
                         double tol, int32_t* done) noexcept nogil:
     """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
     cdef int32_t status, more
-    x.context.w = test.e                                # The stopping test needs its errors during checks only; JACOBI uses the array.
+    x.context.w = test.e                                # The stopping test needs its errors only during checks.
     if test.total == 0:
         compute_sweep_velocities(&x.context, lam)
     if x.packing.single:

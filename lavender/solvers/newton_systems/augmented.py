@@ -35,7 +35,8 @@ class Augmented:
         self.k: Any = None
         self.lu: Any = None
         self.deadline: Deadline = NEVER
-        self.seconds = 0.0  # Time [s] of the next factor: estimated for the first, then that of the last one.
+        # Time [s] of the next factor: an estimate at first, then the time of the last factor.
+        self.seconds = 0.0
 
     def factor(self, what: int, eps: float) -> bool:
         """Factor (1) for the P of the last natural map with eps added to theta, or (2); return whether that succeeded.

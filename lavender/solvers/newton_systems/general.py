@@ -32,7 +32,8 @@ FLOP_TIME = 1e-9 * RATES["work"]["velocities"]  # Time [s] per multiply-add of a
 # fraction of tol.
 MIN_TOLERANCE_RATIO = 1e-2
 MAX_MATRIX_ENTRIES = (
-    9e6  # Largest number of values of an island's N: 3,000 velocities dense, 144 MB with its factor.
+    # Largest number of values of an island's N. 3,000 velocities with a dense N take 144 MB with the factor.
+    9e6
 )
 _STATUS = {
     OUTCOMES["reached"]: Status.CONVERGED,
@@ -41,7 +42,7 @@ _STATUS = {
     OUTCOMES["broken"]: Status.NUMERICAL_ERROR,
     OUTCOMES["lost"]: Status.DIVERGED,
 }
-UNLIMITED_STEPS = 2**31 - 1  # The kernel has no limit of steps; `run` counts them.
+UNLIMITED_STEPS = 2**31 - 1  # The kernel has no limit of steps, because `run` counts the steps.
 _WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
@@ -81,7 +82,7 @@ def run(
     slow = max(SPARSE_TIME_RATIO * step, 1e-9)
     steps = clock = max(
         1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow))
-    )  # Each island counts its own steps.
+    )  # The step limit applies to each island separately.
     if time_limit is not None:
         steps = max(1, int(min(CALL_TIME_FRACTION * time_limit / slow, clock)))
     while counts[0] < max_iter:
@@ -97,7 +98,7 @@ def run(
         if status is Status.CONVERGED:
             judged = judge_impulse(problem, impulse.copy())
         if status is Status.CONVERGED and not judged.relative <= tol:
-            # The kernel rounds sums in another order, and its squares may underflow.
+            # The kernel sums in another order than the judge, and its squares may underflow.
             status = Status.MAX_ITERATIONS if tolerance_ratio > MIN_TOLERANCE_RATIO else Status.STALLED
             tolerance_ratio *= 0.25
             is_continued = False

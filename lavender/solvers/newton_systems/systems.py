@@ -25,7 +25,7 @@ from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled_entries, coupled_rows, element_graph, scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
 
-MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse one.
+MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse factor.
 # Fractions of nonzeros of A above which a dense factor is faster. For the cone law: a full block of s^1/2 m rows has
 # the fraction s, and a multiply-add of a dense factor costs a quarter. It is smaller for bounded rows, of which dense
 # factors use only the free ones, and for Coulomb's law, whose asymmetric matrices lose pivots by panels.
@@ -74,7 +74,7 @@ class System:
     """H of a scaled problem, and the compiled Newton method on it."""
 
     form = ""
-    work = 0.0  # Multiply-adds of one factor.
+    work = 0.0  # Multiply-adds of one factorisation.
     pace = 1e-9  # Upper bound of the time [s] per multiply-add, on any machine of the last ten years.
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
@@ -91,7 +91,7 @@ class System:
         """Start no factor by Python that is expected to end after `deadline`."""
 
     def record_factor_time(self, seconds: float) -> None:
-        """Record the time of the last factor with the steps around it [s], for the estimate of the next one."""
+        """Record the time of the last factorisation with the steps around it [s], to estimate the next time."""
         if self.work > 0.0:
             self.pace = seconds / self.work
 
