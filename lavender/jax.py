@@ -75,7 +75,7 @@ def solve(
     solver: str = "auto",
     tol: float = 1e-10,
 ) -> tuple[Any, Any]:
-    """Compute the velocities after a step and its impulses, with gradients by all arrays.
+    """Compute the velocities and impulses of one step, with gradients by all arrays.
 
     Parameters and results are as for `lavender.torch.solve`, with JAX arrays. The solve runs on the CPU, outside of the
     code that JAX compiles.

@@ -24,11 +24,11 @@ except ImportError as error:
 
 
 class _Solve(torch.autograd.Function):  # type: ignore[misc]
-    """The solve; `vmap` adds a leading batch axis."""
+    """The solve as an autograd function. `vmap` adds a leading batch axis."""
 
     @staticmethod
     def forward(step: Step, *arrays: Any) -> Any:
-        """Solve the step for the velocity after it and its impulses."""
+        """Solve the step; return the velocity after the step, and its impulses."""
         return tuple(map(torch.from_numpy, step.forward(*(x.detach().numpy() for x in arrays))))
 
     @staticmethod
@@ -49,7 +49,7 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
 
 
 class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
-    """The adjoint, which cannot be differentiated again."""
+    """The adjoint of the solve as an autograd function, which cannot be differentiated again."""
 
     @staticmethod
     def forward(step: Step, needed: Any, *arrays: Any) -> Any:
@@ -100,7 +100,7 @@ def solve(
     solver: str = "auto",
     tol: float = 1e-10,
 ) -> tuple[Any, Any]:
-    """Compute the velocities after a step and its impulses, with gradients by all tensors.
+    """Compute the velocities and impulses of one step, with gradients by all tensors.
 
     Parameters
     ----------

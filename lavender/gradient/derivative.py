@@ -265,7 +265,7 @@ class Derivative:
         )
 
     def _check_row_changes(self, message: str) -> None:
-        """Raise CapabilityError if data of single rows cannot change because other rows share their load."""
+        """Raise CapabilityError if data of a single row cannot change because other rows share its load."""
         if not self._system.singular:
             return
         rows = np.flatnonzero(~self.unique.target)
@@ -336,7 +336,7 @@ class Derivative:
         return Gradient(self, (self._linear.adjoint if self._uses_kernel else self._solve_adjoint)(y, c, x))
 
     def _solve_adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
-        """Return q, s (m), f (nv), c (m) of (4), concatenated, with f = y - J^T s; without f for a matrix."""
+        """Return q, s (m), f = y - J^T s (nv) and c (m) of (4), concatenated. A problem given as a matrix has no f."""
         p, rhs = self.problem, c.copy()
         if x is not None:
             rhs += self._apply_a(x, True)
@@ -485,7 +485,7 @@ class Derivative:
 
     @cached_property
     def unique(self) -> Unique:
-        """Which rows of impulse, slack and target are unique; linearly dependent rows can share a load in many ways."""
+        """Uniqueness of impulse, slack and target by row. Linearly dependent rows can share a load in many ways."""
         p, m = self.problem, self.problem.m
         impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
         rows = self._system_rows

@@ -166,7 +166,7 @@ def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver:
 
 @lru_cache(maxsize=256)
 def _reuse_equal_step(step: Step) -> Step:
-    """Return an equal step of an earlier call, if there was one.
+    """Return the equal step of an earlier call if there was one, else this step.
 
     JAX caches compiled callbacks by the identity of their object, so a new object would be compiled in every call.
     """

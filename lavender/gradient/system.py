@@ -110,7 +110,7 @@ class System:
         return sp.csc_array(one - p + p @ (h + shift * one))
 
     def _factor_lu(self, shift: float) -> Solve | None:
-        """Factor G + shift P by SuperLU; None if it is singular."""
+        """Factor G + shift P by SuperLU; return None if it is singular."""
         try:
             lu = factor_sparse_lu(self._form_matrix(shift))
         except RuntimeError:

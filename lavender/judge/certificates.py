@@ -125,7 +125,7 @@ def format_lower_bound(bound: float) -> str:
 def check_certificate(
     problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
 ) -> str | None:
-    """Return why y (m,) does not prove that no impulse meets `tol`; None if it does."""
+    """Return why y (m,) does not prove that no impulse meets `tol`; return None if it proves it."""
     return prove_infeasibility(problem, y, tol, deadline).reason or None
 
 

@@ -99,7 +99,7 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
 
 
 def _project_unit_cone(z: FloatArray, components: Sequence[tuple[slice, float]]) -> FloatArray:
-    """Project z on {|z_g| <= a_g z_n for every component g} in the Euclidean norm: `core/block.pxd` (7)."""
+    """Project z on {|z_g| <= a_g z_n for every component g} in the Euclidean norm, by (7) of `core/block.pxd`."""
     out, normal = z.copy(), max(0.0, float(z[0]))
     size = [float(np.linalg.norm(z[rows])) for rows, _ in components]
     for subset in range(1, 2 ** len(components)):

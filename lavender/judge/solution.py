@@ -384,7 +384,7 @@ class Solution:
         )
 
     def raise_for_status(self) -> Solution:
-        """Return self if the judge accepts the result (within tol, or at the round-off floor of float64).
+        """Return self if the judge accepts the result (within tol, or at the round-off limit of float64).
 
         Raises
         ------

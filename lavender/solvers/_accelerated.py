@@ -50,7 +50,7 @@ class AcceleratedState(SweepState):
 
 @dataclass(frozen=True)
 class Accelerated(Sweeping):
-    """Base class of accelerated sweeps; a `_memory` of 0 is nncg."""
+    """Base class of accelerated sweeps. A `_memory` of 0 selects nncg, other values Anderson acceleration."""
 
     sweep: str | None = None
     convex: int = 0
@@ -76,7 +76,7 @@ class Accelerated(Sweeping):
         return estimate_formation_cost(problem) if over_a else 0.0
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the costs; an iteration is a sweep over the data of `choose_sweep_operator`."""
+        """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
         setup = partial(self._estimate_setup_cost, problem)
         return Cost(setup, lambda: estimate_sweep_cost(problem, count_sweep_work(problem)))
 
@@ -108,7 +108,7 @@ class Accelerated(Sweeping):
 
 
 def build_state_in_given_form(solver: Accelerated, problem: Problem) -> AcceleratedState:
-    """Return the state of sweeps over the form in which the problem was given: A is not formed."""
+    """Return the state of sweeps over the form in which the problem was given, without forming A."""
     return solver._build_state_over_data(problem, compute_block_order(problem, solver.order), problem.metric)
 
 

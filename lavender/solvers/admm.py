@@ -165,7 +165,7 @@ class AdmmState:
         return factor
 
     def _make_factor(self) -> tuple[Any, ...]:
-        """Factor the matrix; use L U, then L U of the full matrix, if that breaks down and is allowed.
+        """Factor the matrix. If that breaks down, try L U, then L U of the full matrix, if these are allowed.
 
         Raises
         ------
@@ -237,7 +237,7 @@ def _analyse_panels(system: LinearSystem) -> LinearSystem:
 
 
 def _factor_system(system: LinearSystem, matrix: Any, shift: float, lu: bool) -> bool:
-    """Factor M = matrix + shift; return whether that succeeded.
+    """Factor M = matrix + shift; return whether the factorisation succeeded.
 
     L U must also solve a test system with a backward error within `BACKWARD_TOLERANCE`:
     max |r - M x| <= BACKWARD_TOLERANCE (max |M_ij| max |x| + max |r|).
@@ -272,11 +272,11 @@ class ADMM(Solver):
     needs_scipy = True
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the cost of `prepare`; the remaining set-up runs in `set_deadline` if it fits, otherwise in `run`."""
+        """Estimate the cost of `prepare`; the remaining set-up runs in `set_deadline` if it fits, else in `run`."""
         return Cost(partial(_estimate_setup_cost, problem))
 
     def prepare(self, problem: Problem) -> AdmmState:
-        """Build the state; the problem is scaled if that takes up to `MAX_SETUP_SCALING_COST`."""
+        """Build the state, and scale the problem if scaling costs at most `MAX_SETUP_SCALING_COST`."""
         import_numerics()
         return AdmmState(problem, self.memory, self.relaxation)
 

@@ -135,7 +135,7 @@ class Count:
     work : float
         Multiply-adds of one factorisation.
     entries : float
-        Numbers that a step reads in addition.
+        Number of additional values that a step reads.
     rows : float
         Number of rows.
     set_up : float, ns
@@ -196,7 +196,7 @@ def count_dense_work(m: int) -> float:
 
 
 def estimate_sparse_work(entries: float, m: int) -> float:
-    """Estimate the multiply-adds of a sparse factor from its size, before an analysis; fill grows with the size."""
+    """Estimate the multiply-adds of a sparse factor from its size, without an analysis. Fill grows with the size."""
     return 100.0 * entries * (1.0 + m / 1000.0)
 
 
@@ -204,7 +204,7 @@ def estimate_sparse_work(entries: float, m: int) -> float:
 
 
 def get_loose_limit(problem: Problem) -> float:
-    """Return a cost [ns] of about a hundred times set-up and judge together, from the number of rows alone."""
+    """Return about a hundred times the cost of set-up and judge together [ns], from the number of rows alone."""
     return LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY * float(len(problem.b)) ** 2
 
 
@@ -270,7 +270,7 @@ def estimate_matrix_setup_cost(problem: Problem) -> float:
 
 
 def estimate_analysis_cost(problem: Problem) -> float:
-    """Estimate the cost of an elimination order of A and its fill [ns]; the rows of a block are one node."""
+    """Estimate the cost to compute an elimination order of A and its fill [ns]; a block is one node."""
     entries, m = problem.max_entries, float(problem.m)
     if entries == m * m:
         return float(RATES["full analysis entry"] * entries)
@@ -288,7 +288,7 @@ def estimate_row_sums_cost(problem: Problem) -> float:
 
 
 def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
-    """Estimate the cost of a first factor of m rows [ns]; sparse if `entries` is given and that is cheaper."""
+    """Estimate the cost of a first factor of m rows [ns], or of a sparse one if `entries` is given and it is cheaper."""
     dense = RATES["dense factor"] * count_dense_work(m)
     return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
 

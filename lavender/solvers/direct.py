@@ -218,7 +218,7 @@ class _Run:
         return relative
 
     def offer(self, result: measure.Judged | None) -> None:
-        """Store a judged iterate if it is the best so far."""
+        """Store a judged iterate if it has the smallest residual so far."""
         if result is not None and result.relative < self.best:
             self.best_pass = result
 

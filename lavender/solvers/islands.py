@@ -32,7 +32,7 @@ def get_rows_of_blocks(problem: Problem, blocks: IntArray) -> IntArray:
 
 
 def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
-    """Return the problem of only these blocks, which must be complete islands.
+    """Return the problem that contains only these blocks. They must form complete islands.
 
     The restriction is exact, except that a b that is negligible in all rows becomes 0.
     """

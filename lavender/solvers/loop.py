@@ -205,7 +205,7 @@ class Loop:
         self.impulse[:] = result.impulse
 
     def _keep_best(self) -> None:
-        """Replace the last iterate by the best one that the solver has checked; with tol = 0, keep the last."""
+        """Replace the last iterate by the best checked iterate. With tol = 0, keep the last iterate."""
         if self.tol == 0.0:
             return
         state: State = self.state

@@ -125,7 +125,7 @@ class NewtonState:
 
     @property
     def cost(self) -> float:
-        """Estimated cost of all steps [ns]."""
+        """Estimated cost of all iterations [ns]."""
         if self.general is not None:
             return estimate_velocity_cost(self.problem, self.general.work)
         return estimate_newton_cost(self.count, self.problem)
@@ -257,7 +257,7 @@ class Newton(Solver):
         time_limit: float | None = None,
         remaining: int | None = None,
     ) -> Claim:
-        """Run about n steps, at most `remaining`, from where the last call ended; the first starts at `impulse` (m,).
+        """Run about n steps, at most `remaining`, continuing the last call. The first call starts at `impulse` (m,).
 
         Over generalised velocities, the row form does not follow.
         """
@@ -325,7 +325,7 @@ class Newton(Solver):
         is_continued: bool = False,
         max_total: int | None = None,
     ) -> Claim:
-        """Run the stages over bodies or rows, after a warm start over bodies; see `_run_stages`."""
+        """Run the stages over bodies or rows (see `_run_stages`). Over bodies, a warm start is tried first."""
         if system is None:
             system = make_system(problem, "impulse")
             impulse[:] = system.solve.fixed

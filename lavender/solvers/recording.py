@@ -76,7 +76,7 @@ class Recorder:
         self.record(claim.stages[-1].solver if claim.stages else "start", claim.iterations, impulse)
 
     def add_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
-        """Record the compiled call that started at `start` (m,) [N s], from calls with smaller limits of its cost."""
+        """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
         problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
         before = self.solve.recording_time
         while claim.iterations > self.records[-1][0]:

@@ -109,7 +109,7 @@ def time_fraction(problem: Problem, seconds: float) -> float:
 
 
 def prepare_call(problem: Problem) -> Any:
-    """Return the compiled call of a small problem or of small islands, cached with the problem, or None."""
+    """Return the compiled call of a small problem or of small islands, or None. The call is cached with the problem."""
     call = problem.derived.cache.get(COMPILED_CALL_KEY)
     if call is None:
         call = problem.derived.cache[COMPILED_CALL_KEY] = _make_call(problem) or False
@@ -117,7 +117,7 @@ def prepare_call(problem: Problem) -> Any:
 
 
 def _make_call(problem: Problem) -> Small | None:
-    """Build the compiled call; None for round cones, rolling or torsional friction, large islands and empty rows."""
+    """Build the compiled call, or None for round cones, rolling or torsional friction, large islands and empty rows."""
     cones, count, label, bounded = problem.cones, 1, None, call_uses_pivots(problem)
     if cones.has_round or cones.has_more_components:
         return None
@@ -171,9 +171,10 @@ class SmallCall:
     limits : Limits or None
         Limits of the cost over generalised velocities; None if it does not accept them.
     pivots : bool
-        It accepts bounded rows.
+        Whether the call accepts bounded rows.
     hands_over : bool
-        It accepts friction, too; a start that is a solution is returned, and a bad start is replaced by zero.
+        Whether the call also accepts friction. It then returns a start that is a solution, and replaces a bad start by
+        zero.
     rules : Rules
         Options of the compiled call.
     """

@@ -81,7 +81,7 @@ def is_sweep_over_jacobian_cheaper(problem: Problem) -> bool:
 
 
 def choose_sweep_data(problem: Problem) -> Any:
-    """Return the data that sweeps use: rows or a matrix as given; for J and M, the cheaper of J and M and A."""
+    """Return the data that sweeps use: rows or a matrix as given. For J and M: these, or A if it is cheaper."""
     return problem.metric if is_sweep_over_jacobian_cheaper(problem) else problem.data
 
 
@@ -134,7 +134,7 @@ class Sweeping(SweepSolver):
         return self._build_state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:
-        """Build the state for new numbers; levels, colours and permutations of a fixed order are reused."""
+        """Build the state for new numbers, and reuse levels, colours and permutations of a fixed order."""
         if not state.plan.is_fixed:
             return self.prepare(problem)
         return self._build_state(problem, state.plan, state)

@@ -30,7 +30,7 @@ MESSAGES = {
 
 
 def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim | None:
-    """Return the claim of `newton` for the code and counts of its first phase; None if that decided nothing."""
+    """Return the claim of `newton` for the code and counts of its first phase; None if the phase decided nothing."""
     message = MESSAGES[code]
     if message is None:
         return None

@@ -94,9 +94,9 @@ def check_time_limit(time_limit: Any) -> float:
 
 
 def make_deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
-    """Create the deadline of a call with a time limit [s].
+    """Create the deadline of a call from its time limit [s].
 
-    Solvers of others, and the modules of SciPy that they need, are imported first, so that this time does not count.
+    Third-party solvers, and the modules of SciPy that they need, are imported first, so that this time does not count.
     """
     if limit == math.inf:
         return NEVER

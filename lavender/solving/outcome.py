@@ -204,7 +204,7 @@ def judge_late_fields(
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
-    """Describe why an iteration without a message of its own found no solution; bad diagonal entries come first."""
+    """Describe why an iteration without its own message found no solution. Bad diagonal entries are reported first."""
     reason = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
     message = f"{reason}, {format_work_count(iterations, 'iterations')}"
     if problem.matrix is None:
@@ -233,7 +233,7 @@ def describe_islands(judged: Residual, tol: float) -> str:
 
 
 def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
-    """Return the claim as DIVERGED, with the first row with a non-finite impulse, if there is one."""
+    """Return the claim; if an impulse is not finite, return it as DIVERGED with the first such row in the message."""
     if claim.status is NUMERICAL_ERROR or all_finite(impulse):
         return claim
     row = int(np.argmin(np.isfinite(impulse)))

@@ -389,7 +389,7 @@ class Prepared:
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
-        """Update the state for another problem, or for another solve of the same one."""
+        """Update the state for another problem, or for another solve of the same problem."""
         if problem is None or problem is self._original:
             if not self._is_fresh:
                 self._set_up(self.problem, False, deadline)

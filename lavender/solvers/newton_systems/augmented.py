@@ -28,7 +28,7 @@ from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
 
 class Augmented:
-    """Factorisation of (1) and (2), which `Solve` calls; K is built at the first call."""
+    """Factorisation of (1) and (2), which the kernel's `Solve` calls. K is built at the first call."""
 
     def __init__(self, kernel: Solve, layout: Layout, bodies: Any) -> None:
         self.kernel, self.layout, self.bodies = kernel, layout, bodies
@@ -39,7 +39,7 @@ class Augmented:
         self.seconds = 0.0
 
     def factor(self, what: int, eps: float) -> bool:
-        """Factor (1) for the P of the last natural map with eps added to theta, or (2); return whether that succeeded.
+        """Factor (2), or (1) for the P of the last natural map with eps added to theta; return whether it succeeded.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class Augmented:
         return succeeded
 
     def _factor_kind(self, what: int, eps: float) -> bool:
-        """Build the blocks of (1) or (2) for the kind `what` and factor them."""
+        """Build and factor the blocks of the system that `what` names, (1) or (2)."""
         s = self.kernel
         if what == SYSTEMS["natural"]:
             p = self._block_matrix(s.p)

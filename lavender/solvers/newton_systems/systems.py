@@ -33,7 +33,7 @@ CONE_DENSE_FRACTION, OTHER_DENSE_FRACTION = 0.4, 0.25
 
 
 def is_dense_faster(nnz: float, m: int, cones: bool) -> bool:
-    """Return whether a dense factor of m rows and nnz entries is faster than panels; `cones` for the cone law."""
+    """Return whether a dense factor of m rows and nnz entries is faster than panels. `cones`: under the cone law."""
     return nnz > (CONE_DENSE_FRACTION if cones else OTHER_DENSE_FRACTION) * m * m
 
 
@@ -97,7 +97,7 @@ class System:
 
 
 class VelocitySystem(System):
-    """K K^T + theta, one block column of s unknowns for each body."""
+    """H = K K^T + theta over the bodies, with one block column of s unknowns for each body."""
 
     form = "velocity"
     pace = 0.5e-9
@@ -122,7 +122,7 @@ class VelocitySystem(System):
 
 
 class MatrixSystem(System):
-    """H as a matrix: dense, or in compressed rows."""
+    """H stored as a matrix, dense or in compressed rows."""
 
     form = "impulse"
     sparse: LinearSystem  # System of a sparse H in the pattern of its elements.
@@ -151,7 +151,7 @@ class MatrixSystem(System):
             self.work = (1.0 if self.symmetric else 2.0) * self.sparse.cost
 
     def _bind_rows(self) -> None:
-        """Give the kernel H in compressed rows, and in the pattern of its elements."""
+        """Pass H to the kernel in compressed rows, and in the pattern of its elements."""
         solve, h = self.solve, self.h
         to, other, indptr, indices, entries = h.indptr, h.indices, h.indptr, h.indices, h.data
         if solve.has_friction or not (is_mirrored(to, other) and h.diagonal().all()):
