@@ -109,7 +109,7 @@ class PivotState:
 
     @property
     def sweeps(self) -> int:
-        """Number of symmetric sweeps that guess the free rows: few for a compiled factor, else depending on its cost."""
+        """Number of symmetric sweeps that guess the free rows: few for a compiled factor, else by its cost."""
         if self.outside is None:
             return MIN_GUESS_SWEEPS
         m, data = self.problem.m, self.problem.csr_data

@@ -80,42 +80,42 @@ cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_ENDED = 3
 
 cdef enum:
-    POINT_REFINEMENTS = 3       # Refinements of the first point with the factor of its weighted system.
+    POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
     EXACT_POINT_REFINEMENTS = 20    # Refinements of linear rows with a factor of nearly no weight, which is less exact.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
-    FIRST_END_FACTORISATIONS = 15   # Budget of the first damped Newton phase after De Saxce's interior point.
-    SECOND_END_FACTORISATIONS = 12  # Budget and inner steps of the second one.
-    MAX_AUGMENTED_ROWS = 10000  # Above this, one factorisation of the augmented system may exceed 0.2 s.
+    FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
+    SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
+    MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
 
 
 cdef inline double first_derivative_fraction() noexcept nogil:
-    """Fraction of phi's derivative in the first De Saxce interior point: near 1 it ends faster, but passes fewer folds."""
+    """Return the part of phi's derivative in the first De Saxce interior point. Near 1 it ends faster, but passes fewer folds."""
     return 0.95
 
 
 cdef inline double second_derivative_fraction() noexcept nogil:
-    """The same after a failure, and first on the augmented system, which has no damped Newton phase to end it."""
+    """Return the fraction after a failure, and first on the augmented system, which no damped Newton phase follows."""
     return 0.7
 
 
 cdef inline double far_from_end() noexcept nogil:
-    """Residual of De Saxce's interior point above which damped Newton does not end it."""
+    """Return the residual of De Saxce's interior point above which no damped Newton phase follows."""
     return 1e-2
 
 
 cdef inline double max_start_gain() noexcept nogil:
-    """Residual, relative to the start, above which damped Newton gives way to an interior point after its first stretch."""
+    """Return the residual, relative to the start, above which an interior point follows the first stretch of damped Newton."""
     return 0.9
 
 
 cdef inline double start_alpha() noexcept nogil:
-    """First proximal weight of damped Newton from the start; 1e-4 to 1e-7 take 2,030 to 2,530 factors of 68."""
+    """Return the first proximal weight of damped Newton from the start; 1e-4 to 1e-7 take 2,030 to 2,530 factors of 68."""
     return 1e-5
 
 
 cdef inline double first_cone_weight() noexcept nogil:
-    """Proximal weight on cones, whose scaling spans more than that of rows; N loses 2^-53 / weight to rounding.
+    """Return the first proximal weight on cones, whose scaling spans more than that of rows; N loses 2^-53 / weight to rounding.
 
     On a redundant pyramid 1e-10 ends at 3e-8 and 1e-8 at 4e-10; 1e-6 takes a step more.
     """
@@ -173,11 +173,11 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
     is_linear = is_inside_bounds(n, z, True)
     if not is_linear and (n.s.form == BODIES or not is_inside_bounds(n, z, False)):
         return
-    # The weight of the first point is refined away with the existing factor.
+    # Refinement with the existing factor removes the effect of the first point's weight.
     copy_vector(n, n.trial, z)
     refine_point(n, n.trial, POINT_REFINEMENTS, 0.1)
     if is_linear and not is_finished(n):
-        # Nearly dependent rows feel that weight. A factor with nearly none is less exact; refinement corrects that.
+        # The weight changes z on nearly dependent rows. A factor with nearly no weight is less exact, which refinement corrects.
         for j in range(n.s.e.m):
             n.s.v[j] = 1.0 / (n.s.e.theta[j] + 1e-12)
         system_factor(&n.s, BARRIER, 0.0)
@@ -186,7 +186,7 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcept nogil:
-    """Begin exchanges from z; an unfinished result of them is no start for the next phase."""
+    """Begin exchanges from z. The next phase does not start from their result if they do not finish."""
     store_earlier_best(n)
     begin_active_set(n, z)
 
@@ -225,7 +225,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
         restore_best_of_all(n)
-        if n.best < 1e-3 and n.has_augmented:           # Nearly dependent rows may prevent the rest.
+        if n.best < 1e-3 and n.has_augmented:           # Nearly dependent rows may prevent further progress.
             n.s.augmented = 1
             begin_interior_point(n, augmented_shift(), 0.0)
             n.s.augmented = 0

@@ -54,7 +54,7 @@ cdef enum:
 
 
 cdef inline double max_roundoff_residual() noexcept nogil:
-    """Relative residual above which the round-off limit is not computed, since rounding alone does not explain it."""
+    """Return the relative residual above which rounding cannot be the only cause, so that the round-off limit is not computed."""
     return 1e-5
 
 
@@ -387,7 +387,7 @@ cdef inline double judge_point(newton_t* n, const double* z, bint floor) noexcep
 
 
 cdef inline double score_point(newton_t* n, const double* z) noexcept nogil:
-    """Judge z; keep it if it is the best point, and keep the best impulse of each island.
+    """Judge z and return its residual. Keep z if it is the best point so far, and keep the best impulse of each island.
 
     The best impulses of the islands together may be within tol before a single point is.
     """
@@ -411,7 +411,7 @@ cdef inline double convex_residual(newton_t* n, const double* z, const double* h
 
 
 cdef inline bint is_budget_spent(const newton_t* n) noexcept nogil:
-    """Return whether no factorisation may follow."""
+    """Return whether no further factorisation is allowed."""
     return n.s.factorisations >= n.budget or n.stop
 
 

@@ -28,11 +28,11 @@ cdef struct scaled_t:
     double* scale               # (m) D^-1/2
     double* speed               # (m) velocity error per unit of the natural map
     int32_t small               # entries of the elements' small matrices
-    int32_t whole               # no row is fixed
+    int32_t whole               # whether no row is fixed
 
 
 cdef inline bint is_known(const blocks_t* p) noexcept nogil:
-    """Return whether the problem has no round cones of more than two tangents."""
+    """Return whether the method accepts the problem: no round cones of more than two tangents."""
     cdef int32_t i
     for i in range(p.n_blocks):
         if is_round_cone_contact(p, i):
@@ -71,7 +71,7 @@ cdef inline double row_compliance(const view_t* v, int32_t j) noexcept nogil:
 
 
 cdef inline bint is_empty_row(const view_t* v, int32_t i, int32_t j) noexcept nogil:
-    """Return whether row j of A, of block i, has no non-zero entry."""
+    """Return whether row j of A, which belongs to block i, has no non-zero entry."""
     cdef const rows_t* r = v.r
     cdef int32_t q, b
     cdef double x = fabs(row_compliance(v, j))
@@ -122,7 +122,7 @@ cdef inline int64_t scaled_real_size(int64_t m) noexcept nogil:
 
 
 cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
-    """Assign places in index (`scaled_index_size`) for at most m rows."""
+    """Bind the integer arrays for at most m rows to `index` (`scaled_index_size` int32)."""
     s.keep = index
     s.block = index + m
     s.e.ptr = index + 2 * m
@@ -137,7 +137,7 @@ cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) 
 
 
 cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) noexcept nogil:
-    """Assign places in real (`scaled_real_size`)."""
+    """Bind the arrays of doubles for at most m rows to `real` (`scaled_real_size` doubles)."""
     s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
     s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
     s.e.reach = real + 7 * m

@@ -79,7 +79,7 @@ cdef struct state_t:            # at the beginning of the integer workspace
 
 
 cdef inline int64_t head() noexcept nogil:
-    """Return the size of `state_t` in int32."""
+    """Return the size of `state_t`, as a number of int32."""
     return sizeof(state_t) // sizeof(int32_t)
 
 
@@ -88,7 +88,7 @@ cdef inline newton_t* state_of(const workspace_t* r) noexcept nogil:
 
 
 cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) noexcept nogil:
-    """Start from lam (m); the workspace is bound."""
+    """Start from lam (m). The workspace must be bound before."""
     n.tol, n.budget = o.tol, o.budget
     set_reference(&n.problem, o.e0, o.v0)
     newton_start(n, lam)
@@ -112,7 +112,7 @@ cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t*
 
 
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
-    """Write sizes that suffice for any values: no row is fixed, and all contacts have six rows with friction."""
+    """Write the workspace sizes for the largest case: no row is fixed, and all contacts have six rows with friction."""
     cdef int64_t m = v.p.n_rows
     r.n_index = head() + method_index_size(m)
     r.n_real = judge_workspace_size(&v.p, NULL, NULL) + method_real_size(m, 6 * m) + 2 * m * m + dense_workspace_size(m, True) + 8
@@ -191,7 +191,7 @@ cdef int32_t call_factor(void* at, int32_t what, double eps) noexcept with gil:
     cdef Solve self = <Solve>at
     try:
         return bool(self.others.factor(what, eps))
-    except BaseException as error:                      # The step ends and its caller raises, also for Ctrl-C.
+    except BaseException as error:                      # The step ends, and its caller raises the error, also for Ctrl-C.
         self.raised = error
         self.n.stop = 1
         return 0
@@ -349,7 +349,7 @@ cdef class Solve(Method):
         bind_dense_system(self.n, wide and has_wide(), &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
 
     def over_entries(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
-        """Use H in compressed rows, and its system `linear` over the rows of the graph (to, other) of elements.
+        """Use H in compressed rows. Its linear system `linear` has the pattern of the graph (to, other) of elements.
 
         h has the entries of H in these rows, diagonal (m,) those on the diagonal.
         """
@@ -415,7 +415,7 @@ cdef class Solve(Method):
             begin(self.n, &self.options, &impulse[0])
 
     def step(self, int work, double[::1] impulse):
-        """Do `work` factorisations or a few more; return the outcome, and write the best impulse (rows,)."""
+        """Do `work` factorisations or a few more. Write the best impulse (rows,) to `impulse`; return the outcome."""
         self.interrupt.stopped = 0
         if self.linear is not None:
             self.linear.interrupt.stopped = 0
@@ -478,7 +478,7 @@ cdef class Solve(Method):
 
     @property
     def sign(self):
-        """Sign of the determinant of the last "natural" factor; 0 of a sparse or the augmented system."""
+        """Sign of the determinant of the last "natural" factor; 0 for a sparse or the augmented system."""
         return determinant_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):
@@ -537,7 +537,7 @@ cdef class Solve(Method):
         return phi_array, psi_array
 
     def combine_pair(self, double fraction):
-        """Compute De Saxce's small matrices of the interior point into pair or v; return psi (m,)."""
+        """Compute the small matrices of De Saxce's form at the interior point, into pair or v; return psi (m,)."""
         multiply_duals(self.n.s.e, &self.n.ip, self.n.u)
         normal_shifts(self.n.s.e, self.n.u, fraction, self.n.c, self.n.psi)
         combine_pair(&self.n.s, self.n.psi)

@@ -39,7 +39,7 @@ from lavender_ext.newton.system cimport (BARRIER, PAIR, set_first_weights, syste
 
 
 cdef inline double proximal_weight() noexcept nogil:
-    """Proximal weight of an interior point, as a fraction of d.
+    """Return the proximal weight of an interior point, as a fraction of d.
 
     A larger weight changes the steps; a smaller one is lost in the rounding of a pivot (2^-53).
     """
@@ -47,7 +47,7 @@ cdef inline double proximal_weight() noexcept nogil:
 
 
 cdef inline double unreachable_fraction() noexcept nogil:
-    """Fraction of |z|^2 below which g counts as unreachable by H.
+    """Return the fraction of |z|^2 below which g counts as unreachable by H.
 
     The first point is then the least-squares solution. Fractions of 1e-4 to 0.1 take the same steps.
     """
@@ -55,12 +55,12 @@ cdef inline double unreachable_fraction() noexcept nogil:
 
 
 cdef inline double first_dual_fraction() noexcept nogil:
-    """First duals as a fraction of the first impulses; fractions of 0.001 to 1 take about the same steps."""
+    """Return the first duals as a fraction of the first impulses; fractions of 0.001 to 1 take about the same number of steps."""
     return 0.01
 
 
 cdef inline double step_damping() noexcept nogil:
-    """Fraction of the step to the boundary that an interior point takes (Mehrotra 1992: just below 1)."""
+    """Return the fraction of the step to the boundary that an interior point takes (Mehrotra 1992: just below 1)."""
     return 0.995
 
 
@@ -74,7 +74,7 @@ cdef inline bint has_only_free_rows(const elements_t* e) noexcept nogil:
 
 
 cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
-    """Return whether any row has no bounds, as the rows of joints."""
+    """Return whether any row has no bounds, which is the case for rows of joints."""
     cdef int32_t i
     for i in range(n.s.e.n):
         if is_row(n.s.e, i) and not has_lower_bound(n.s.e, n.s.e.ptr[i]) and not has_upper_bound(n.s.e, n.s.e.ptr[i]):
@@ -131,7 +131,7 @@ cdef inline void multiply_duals(const elements_t* e, const interior_t* p, double
 
 
 cdef inline double contact_shift(const elements_t* e, int32_t i, const double* s, double fraction, double* psi) noexcept nogil:
-    """Return phi of one contact's s; write `fraction` times its derivative to psi."""
+    """Return phi for the slack s of one contact; write `fraction` times the derivative of phi to psi."""
     cdef int32_t k, g, first, n
     cdef double t, a, phi = 0.0
     psi[0] = 0.0
@@ -203,7 +203,7 @@ cdef inline void combine_pair(system_t* s, const double* psi) noexcept nogil:
 
 
 cdef inline bint interior_step(newton_t* n) noexcept nogil:
-    """Take one predictor-corrector step and compute its errors; return False if the factorisation or the step fails."""
+    """Take one predictor-corrector step and compute the errors after it; return False if the factorisation or the step fails."""
     cdef system_t* s = &n.s
     cdef interior_t* p = &n.ip
     cdef const elements_t* e = s.e
@@ -217,7 +217,7 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
         combine_pair(s, n.psi)
     if not system_factor(s, what, 0.0) and not gap - gap == 0.0:
         return False
-    # Predictor; its q is u itself.
+    # Predictor, for which q of (3) is u itself.
     for j in range(e.m):
         n.r[j] = e.g[j] - p.hz[j]
         if what == PAIR:

@@ -32,7 +32,7 @@ cdef enum:                      # forms
     DENSE = 1
     SPARSE = 2
 
-cdef enum:                      # systems (1), (2), (3)
+cdef enum:                      # kinds of system: (1), (2), (3) above
     BARRIER = 0
     PAIR = 1
     NATURAL = 2
@@ -52,13 +52,13 @@ cdef struct system_t:
     int32_t symmetric           # A is symmetric
     int32_t augmented           # the augmented system is factored and solved at present
     int32_t factorisations
-    int32_t n_free              # rows of the last dense matrix, -1: all
-    int32_t law                 # of the last natural map
+    int32_t n_free              # number of rows of the last dense matrix; -1: all rows
+    int32_t law                 # law of the last natural map
     const elements_t* e
     linear_t* linear            # the matrix of (1), (2) or (3)
     const double* h             # (m, m) DENSE
-    csr_t a                     # H, SPARSE
-    coupled_t coupled           # the same in the pattern of the elements
+    csr_t a                     # H in compressed rows, SPARSE
+    coupled_t coupled           # H in the pattern of the elements, SPARSE
     const external_t* others    # or NULL
     double* multiplied          # (m, m) DENSE with cones: L H, in the place of L L^T
     int32_t* free               # (m) rows of the last dense matrix
@@ -73,7 +73,7 @@ cdef struct system_t:
 
 
 cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
-    """Return the number of doubles of L L^T, or with cones of L H."""
+    """Return the number of doubles that store L L^T, or L H if the problem has cones."""
     return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
@@ -249,7 +249,7 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
 
 
 cdef inline int32_t determinant_sign(const system_t* s) noexcept nogil:
-    """Return the sign of the determinant of the last (3); 0 if it is not known."""
+    """Return the sign of the determinant of the last matrix (3); 0 if it is not known."""
     return 0 if s.augmented or s.form == SPARSE else linear_sign(s.linear)
 
 
@@ -348,7 +348,7 @@ cdef inline void natural_times(system_t* s, const double* dz, double* out) noexc
 
 
 cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
-    """Solve (3) and refine its eps away; r, dx (m) are scratch."""
+    """Solve (3) with refinement, which removes the effect of eps; r, dx (m) are scratch."""
     cdef int32_t j, _, m = s.e.m
     cdef double left, last = 1.0 / 0.0, size = norm_inf(rhs, m)
     solve_natural(s, rhs, x)

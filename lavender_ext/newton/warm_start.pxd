@@ -18,10 +18,10 @@ from lavender_ext.core.view cimport rows_t
 cpdef enum:
     FIRST_SWEEP_CHECK = 4       # First check of (2). Earlier ones leave a residual just below tol: the next step starts above it.
     MIN_SWEEPS_TO_GIVE_UP = 16  # From this many sweeps on, the prediction of (2) is reliable.
-    MAX_WARM_SWEEPS = 64        # With more sweeps Newton's method is faster.
-    MAX_WARM_ROWS = 200000      # Above this, the sweeps may take more than a fraction of a second.
-    MAX_BAND_WIDTH = 48         # Above this width of the band, (3) is not used.
-    MAX_TRACED_SCORES = 256     # scores of one solve that are stored
+    MAX_WARM_SWEEPS = 64        # If more sweeps are needed, Newton's method is faster.
+    MAX_WARM_ROWS = 200000      # With more rows, the sweeps may take more than a fraction of a second.
+    MAX_BAND_WIDTH = 48         # If the band of A is wider, (3) is not used.
+    MAX_TRACED_SCORES = 256     # Largest number of judged impulses of one solve that are traced.
 
 cpdef enum:                     # results
     UNDECIDED = 0
@@ -34,11 +34,11 @@ cpdef enum:                     # results
 cdef struct warm_t:
     double* start               # (m) lam at the start
     double* band                # (m, width) band of A
-    double* slack               # (m) w of the last scored impulse
-    double* error               # (m) e of the last scored impulse
+    double* slack               # (m) slack w of the last judged impulse
+    double* error               # (m) error e of the last judged impulse
     int32_t* last_joint         # (n_bodies) last joint on a body
     int32_t* previous_joint     # (2 joints) previous joint on the same body: 2 joint + side, or -1
-    int32_t width               # of the band, 0 if (3) does not apply
+    int32_t width               # width of the band; 0 if (3) does not apply
     int32_t sweeps
     int32_t factorisations
     double relative             # relative residual of lam

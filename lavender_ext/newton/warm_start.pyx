@@ -23,7 +23,7 @@ from lavender_ext.sweep.pgs cimport sweep_bodies_in_sequence
 
 
 cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """Compute E0, V0 of lam = 0, w = -b; return 0 if the judge may use another reference."""
+    """Compute the errors E0, V0 of lam = 0, for which w = -b; return 0 if the judge may use another reference."""
     cdef int32_t i, j
     cdef double e, rhs = 0.0, min_diagonal = 1.0 / 0.0, inf = 1.0 / 0.0
     cdef tally_t s = make_empty_tally()
@@ -63,7 +63,7 @@ cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s,
 
 
 cdef inline void store_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
-    """Store the work, energy and max |e_n| of a score; it replaces an earlier score after the same work."""
+    """Store the work, energy and max |e_n| of a judged impulse in the trace, in place of an earlier one after the same work."""
     cdef int32_t i
     cdef double x, big = 0.0, work = s.sweeps + s.factorisations
     cdef double* out
@@ -89,7 +89,7 @@ cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, 
     score_given_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
         store_score(p, r, s, x.energy)
-    if x.relative >= 0.0:                               # The residual of the worst island.
+    if x.relative >= 0.0:                               # This is the residual of the worst island.
         return x.relative
     return relative_residual(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 

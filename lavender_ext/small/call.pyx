@@ -378,7 +378,7 @@ cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t*
 
 cdef inline int32_t number_island_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number,
                                          int32_t* body) noexcept nogil:
-    """Assign indices to the bodies of k blocks by appearance: `body` lists them, `number` is the inverse. Return their count."""
+    """Number the bodies of k blocks in the order of appearance, in `body`; `number` is the inverse. Return their count."""
     cdef const int32_t* two
     cdef int32_t i, side, n = 0
     for i in range(k):

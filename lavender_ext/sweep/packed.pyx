@@ -124,7 +124,7 @@ cdef inline int32_t compute_schedule_levels(const blocks_t* p, const rows_t* r, 
 
 cdef inline int32_t delay_wide_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, plan_t* x, int32_t t,
                                    int32_t* n_levels) noexcept nogil:
-    """Give a later start to bodies with blocks that span more levels than necessary; return the T of the new levels."""
+    """Let bodies whose blocks span more levels than necessary begin later; return the T of the new levels."""
     cdef int32_t i, shortest = p.n_blocks // BLOCKS_PER_SLOT, _round
     for i in range(r.n_bodies):
         if x.n_blocks[i] > shortest:

@@ -98,7 +98,7 @@ cdef void sweep_matrix_sor(const blocks_t* p, const csr_t* a, double omega, cons
 
 
 cdef void sweep_jacobi(const blocks_t* p, const double* w, double omega, double* lam) noexcept nogil:
-    """Update all blocks with the slacks w (m) of before the sweep, and steps multiplied by omega (Jacobi)."""
+    """Update all blocks with the slacks w (m) computed before the sweep, and steps multiplied by omega (Jacobi)."""
     cdef stored_slack_t form = stored_slack_t(w, omega)
     sweep_blocks(p, &form, NULL, p.n_blocks, lam, NULL)
 

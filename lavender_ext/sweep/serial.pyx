@@ -41,7 +41,7 @@ cdef enum:
 
 
 cdef bint pack_blocks_of_long_run(sweep_context_t* c, const double* lam, int64_t sweeps) noexcept nogil:
-    """Pack the blocks if a run of this length pays for it; return whether they are packed."""
+    """Pack the blocks if a run of `sweeps` sweeps is long enough for that; return whether the blocks are packed."""
     cdef packing_t* x = c.packing
     if not ALL_SWEEPS or x == NULL:
         return False
@@ -53,7 +53,7 @@ cdef bint pack_blocks_of_long_run(sweep_context_t* c, const double* lam, int64_t
 
 
 cdef void compute_sweep_velocities(const sweep_context_t* c, const double* lam) noexcept nogil:
-    """Compute the velocities v of lam (m); there are none over A."""
+    """Compute the velocities v of lam (m). Sweeps over A have no velocities."""
     if c.general != NULL:
         multiply_whitened_transpose(c.general, lam, c.v)
     elif c.n_v > 0:
@@ -96,7 +96,7 @@ cdef bint can_pack_blocks(const sweep_run_t* x, const view_t* v) noexcept nogil:
 
 
 cdef int32_t count_sweep_velocities(const view_t* v) noexcept nogil:
-    """Return the number of velocities that sweeps over v keep."""
+    """Return the number of velocities that sweeps over the problem v store."""
     return v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
 
 
