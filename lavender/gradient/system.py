@@ -25,7 +25,7 @@ SHIFT_OF_SINGULAR = 1e-11
 # Number of proximal steps of (6). Each divides the error of a component by 1 + pivot / shift: eight steps leave 2^-8 if
 # its pivot is as large as the shift, and 1e-16 if it is 100 times as large.
 MAX_PROXIMAL_STEPS = 8
-# The iteration (6) ends if a step changes x by at most this fraction of its largest entry.
+# The iteration (6) ends if a step changes x by up to this fraction of its largest entry.
 MIN_PROXIMAL_CHANGE = 1e-14
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
 MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.

@@ -54,7 +54,7 @@ __all__ = [
 
 UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
-# |z| counts as rounding if it is at most this fraction of b.y. The floor of a solution (2) is then above 1e-6.
+# |z| counts as rounding if it does not exceed this fraction of b.y. The floor of a solution (2) is then above 1e-6.
 MAX_ROUNDING_SLACK = 1e-10
 SAFE_SUM_RATIO = 1e3  # A sum above this multiple of its rounding bound is not recomputed exactly.
 MAX_POLISHED_SLACK = (

@@ -58,7 +58,7 @@ _START_RHO = 0.1  # First penalty rho. B has unit diagonal, so its scale is 1. T
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# `prepare` scales the problem if scaling is estimated to cost at most this [ns]; otherwise `run` does.
+# `prepare` scales the problem if the estimated cost of scaling does not exceed this [ns]; otherwise `run` does.
 MAX_SETUP_SCALING_COST = 5e6
 # Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
@@ -276,7 +276,7 @@ class ADMM(Solver):
         return Cost(partial(_estimate_setup_cost, problem))
 
     def prepare(self, problem: Problem) -> AdmmState:
-        """Build the state, and scale the problem if scaling costs at most `MAX_SETUP_SCALING_COST`."""
+        """Build the state, and scale the problem unless scaling costs more than `MAX_SETUP_SCALING_COST`."""
         import_numerics()
         return AdmmState(problem, self.memory, self.relaxation)
 

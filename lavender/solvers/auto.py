@@ -283,7 +283,7 @@ class Tree:
         return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
 
     def factorisations(self, times: float) -> Iterator[Stage]:
-        """Yield stages of the factorising solvers; each costs at most this multiple of the cheapest solver's cost."""
+        """Yield stages of the factorising solvers; each costs up to this multiple of the cheapest solver's cost."""
         budget = times * self.newton
         for name, cost in self.solver_costs.items():
             if cost <= budget:

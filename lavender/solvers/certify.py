@@ -41,7 +41,7 @@ from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import residuals_by_island
 
-# Linear programs are used if all islands together have at most this many rows.
+# Linear programs are used if all islands together have up to this many rows.
 CERTIFICATE_ROWS = 3000
 LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.

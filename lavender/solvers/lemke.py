@@ -98,7 +98,7 @@ class Lemke(Solver):
     def _follow_paths(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
-        """Do at most `max_iter` pivots and return the claim; the clock is checked after each `chunk` pivots."""
+        """Do up to `max_iter` pivots and return the claim; the clock is checked after each `chunk` pivots."""
         rows, message = state.rows, ""
         certificate: FloatArray | None = None
         while True:

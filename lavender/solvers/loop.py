@@ -47,7 +47,7 @@ FIRST_CHUNK_ITERATIONS = 256
 Callback = Callable[[int, FloatArray, Residual], Any]
 # The fields are iterations, time [s], relative residual, energy error and velocity error.
 Record = tuple[int, float, float, float, float]
-# An impulse outside its bounds by at most this relative distance counts as inside: projections round as much.
+# An impulse outside its bounds by up to this relative distance counts as inside: projections round as much.
 BOUND_ROUNDING = 1e-12
 EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 

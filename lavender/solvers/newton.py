@@ -65,7 +65,7 @@ FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of the row form.
 VELOCITY_MAX_COST_RATIO = 10.0
 MAX_FORMED_ROWS = (
-    # If the velocity form fails, A is formed and the row form continues if A has at most this many rows.
+    # If the velocity form fails, A is formed and the row form continues if A has up to this many rows.
     3000
 )
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
@@ -75,7 +75,7 @@ _ENDS = {
     OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["stuck"]: Status.STALLED,
 }
-# The row form starts from the result of the velocity form if its relative residual is at most this,
+# The row form starts from the result of the velocity form if its relative residual does not exceed this,
 # otherwise from the default start.
 WARM_START_MAX_RESIDUAL = 1e-3
 

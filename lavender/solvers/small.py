@@ -44,7 +44,7 @@ NO_WORK_MESSAGES = {
     Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
 }
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
-# Newton's method starts from an iterate if its relative residual is at most this.
+# Newton's method starts from an iterate if its relative residual does not exceed this.
 WARM_START_MAX_RESIDUAL = 1e-3
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
 # If an island has at least this many rows per velocity, the matrix N is full, and small compared with the data

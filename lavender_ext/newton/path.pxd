@@ -107,7 +107,7 @@ cdef enum:
     N_PATHS = 3                 # ratios c that are tried
     MAX_PATH_FACTORISATIONS = 600   # Budget of one path; most end within 300.
     MAX_START_STEPS = 15        # Newton steps at one first tau.
-    MAX_TAU_RAISES = 3          # The first tau is raised at most this often: contacts of towers carry up to some hundred times g.
+    MAX_TAU_RAISES = 3          # The first tau is raised up to this often: contacts of towers carry up to some hundred times g.
     MAX_CORRECTIONS = 4         # Newton steps of one point; if more are needed, the step is halved instead.
     MAX_REPEATED_CORRECTIONS = 4    # Newton steps that correct the last point further.
     HALVINGS_TO_REPEAT = 2      # Halvings of a step before the last point is corrected further.

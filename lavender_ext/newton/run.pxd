@@ -132,7 +132,7 @@ cdef struct stretches_t:        # a damped Newton phase that continues as long a
 cdef struct de_saxce_t:
     double derivative_fraction
     double next_fraction        # fraction of phi's derivative in a second interior point; 0: there is no second one
-    double max_residual         # damped Newton follows only if the relative residual is at most this
+    double max_residual         # damped Newton follows only if the relative residual does not exceed this
     int32_t stage
     int32_t augmented
 

@@ -122,7 +122,7 @@ cdef inline int64_t scaled_real_size(int64_t m) noexcept nogil:
 
 
 cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
-    """Bind the integer arrays for at most m rows to `index` (`scaled_index_size` int32)."""
+    """Bind the integer arrays for up to m rows to `index` (`scaled_index_size` int32)."""
     s.keep = index
     s.block = index + m
     s.e.ptr = index + 2 * m
@@ -137,7 +137,7 @@ cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) 
 
 
 cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) noexcept nogil:
-    """Bind the arrays of doubles for at most m rows to `real` (`scaled_real_size` doubles)."""
+    """Bind the arrays of doubles for up to m rows to `real` (`scaled_real_size` doubles)."""
     s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
     s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
     s.e.reach = real + 7 * m

@@ -202,7 +202,7 @@ cdef inline int32_t step_guess_and_exchanges(direct_t* t, int32_t max_rounds) no
 
 
 cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do at most `max_rounds` rounds."""
+    """Do up to `max_rounds` rounds."""
     return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds))
 
 
@@ -260,7 +260,7 @@ cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t step_proximal_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do at most `max_rounds` rounds of a pass; the header has its results."""
+    """Do up to `max_rounds` rounds of a pass; the header has its results."""
     cdef int32_t code, i
     if t.is_pass_over and t.passes == MAX_PASSES:
         return PASSES_USED
@@ -407,7 +407,7 @@ cdef inline int32_t choose_state_after_exchanges(direct_t* t, int32_t code) noex
 
 
 cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do at most `max_rounds` rounds of the present state; the header has states and results."""
+    """Do up to `max_rounds` rounds of the present state; the header has states and results."""
     cdef int32_t code
     if t.state == GUESS or t.state == EXCHANGE:
         if t.linear:
@@ -528,7 +528,7 @@ cdef class Pivoting:
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
     def advance(self, int max_rounds):
-        """Do at most `max_rounds` rounds, refine and judge; return the result of the step (table in direct.pyx)."""
+        """Do up to `max_rounds` rounds, refine and judge; return the result of the step (table in direct.pyx)."""
         cdef int32_t code
         with nogil:
             code = step_direct_solve(&self.t, max_rounds)

@@ -485,7 +485,7 @@ cdef void begin_lemke_solve(lemke_t* l) noexcept nogil:
 
 
 cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
-    """Do at most `pivots` further pivots; return DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
+    """Do up to `pivots` further pivots; return DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
 
     Several short calls give the same bits as one long call.
     """
@@ -545,7 +545,7 @@ cdef class Lemke:
         begin_lemke_solve(&self.l)
 
     def run(self, int pivots):
-        """Do at most `pivots` further pivots; return DONE, PIVOTS, RAY or LATE."""
+        """Do up to `pivots` further pivots; return DONE, PIVOTS, RAY or LATE."""
         cdef int32_t code
         with nogil:
             code = follow_lemke_paths(&self.l, pivots)

@@ -143,7 +143,7 @@ cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint t
 
 
 cdef inline int32_t count_remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
-    """Return the number of rounds of the next step: at most MAX_PASS_EXCHANGES, and at most `max_rounds` in total."""
+    """Return the number of rounds of the next step: up to MAX_PASS_EXCHANGES, and up to `max_rounds` in total."""
     cdef double remaining = max_rounds - t.s.n_rounds
     return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
 

@@ -21,7 +21,7 @@ from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 cdef enum:
     MIXING_MEMORY = 5           # number of sweeps that Anderson mixing combines
     MIN_CHECK_INTERVAL = 4      # Sweeps before the first check of the residual. Later checks follow after half as many as are done.
-    FIRST_FACTORISATIONS = 12   # Newton's method does at most this many factorisations before sweeps continue.
+    FIRST_FACTORISATIONS = 12   # Newton's method does up to this many factorisations before sweeps continue.
     RESUMED_SWEEP_RATIO = 8     # The sweeps after them end at this multiple of `max_sweeps` in total.
     MAX_SUBPROBLEM_FACTORISATIONS = 120    # largest number of factorisations of one subproblem
     EXTRAPOLATION_FACTOR = 4    # Sweeps continue if the present rate reaches tol within this multiple of the remaining checks.

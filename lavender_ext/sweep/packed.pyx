@@ -42,7 +42,7 @@ cdef enum:                      # doubles of workspace: a record and four int32 
 cdef enum:
     SLOT_LIMIT = 32768          # a number above the number of slots; `place` of a block is SLOT_LIMIT * stage + slot
     MIN_BLOCKS_PER_SLOT = 2     # Orders with fewer blocks per slot are not packed: pairs would be half empty.
-    BLOCKS_PER_SLOT = 6         # T is extended until slots have at most this many blocks on average, enough to hide the latency.
+    BLOCKS_PER_SLOT = 6         # T is extended until slots have up to this many blocks on average, enough to hide the latency.
     MAX_SHORTENING_ROUNDS = 3   # largest number of times that levels are computed again to shorten T
 
 
