@@ -201,7 +201,9 @@ def _load_problem(records: Records, record: Record) -> lv.Problem:
         The records have no source, or the source has changed.
     """
     if record.case not in records.cases:
-        raise InputError("the records do not name its source")
+        raise InputError(
+            f"the records do not name the source of {record.case!r}: write them anew with `lavender report`"
+        )
     source = records.cases[record.case].source
     problem = bench.resolve_sources([source])[0].problem
     present_hash = hash_problem(problem)

@@ -117,7 +117,7 @@ def is_accepted_by_library(problem: Problem, solver: str) -> bool:
 
 
 def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
-    """Return (order, memory, sweep, convex, keeps) and omega for the options of a solver.
+    """Encode the options of a solver as five integers (order, memory, sweep, convex, keeps of `lav_options`) and omega.
 
     Raises
     ------

@@ -550,7 +550,7 @@ class Derivative:
 
     @cached_property
     def switching(self) -> tuple[int, ...]:
-        """Blocks within ten estimated errors of another state.
+        """Indices of the blocks within ten estimated errors of another state.
 
         If there are any, several derivatives exist; this one belongs to the present states (`states[i].name`).
         """

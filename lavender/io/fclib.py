@@ -294,7 +294,10 @@ class _Reader:
         """Read a single 32-bit integer."""
         data = self.find_dataset(path, "iu", 1)
         if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
-            raise InputError(f"{path} is one number in a chunk of {_get_chunk_length(data)}")
+            raise InputError(
+                f"{path} is one number stored in a chunk of {_get_chunk_length(data)}; up to "
+                f"{MAX_SCALAR_CHUNK_NUMBERS} are read: write it without chunks"
+            )
         value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
             raise InputError(f"{path} is {value}; a signed 32-bit integer is needed")

@@ -122,7 +122,7 @@ class States(Sequence[State]):
 
     @property
     def boundary(self) -> tuple[int, ...]:
-        """Blocks with an uncertain state (`State.at_boundary`), including blocks without an error bound."""
+        """Indices of blocks with uncertain states (`State.at_boundary`), including blocks without an error bound."""
         return tuple(int(i) for i in np.flatnonzero((self.margin <= self.tolerance) & (self.margin < np.inf)))
 
     @property

@@ -288,7 +288,7 @@ def estimate_row_sums_cost(problem: Problem) -> float:
 
 
 def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
-    """Estimate the cost of a first factor of m rows [ns], dense, or sparse if `entries` is given and that is cheaper."""
+    """Estimate the cost of a first factor of m rows [ns], dense, or sparse if `entries` is given and less work."""
     dense = RATES["dense factor"] * count_dense_work(m)
     return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
 

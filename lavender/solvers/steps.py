@@ -63,7 +63,7 @@ def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
 class Step:
     """A solver that runs on the problem of a log.
 
-    `over` is set if it cannot continue, `late` if it has no time. It stops if it predicts that more than `least`
+    `over` is set if the step cannot continue, `late` if it has no time. It stops if it predicts that more than `least`
     iterations remain.
     """
 
@@ -235,7 +235,7 @@ class Sweeps(Iterations):
                 return claim
 
     def finish(self) -> None:
-        """Sweep for all of the remaining time."""
+        """Sweep until the remaining time is used up."""
         self.time_fraction, self.least = 1.0, np.inf
         self.run(np.inf)
         self.log.timed_out = self.late

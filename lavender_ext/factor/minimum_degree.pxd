@@ -156,7 +156,7 @@ cdef inline int32_t begin_graph(quotient_t* g, const int32_t* size, int32_t* int
 
 cdef inline void minimum_degree_order(int32_t n, const int32_t* size, int32_t workspace, int32_t* list, int32_t* integers,
                                       int64_t* outside, int32_t* head, int32_t* order) noexcept nogil:
-    """Write to order (n) the vertex that is eliminated first, second, ...
+    """Write the vertices in the order of their elimination to order (n).
 
     list (workspace) has the neighbours of vertex i, without itself, at list[integers[i]:integers[i + 1]]; workspace is at least
     their number plus n. size (n) > 0 are weights. integers (8 n + 1), outside (n) and head (sum of size + 1) are scratch.

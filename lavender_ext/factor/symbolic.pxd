@@ -13,7 +13,7 @@ cdef inline double max_zero_fraction() noexcept nogil:
 
 cdef inline void block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent, int32_t* mark,
                             int32_t* row_count, int32_t* column_count) noexcept nogil:
-    """Compute the elimination tree of a lower pattern, and the off-diagonal entries of each row and column of L."""
+    """Compute the elimination tree of a lower pattern, and the number of off-diagonal entries in each row and column of L."""
     cdef int32_t k, q, j
     for k in range(n):
         parent[k] = -1
@@ -130,7 +130,7 @@ cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_
                                     int32_t* first) noexcept nogil:
     """Merge adjacent vertices, each the parent of the one before, to supernodes; return their number.
 
-    first (n + 1) receives the first vertex of each. A vertex has size (n) columns, or one if that is NULL. It joins the
+    first (n + 1) receives the first vertex of each supernode. A vertex has size (n) columns, or one if that is NULL. It joins the
     supernode before it if the fraction of stored zeros stays within `max_zero_fraction`.
     """
     cdef int32_t j, k = 0, q

@@ -27,7 +27,7 @@ cdef struct scaled_t:
     double* fixed               # (rows) impulse of the fixed rows
     double* scale               # (m) D^-1/2
     double* speed               # (m) velocity error per unit of the natural map
-    int32_t small               # entries of the elements' small matrices
+    int32_t small               # total number of entries of the square matrices of all elements
     int32_t whole               # whether no row is fixed
 
 

@@ -170,7 +170,7 @@ cdef void compute_slack_and_rounding(pivoting_t* s) noexcept nogil:
 
 
 cdef inline int32_t choose_bound_after_exchange(const pivoting_t* s, int32_t i) noexcept nogil:
-    """Return where row i is after an exchange (3). The tolerance 8 f is a few roundings of w, or of x = w / d."""
+    """Return the state of row i after an exchange (3). The tolerance 8 f is a few roundings of w, or of x = w / d."""
     cdef double lower = s.p.lower[i], upper = s.p.upper[i], slop = 8.0 * s.f[i]
     if lower == upper:
         return AT_LOWER
@@ -233,7 +233,7 @@ cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
 
 
 cdef inline void run_symmetric_sweeps(pivoting_t* s, int32_t n) noexcept nogil:
-    """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first and 1 in the others.
+    """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first sweep and 1 in the others.
 
     Along a stack, each contact gets 0.85 of the change of the previous one with omega = 1.7, so that a change passes through
     4000 contacts before it underflows; with omega = 1 each gets 0.5, which is enough for 1000.

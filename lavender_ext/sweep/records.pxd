@@ -84,7 +84,7 @@ cdef inline int32_t record_size_in_pairs(int32_t kind) noexcept nogil:
 
 
 cdef inline int64_t encode_record_header(int32_t kind, int64_t previous_size) noexcept nogil:
-    """Return kind + 2^8 size + 2^32 size of the record before, both in pairs."""
+    """Return kind + 2^8 (size of this record) + 2^32 (size of the record before it), both sizes in pairs."""
     return kind + (<int64_t>record_size_in_pairs(kind) << 8) + (previous_size << 32)
 
 
@@ -101,7 +101,7 @@ cdef inline int64_t decode_previous_record_size(int64_t code) noexcept nogil:
 
 
 cdef inline pair_t* interleave_pairs(pair_t* out, int32_t n, const double* x, const double* y) noexcept nogil:
-    """Store the pairs of x (n) and y (n) to `out`, and return the place after them."""
+    """Store the pairs of x (n) and y (n) to `out`; return the address after the last pair."""
     cdef int32_t k
     for k in range(n):
         out[k] = load_pair(x + k, y + k)

@@ -247,7 +247,7 @@ cdef inline void form_y_transpose(const flow_t* f, int32_t island) noexcept nogi
 
 
 cdef inline void form_column_of_a(const flow_t* f, int32_t place) noexcept nogil:
-    """Form the column of A of the row at this index of the island, unless it is known."""
+    """Form the column of A that belongs to the row with this index in the island, unless it is formed already."""
     cdef int32_t b, nc
     cdef const double* y
     if f.panel_of_column[0] == UNFORMED:

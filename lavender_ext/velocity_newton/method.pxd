@@ -65,7 +65,7 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
 
 cdef inline int32_t advance_islands(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                  info_t* info) noexcept nogil:
-    """Step the islands, beginning with a paused one."""
+    """Take steps on the islands, beginning with a paused island."""
     cdef state_t* s = <state_t*>r.index
     cdef int32_t how = SPENT, left = o.budget - s.done
     info.direction = info.tried = NULL

@@ -246,7 +246,7 @@ cdef inline double proximal_error(const flow_t* f, int32_t island) noexcept nogi
 
 
 cdef inline double error_over_limits(const flow_t* f, double energy, double velocity) noexcept nogil:
-    """Return the error as a multiple of its limits: at most 1 within tol, NaN if not finite."""
+    """Return the error as a multiple of its limits: at most 1 if it is within tol, NaN if it is not finite."""
     cdef double x = 0.0, v = 0.0
     if energy != energy or velocity != velocity:
         return energy + velocity
@@ -258,7 +258,7 @@ cdef inline double error_over_limits(const flow_t* f, double energy, double velo
 
 
 cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double error) noexcept nogil:
-    """Begin Newton steps under a law from y; `error` is the error of `best`, or infinity."""
+    """Begin Newton steps under the given law from y. `error` is the error of `best`, or infinity."""
     cdef descent_t* x = &f.descent
     f.p.law = law
     x.idle_steps = x.steps = x.response_is_known = x.center_moved = 0
@@ -287,7 +287,7 @@ cdef inline double store_iterate_if_best(flow_t* f, int32_t island, bint moves, 
 
 
 cdef inline double compute_gradient(flow_t* f) noexcept nogil:
-    """Compute G into `grad` and return |G|; over rows, h and its norm."""
+    """Compute G into `grad` and return |G|. If the island is over rows, do so with h of `normal.pxd` (1)."""
     cdef int32_t a, c
     cdef double size = 0.0
     cdef const int32_t* own = f.unknowns
@@ -392,7 +392,7 @@ cdef inline double normal_shift(const flow_t* f, int32_t i) noexcept nogil:
 
 
 cdef inline void compute_normal_shifts(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
-    """Compute phi from the slack of lam; phi must be 0 before."""
+    """Compute phi (3) from the slack of lam. phi must be 0 before the call."""
     cdef int32_t a, i
     cdef double velocity
     measure_error(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
@@ -531,7 +531,7 @@ cdef inline bint is_at_rest(flow_t* f, int32_t island, double* impulse) noexcept
 
 
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Solve one island from `impulse`, or from where it is paused, into `impulse`; return the outcome."""
+    """Solve one island from `impulse`, or continue a paused island, into `impulse`; return the outcome."""
     cdef int32_t end
     cdef bint waits = f.paused.island == island
     f.island = island

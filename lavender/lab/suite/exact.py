@@ -275,4 +275,6 @@ def _iterate_solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatA
     try:
         yield factor_sparse_lu(a).solve
     except RuntimeError as error:
-        raise InputError(f"the rows cannot be factorised ({error})") from None
+        raise InputError(
+            f"the {a.shape[0]} free rows cannot be factorised ({error}): remove linearly dependent rows, or give them compliance"
+        ) from None

@@ -123,8 +123,8 @@ def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
 def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
     """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies.
 
-    With Coulomb friction, the smaller of two distances is returned: to the solution of `auto`, and to the solution that
-    continues from the impulses.
+    With Coulomb friction, several solutions may exist: the errors are taken against the nearer of two, the solution of
+    `auto` from its default start and the solution that it finds when started at these impulses.
     """
     error, distance = motion.measure_distance(problem, impulse, motion.get_reference(problem)), 0.0
     if problem.law == "coulomb":
