@@ -16,7 +16,7 @@ cdef extern from *:
 
 
 cdef struct pivots_t:
-    int32_t small               # number of small pivots (at most tiny size_i), whose rows and columns are left out of the solution
+    int32_t small               # number of small pivots (up to tiny size_i); their rows and columns are left out of the solution
     int32_t negative            # number of negative pivots, which are used
     double least                # smallest p_i / size_i
     int32_t first_small         # index of the first small pivot, or -1
@@ -59,7 +59,7 @@ cdef struct supernodal_t:
     int32_t* local_row          # (n) row index of each position within the present panel
     int32_t* head               # (supernodes) first of the descendants that update a supernode next
     int32_t* link               # (supernodes) next descendant in the same list
-    int32_t* next_row           # (supernodes) first row of a supernode whose update has not been done
+    int32_t* next_row           # (supernodes) first row of a supernode with an update that has not been done
     interrupt_t* interrupt      # checks for signals, or NULL
 
 

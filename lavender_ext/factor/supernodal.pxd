@@ -232,7 +232,7 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
 
 cdef inline void subtract_three(int32_t n, int32_t columns, const double* a, int64_t lda, const double* t,
                                 double* y) noexcept nogil:
-    """Subtract A t from y (n). A has up to three columns, whose products are subtracted one after the other."""
+    """Subtract A t from y (n). The products of up to three columns of A are subtracted one after the other."""
     cdef int32_t q
     cdef double t0 = t[0], t1, t2
     cdef const double* b = a + lda

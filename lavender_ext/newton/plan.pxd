@@ -115,7 +115,7 @@ cdef inline double start_alpha() noexcept nogil:
 
 
 cdef inline double first_cone_weight() noexcept nogil:
-    """Return the first proximal weight on cones, whose scaling spans more than that of rows; N loses 2^-53 / weight to rounding.
+    """Return the first proximal weight on cones, with a wider scaling than rows; N loses 2^-53 / weight to rounding.
 
     On a redundant pyramid 1e-10 ends at 3e-8 and 1e-8 at 4e-10; 1e-6 takes a step more.
     """

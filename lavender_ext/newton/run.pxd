@@ -460,7 +460,7 @@ cdef inline void store_earlier_best(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
-    """Begin a phase whose best point is recorded separately from earlier points."""
+    """Begin a phase with a best point that is recorded separately from earlier points."""
     store_earlier_best(n)
     n.best = 1.0 / 0.0
 

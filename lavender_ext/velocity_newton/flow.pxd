@@ -38,7 +38,7 @@ cdef struct descent_t:          # state of the Newton steps under one law
     double sizes[3]             # norms of the gradient G at the last three steps
 
 
-cdef struct paused_t:           # an island whose step budget ended; the next call continues it
+cdef struct paused_t:           # an island with an ended step budget; the next call continues it
     int32_t island              # -1: no island is paused
     int32_t worst               # worst outcome of the islands before the paused one
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)

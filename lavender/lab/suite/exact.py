@@ -276,5 +276,6 @@ def _iterate_solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatA
         yield factor_sparse_lu(a).solve
     except RuntimeError as error:
         raise InputError(
-            f"the {a.shape[0]} free rows cannot be factorised ({error}): remove linearly dependent rows, or give them compliance"
+            f"the {a.shape[0]} free rows cannot be factorised ({error}): remove linearly dependent rows, or give them "
+            "compliance"
         ) from None
