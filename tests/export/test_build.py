@@ -231,7 +231,7 @@ def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, comp
     made = vectors.make_export_files(records, None, 2)
     header = made["chosen.h"]
     assert "to a relative residual of 1e-06" in header and "1e-09" not in header
-    assert all(step in header for step in ("LAV_ANDERSON", "LAV_NEWTON"))
+    assert "LAV_ANDERSON" in header
     for name, text in made.items():
         (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     (tmp_path / "vectors.bin").write_bytes(vectors.make_export_files(records, None, 3)["vectors.bin"])
