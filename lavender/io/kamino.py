@@ -63,7 +63,7 @@ KAMINO_ADVICE = (
 )
 
 
-_LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # of each solver
+_LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # The layout of each solver.
 # For each solver: its numbers of bodies and rows, and the kinds of rows that have been compared with D.
 _VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
 

@@ -183,7 +183,7 @@ def describe_exceedance(n_worlds: int) -> str:
     """Return a sentence on the probability that a further world has a larger error than all worlds measured.
 
     Each of n + 1 worlds that are drawn alike is the worst of them with the same probability, 1 / (n + 1), whatever the
-    distribution of the errors. This does not hold for steps: those of one world depend on each other.
+    distribution of the errors. It does not hold for steps, because the steps of one world depend on each other.
     """
     if not n_worlds:
         return ""

@@ -47,8 +47,8 @@ NO_TIME_MESSAGE = "the time limit left no time for a solver"
 # Newton's method starts from an iterate if its relative residual does not exceed this.
 WARM_START_MAX_RESIDUAL = 1e-3
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-# If an island has at least this many rows per velocity, the matrix N is full, and small compared with the data
-# of which it is formed.
+# If an island has at least this many rows per velocity, the matrix N is full, and smaller than
+# the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
 VELOCITIES_OF_TWO_BODIES = 12.0
 # Largest number of Newton steps of all islands of velocities, within the default limits of each solver.
