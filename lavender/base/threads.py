@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_THREADS = (
-    1024  # Further calls wait. The pool starts a thread only if there is work and no thread is idle.
-)
+# Further calls wait. The pool starts a thread only if there is work and no thread is idle.
+MAX_THREADS = 1024
 
 
 @cache

@@ -260,9 +260,8 @@ class Batch(Sequence[Problem]):
         batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = m, m * np.arange(n)
         return batch
 
-    names_of: Callable[[int], Sequence[str]] | None = (
-        None  # Function that returns the names of a world's blocks.
-    )
+    # Function that returns the names of a world's blocks.
+    names_of: Callable[[int], Sequence[str]] | None = None
     contact_counts: np.ndarray | None = None  # (n,) Number of contacts with rows; None if it is not known.
     _has_shared_cones = True
     _pattern: tuple[np.ndarray, np.ndarray] | None = None

@@ -59,9 +59,8 @@ MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
 MAX_SCALED_RHS = 1e2
 # [-] As MAX_SCALED_RHS, for the program form. It is larger, because |x| often exceeds the active bounds.
 MAX_SCALED_PROGRAM_RHS = 1e6
-VELOCITY_FORM_MASS_RATIO = (
-    1e3  # At and above this mass ratio, the velocity form is more accurate at all sizes.
-)
+# At and above this mass ratio, the velocity form is more accurate at all sizes.
+VELOCITY_FORM_MASS_RATIO = 1e3
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from lavender.judge.solution import Claim, Status, sum_work
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
 
-MIN_TOLERANCE = (
-    1e-14  # Smallest tolerance passed to a backend; rounding in its arithmetic prevents smaller residuals.
-)
+# Smallest tolerance passed to a backend; rounding in its arithmetic prevents smaller residuals.
+MIN_TOLERANCE = 1e-14
 MIN_GAP = 1e-18  # Smallest absolute gap of objectives passed to a backend.
 # Gap relative to the objective in the first call: at large mass ratios, rounding of the sums causes about as much.
 MAX_RELATIVE_GAP = 1e-13

@@ -57,23 +57,18 @@ VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
 # |z| counts as rounding if it does not exceed this fraction of b.y. The floor of a solution (2) is then above 1e-6.
 MAX_ROUNDING_SLACK = 1e-10
 SAFE_SUM_RATIO = 1e3  # A sum above this multiple of its rounding bound is not recomputed exactly.
-MAX_POLISHED_SLACK = (
-    1e-6  # Up to this fraction of the sum of its terms, |z| counts as rounding; larger z is not polished.
-)
-MAX_EXACT_ROWS = (
-    16  # Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
-)
+# Up to this fraction of the sum of its terms, |z| counts as rounding; larger z is not polished.
+MAX_POLISHED_SLACK = 1e-6
+# Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
+MAX_EXACT_ROWS = 16
 MIN_NAMED_SHARE = 1e-6  # Rows below this fraction of the largest |y| in the metric of D are not named.
 MAX_NAMED_BLOCKS = 6  # Number of blocks of each kind that a message names.
-MAX_POLISHED_ROWS = (
-    1000  # Certificates with more rows are not polished: the dense least squares would be too large.
-)
-LEAST_SQUARES_TIME = (
-    6e-10  # s for each (row x column x smaller of both) of the dense least squares, measured.
-)
-LEAST_SQUARES_SHIFT = (
-    1e-14  # Shift of the normal equations, relative to their trace: above the rounding of a factor.
-)
+# Certificates with more rows are not polished: the dense least squares would be too large.
+MAX_POLISHED_ROWS = 1000
+# s for each (row x column x smaller of both) of the dense least squares, measured.
+LEAST_SQUARES_TIME = 6e-10
+# Shift of the normal equations, relative to their trace: above the rounding of a factor.
+LEAST_SQUARES_SHIFT = 1e-14
 # Number of iterations. Each divides the error by 1 + (singular value)^2 / shift.
 LEAST_SQUARES_ITERATIONS = 6
 # Columns per product. OpenBLAS starts threads for products of more than 262,144 multiply-adds.

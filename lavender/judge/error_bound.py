@@ -53,14 +53,12 @@ from lavender_ext.derivative.linear import CASES, Linear
 UNIT_ROUNDOFF = 2.0**-53
 MAX_ISLAND_ROWS = 600  # Larger islands have no bound: dense products of 600 rows take about 0.1 s.
 MAX_MATRIX_ENTRIES = 4e6  # No bound is computed if A has more entries than this, because A is formed.
-MAX_UNCERTAINTY_STEPS = (
-    8  # Every row counts as uncertain if this many rounds have each found further uncertain rows.
-)
+# Every row counts as uncertain if this many rounds have each found further uncertain rows.
+MAX_UNCERTAINTY_STEPS = 8
 MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5); each doubles the assumed bound of |dy|.
 MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger.
-CONTRACTION_MARGIN = (
-    1e-9  # (3) and (4) must contract by at least this much, which covers the rounding of their norms.
-)
+# (3) and (4) must contract by at least this much, which covers the rounding of their norms.
+CONTRACTION_MARGIN = 1e-9
 LARGE_NORM = 0.5  # If the estimate of a norm by sums exceeds this, the norm is computed by singular values.
 SUM_ROUNDING_FACTOR = 1.0 + 1e-8  # Factor for the rounding of sums of bounds.
 

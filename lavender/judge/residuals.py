@@ -77,9 +77,8 @@ UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to th
 at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
-DEFAULT_THRESHOLD = (
-    1e-6  # m/s. Default of `threshold`: sensors of robots do not measure smaller velocity errors.
-)
+# m/s. Default of `threshold`: sensors of robots do not measure smaller velocity errors.
+DEFAULT_THRESHOLD = 1e-6
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
 )  # fmt: skip

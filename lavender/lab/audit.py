@@ -67,10 +67,9 @@ MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps or fewer.
 MIN_TASKS_PER_WORKER = 10  # With fewer tasks, the progress and the remaining time would be coarse.
 DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about this time.
-MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated from results of at least this time.
-MAX_DEFAULT_WORLDS = (
-    4096  # Without a number of worlds, no more are simulated: their errors fill the quantiles.
-)
+MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated only after results have arrived for this long.
+# If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
+MAX_DEFAULT_WORLDS = 4096
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
@@ -92,7 +91,7 @@ AUDIT_BUSY_CONSEQUENCE = (
     "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
 OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
-# Number of a contact within its step; it is removed from row names, as it differs between steps.
+# Matches "contact 12 " at the start of a row's name. The number differs between steps and is removed from names.
 CONTACT_NUMBER = re.compile(r"^contact \d+ ")
 
 
@@ -106,7 +105,7 @@ class Worst:
         Largest velocity error of a row.
     world, step : int
     where : str
-        Name of this row.
+        Name of the row with this error.
     problem : Problem
     impulse : (m,) N s
         The engine's answer.
@@ -124,12 +123,14 @@ class Worst:
 
 
 class Piece(NamedTuple):
-    """Results of k steps.
+    """Results of k judged steps.
 
     Parameters
     ----------
     world, step : (k,) int
+        World and number of each step.
     numbers : (len(WORST_ROW_ERRORS), k)
+        Errors of the worst row of each step, one row for each name in `WORST_ROW_ERRORS`.
     verdict : (k,) int
         Indices in AUDIT_VERDICTS.
     rows, contacts : (k,) int
@@ -197,7 +198,7 @@ class Audit:
 
     @property
     def is_unconverged(self) -> Any:
-        """(worlds, steps) bool: whether the solve stopped before convergence, or is wrong."""
+        """(worlds, steps) bool: whether the solve stopped before convergence, or the answer is wrong."""
         return (self.verdict == AUDIT_VERDICTS.index(UNCONVERGED)) | (
             self.verdict == AUDIT_VERDICTS.index(WRONG)
         )
@@ -234,9 +235,10 @@ class Audit:
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
     def has_exact_solves(self, divergence: Divergence) -> bool:
-        """Whether every solve of a world that diverged was exact: at its floor, or within `DEFAULT_THRESHOLD`.
+        """Return whether every step of a world that diverged was solved, so that its solver is not the cause.
 
-        The solve of the last step does not count if the state or the unconstrained acceleration was already too large.
+        A step is solved if its error is at the round-off floor or below `DEFAULT_THRESHOLD` [m/s]. The last step does
+        not count if its state or unconstrained acceleration was too large before it was solved.
         """
         selection = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
         verdict = self.verdict[selection]
@@ -366,8 +368,8 @@ class Audit:
         `summary_page.write` writes the page.
 
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
-        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl and
-        qacc_warmstart of the worst worlds before their step, one row each, and for MuJoCo `state`, their
+        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl
+        and qacc_warmstart of the worst worlds before their step, one row each, and for MuJoCo `state`, their
         mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
@@ -551,10 +553,10 @@ def count_processes(workers: int) -> int:
 
 
 def choose_world_count(runs: Runs, judging: tuple[str, float], processes: int) -> int:
-    """Return the number of worlds that take about `DEFAULT_DURATION` in so many processes.
+    """Return the number of worlds that take about `DEFAULT_DURATION` in `processes` processes.
 
-    `runs` are of one world, which is simulated and judged with MuJoCo; its second run is timed, because the first one
-    also imports modules.
+    `runs` describes one world. It is simulated and judged twice with MuJoCo, and the second run is timed, because the
+    first one also imports modules.
     """
     _reject_unsupported_model(runs)
     audit_worlds(replace(runs, steps=1), judging, range(1))
@@ -646,7 +648,11 @@ def _judge_steps(
     state_of: Callable[[int], Any],
     sizes: tuple[Any, Any],
 ) -> Piece:
-    """Judge some steps with `judging` = (precision, threshold [m/s])."""
+    """Judge the answers `impulse` [N s] to the problems of `batch`, one for each step.
+
+    `judging` is (precision, threshold [m/s]); `world` and `step` are the numbers of the steps, `state_of(i)` returns
+    the state before step i, and `sizes` holds the numbers of rows and of contacts.
+    """
     residuals = residual_many(batch, impulse, precision=judging[0], threshold=judging[1], errors="status")
     numbers = np.array(
         [residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor]

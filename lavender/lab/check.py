@@ -28,16 +28,17 @@ REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = (
     "clarabel_cone",
     "block_gauss_seidel",
-)  # References for relaxed friction, which is not a QP.
-REFERENCE_MAX_RESIDUAL = (
-    1e-9  # A reference must reach this relative residual, or 10 times the round-off floor.
-)
+)  # Reference solvers, in order, under the law "cone" (relaxed friction), whose problem is not a QP.
+# A reference must reach this relative residual, or 10 times the round-off floor.
+REFERENCE_MAX_RESIDUAL = 1e-9
 
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
 PROVED = "no solution, proved"
-NEAR_NONE = "no solution within rounding"  # If the exact data have a solution, it is huge.
-INEXACT = "no exact solution"  # A certificate holds, and other solvers meet the tolerance.
+# A certificate holds up to rounding: any solution has huge impulses.
+NEAR_NONE = "no solution within rounding"
+# A certificate holds, and another solver's answer meets the tolerance nevertheless.
+INEXACT = "no exact solution"
 NOT_SOLVED = "not solved"
 NOTHING_TO_DO = "nothing to do"
 CLAIM_CONTRADICTED = "claim contradicted"
@@ -48,7 +49,7 @@ REFUSED = "refused"
 
 @dataclass(frozen=True)
 class CrossCheckRow:
-    """Comparison of one solver with the reference; numbers without a meaning are None.
+    """Comparison of one solver with the reference; a number that does not apply is None.
 
     Parameters
     ----------
@@ -63,9 +64,9 @@ class CrossCheckRow:
     allowed : float or None, sqrt J
         Largest distance that (3) allows.
     slack : float or None, m/s
-        Largest difference of slack.
+        Largest difference of a row's slack from the reference's.
     objective : float or None, J
-        1/2 l.A l - b.l minus the reference's.
+        1/2 l.A l - b.l of the solver's impulse l, minus that value for the reference.
     time : float or None, s
         Set-up and solve.
     note : str
@@ -196,8 +197,9 @@ def cross_check(
 ) -> CrossCheck:
     """Solve from the zero impulse with every solver, and compare each with a judged reference.
 
-    The reference must reach max(1e-9, 10 floor), and 1e-5, by the judge. Otherwise the next of osqp, clarabel, piqp,
-    direct (relaxed friction: clarabel_cone, block_gauss_seidel) is used, and named.
+    The judged relative residual of the reference must be at most max(1e-9, 10 floor), with the round-off floor, and at
+    most 1e-5. Otherwise the next solver of osqp, clarabel, piqp, direct (relaxed friction: clarabel_cone,
+    block_gauss_seidel) computes the reference; the result names it.
 
     Parameters
     ----------
@@ -209,9 +211,9 @@ def cross_check(
     tol : float
         Relative residual tolerance of the solvers.
     max_iter : int, optional
-        Largest number of iterations of each solver; default: each spec's.
+        Largest number of iterations of each solver; default: the solver's own.
     time_limit : float, optional, s
-        For each solver that can be stopped.
+        Time limit of each solver; a solver that cannot be interrupted ignores it.
 
     Returns
     -------
@@ -256,7 +258,10 @@ def _check_solver(
     optimum: Solution | None,
     run_solver: Callable[..., Solution],
 ) -> CrossCheckRow:
-    """Run one solver, or the bounded variant if `reason` says why it does not accept the problem, and compare it."""
+    """Run one solver and compare its solution with `optimum`.
+
+    `reason` says why the solver does not accept the problem; its bounded variant runs instead, if it has one.
+    """
     other = None if reason is None else specs()[name].standing_in(problem)
     if reason is not None and other is None:
         return CrossCheckRow(name, REFUSED, note=reason)
@@ -304,7 +309,7 @@ def _solve_reference(
             continue
         spec = get(name)
         try:
-            # A reference may take longer than a solver.
+            # A reference may use 100 times the solver's default number of iterations.
             budget = 100 * spec.max_iter if spec.resumable else None
             solution = raise_if_interrupted(
                 run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)

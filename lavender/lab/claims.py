@@ -42,7 +42,7 @@ OUTCOMES = (
 )
 RIGHT_OUTCOMES, WRONG_OUTCOMES = (0, 2), (1, 3)
 STATES_FILE = "states.npz"
-N_KEPT_PROBLEMS = 8  # The worst answers are written to files.
+N_KEPT_PROBLEMS = 8  # The problems of this many worst answers are written to files.
 NUMBER_PATTERN = re.compile(
     r"\b\d+\b"
 )  # Numbers of contacts and limits differ between steps and are removed from row names.
@@ -77,9 +77,11 @@ class ClaimComparison:
     iterations : (steps, worlds) int
         -1 if the engine does not count them.
     where : dict
-        Worst row of wrong answers, without numbers -> their number and largest error [m/s].
+        Name of the worst row, with numbers removed -> number of wrong answers with this worst row, and their largest
+        error [m/s].
     masses : list of (float, bool)
-        Effective mass [kg] of the worst row of each wrong answer, and whether the engine claimed it.
+        Effective mass [kg] of the worst row of each wrong answer, and whether the engine claimed that it had
+        converged.
     stopped : bool
         Ctrl-C ended the run early.
     """
@@ -222,7 +224,7 @@ def compare_claims(
     Returns
     -------
     ClaimComparison
-        After Ctrl-C, of the steps so far, with `stopped`.
+        After Ctrl-C, it covers the steps judged so far, and its `stopped` is true.
 
     Raises
     ------
@@ -277,7 +279,7 @@ def compare_claims(
 
 
 def _write_states_before_steps(recorder: Recorder) -> None:
-    """Write `states.npz` next to the recorder's folder: the states before the recorded steps, from which to start."""
+    """Write `states.npz` next to the recorder's folder: the states from which the recorded steps can be repeated."""
     labels = [NUMBER_PATTERN.findall(file.replace("_", " ")) for file in recorder.files]
     folder = recorder.folder / STATES_FOLDER
     found = [

@@ -30,9 +30,10 @@ from lavender.problem import Problem
 from lavender.solving.solve import solve
 
 MANIFEST = Path(__file__).with_name("manifest.json")
-# Manifest of files of other projects, which this one does not contain.
+# Manifest of problems that are files of other projects and are not part of this repository.
 RECORDED = MANIFEST.with_name("recorded.json")
-MAX_SEARCH_ROWS = 60  # Other motions of problems under Coulomb's law are searched up to this many rows.
+# Several motions are searched for if a problem under Coulomb's law has at most this many rows.
+MAX_SEARCH_ROWS = 60
 NEAR_SOLUTION_SPEED = 1e-9  # [m/s] The catalogue counts answers within this distance of an exact solution.
 MAX_SWEEPS = 10_000  # Largest number of PGS sweeps with which the difficulty of a problem is measured.
 ANSWER_TIME_LIMIT = 30.0  # [s] Time limit of `auto` for the answer from which a proof starts.
@@ -55,18 +56,18 @@ class Entry:
     licence : str
         Licence of a model that another package installs.
     made : str
-        Versions of other packages on which the numbers depend.
+        Versions of other packages on which the problem's numbers depend.
     sweeps : int or None
         Sweeps of PGS to a residual of 1e-3; None if 10,000 do not suffice, or PGS does not accept the problem.
     condition : float or None
         Condition number of A on its range, scaled to a diagonal of 1; None above CONDITION rows.
     degenerate : float
-        Fraction of blocks at a boundary, of the blocks with a bounded error; 0 without such blocks.
+        Fraction of the blocks with a bounded error that are at a boundary between two states; 0 without such blocks.
     known : {"enclosed", "infeasible", "open"}
     radius : float or None, m/s
         Radius of the enclosed solution, for every row.
     unique : bool
-        It is proved to be the only motion.
+        Whether the motion of the enclosed solution is proved to be the only one.
     motions : int
         Number of motions that were found, a lower bound; 0 if they were not searched.
     apart : float or None, m/s
@@ -129,7 +130,7 @@ def certify_problem(problem: Problem, name: str, group: str) -> Entry:
 
 
 def count_sweeps_to_thousandth(problem: Problem) -> int | None:
-    """Count the sweeps that `pgs` needs to a thousandth of the zero impulse's error; None if they do not suffice."""
+    """Count the sweeps that `pgs` needs to a relative residual of 1e-3; None if MAX_SWEEPS do not suffice."""
     try:
         found = solve(problem, "pgs", impulse=problem.start(), tol=1e-3, max_iter=MAX_SWEEPS)
     except CapabilityError:
@@ -138,7 +139,7 @@ def count_sweeps_to_thousandth(problem: Problem) -> int | None:
 
 
 def certify_groups(groups: Iterable[str]) -> Iterator[Entry]:
-    """Certify every problem of these sets, files and folders; of all sets if none is named."""
+    """Certify every problem of the named sets, files and folders, or of all sets if `groups` is empty."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
         if is_path(group):
             for item in resolve_sources(group):
@@ -186,7 +187,7 @@ def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
 
 
 def find_changed_problems(entries: Iterable[Entry]) -> Iterator[str]:
-    """Build every problem again from its name; yield a line for each that has other numbers."""
+    """Build every problem again from its name; yield a line for each whose numbers differ from its entry's hash."""
     for entry in entries:
         problem = suite.case(entry.name).problem
         if (now := hash_problem(problem)) != entry.sha:

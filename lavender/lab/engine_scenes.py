@@ -11,8 +11,8 @@ A state is a dict of arrays; the first dimension of each array is the world. The
     genesis     qpos, qvel: the results of `get_qpos` and `get_dofs_velocity`
 
 If a state of newton has only the arrays of bodies, or only the arrays of joints, the engine's kinematics computes the
-others. Without states, world 0 starts as the scene was built. The velocities of each other world differ from world 0 by
-`spread` times a standard normal number, drawn with the seed (seed, world).
+others. Without states, world 0 starts as the scene was built. The velocities of each other world differ from world 0
+by `spread` times a standard normal number, drawn with the seed (seed, world).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def step_scene(
     UnknownName
         The engine or the builder is unknown.
     CapabilityError
-        As the importers.
+        The importer of the engine does not support the scene.
     """
     steps = check_int("steps", steps, 1)
     running = start_scene(scene, engine, worlds=worlds, dt=dt, states=states, spread=spread, seed=seed)
@@ -113,7 +113,7 @@ def start_scene(
     spread: float = 0.0,
     seed: int = 0,
 ) -> NewtonScene | GenesisScene:
-    """Build a scene of so many worlds in its start states; parameters as of `step_scene`."""
+    """Build a scene of `worlds` worlds and set their start states; see `step_scene` for the parameters."""
     check_name("engine", engine, CLAIM_ENGINES)
     worlds, dt = check_int("worlds", worlds, 1), check_float("dt", dt, above=0.0)
     spread, seed = check_float("spread", spread, low=0.0), check_int("seed", seed, high=None)
@@ -136,11 +136,12 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     Raises
     ------
     InputError
-        The file cannot be read, has arrays with other names or different numbers of entries, or a number is not finite.
+        The file cannot be read, has arrays with other names or different numbers of entries, or a number is not
+        finite.
     """
     label = "states"
     if isinstance(source, (str, os.PathLike)):
-        read_first_bytes(source)  # Checks that it is a regular file.
+        read_first_bytes(source)  # Raises an error if `source` is not a regular file.
         label = f"states {os.fspath(source)}"
         with closing(Archive(source)) as archive:
             source = dict(archive)
@@ -267,11 +268,11 @@ class NewtonScene:
 
     @property
     def _has_equal_worlds(self) -> bool:
-        """Whether the arrays of all worlds can have the same length, which is necessary to store states by world."""
+        """Return whether all worlds have equal numbers of bodies and joints, so that states fit one array per name."""
         return self.n > 0 and all(len(getattr(self.before, name)) % self.n == 0 for name in NEWTON_STATE)
 
     def set_state(self, state: EngineState) -> None:
-        """Continue from a state of all worlds (n, ...); the solver's memory of earlier steps is cleared."""
+        """Set the state of all worlds, arrays (n, ...), and clear the solver's warm start."""
         if not self._has_equal_worlds:
             raise InputError(
                 "the worlds of this scene have different bodies or joints, so they cannot start from states: "
@@ -314,7 +315,7 @@ class NewtonScene:
         self._start_mujoco()
 
     def _complete_state(self, from_joints: bool) -> None:
-        """Compute bodies from joints, or joints from bodies."""
+        """Compute the state of bodies from the state of joints, or the reverse, by the engine's kinematics."""
         state = self.before
         if from_joints:
             self.newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
@@ -366,7 +367,7 @@ class GenesisScene:
         return {name: np.array(x.cpu().numpy(), float) for name, x in zip(GENESIS_STATE, arrays, strict=True)}
 
     def set_state(self, state: EngineState) -> None:
-        """Continue from a state of all environments; the solver's warm start is cleared."""
+        """Set the state of all environments, arrays (n, ...), and clear the solver's warm start."""
         own = self.get_state()
         for name in GENESIS_STATE:
             shape = state[name].shape if name in state else ()

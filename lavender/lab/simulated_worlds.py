@@ -1,14 +1,15 @@
 """Worlds of one MuJoCo model, stepped by a selectable engine, and the constraint problem of every step.
 
-World 0 is the one that `lavender record` simulates; the others differ from it by their start and their random controls:
+World 0 is the world that `lavender record` simulates. The other worlds differ from it by their initial velocities and
+their random controls:
 
     qvel += spread N(0, 1) [m/s, rad/s], drawn with (seed, world)        controls drawn with seed + world
 
-With start states, world i starts from state i without this noise; further worlds start from the same states with it.
-The first step uses the controls of the state, if it has any.
+If start states are given, world i starts from state i without this noise. If there are more worlds than states, the
+states are used again with noise. The first step uses the controls of the start state, if it has any.
 
-A problem is the one of the engine's own forward pass, with its warm start and its answer. MJX and MuJoCo Warp step all
-worlds at once, in float32.
+The constraint problem of a step is the one of the engine's own forward pass, with its warm start and its answer. MJX
+and MuJoCo Warp step all worlds at once, in float32.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ BLOCK_KINDS = {
 }
 PYRAMIDAL_CONTACT = 6  # Value of mjtConstraint of an edge of a pyramidal contact.
 MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
-# If a smaller fraction of the judged steps has contact, no setting is recommended, and an audit warns that its results
-# hardly concern contact: mean times and the error that 1 % of the steps exceed then describe steps without contact.
-# 6 % of the steps of dm_control's finger have contact, none of its stacker's.
+# If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,
+# and the error that 1 % of the steps exceed, then describe steps without contact. Examples: 6 % of the steps of
+# dm_control's finger model have contact, none of its stacker model.
 MIN_CONTACT_SHARE = 0.2
 
 
@@ -64,7 +65,7 @@ class Runs:
     ----------
     model : path of a model (MJCF)
     worlds, steps : int
-    control : "random", "zero", or an array (any, nu) that every world plays
+    control : "random", "zero", or an array (any, nu) of controls that every world applies step by step
     seed : int
     spread : float, m/s, rad/s
         Standard deviation of the noise that is added to the velocities at the start.
@@ -88,7 +89,7 @@ class Runs:
         check_float("spread", self.spread, low=0.0)
 
     def load_model(self) -> tuple[Any, Any]:
-        """Load MuJoCo and the model; InputError if it cannot be read, or the controls do not fit."""
+        """Load MuJoCo and the model; raise InputError if the model cannot be read or the controls do not fit it."""
         mj, model = load_model(self.model)
         make_controller(model, self.control, self.seed)
         return mj, model
@@ -116,7 +117,7 @@ class Runs:
         if self.starts is None or self.starts.controls is None:
             return drive
         first = self.starts.controls[world % len(self.starts)]
-        # The random controls of later steps do not depend on whether the state has controls.
+        # Draw the random controls of step 0, too, so that those of later steps do not depend on the start state.
         return lambda data, step: (drive(data, step), first)[step == 0]
 
 
@@ -156,7 +157,7 @@ class StepSizes:
 
     @property
     def size_table(self) -> Table:
-        """Median and maximum of rows and contacts, and the fraction of steps that have any."""
+        """Table of the median and maximum number of rows and contacts, and the fraction of steps that have any."""
         rows = []
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
             if len(counts):
@@ -167,7 +168,7 @@ class StepSizes:
 
     @property
     def as_dict(self) -> dict[str, Any]:
-        """The contents of `table` for numbers.json."""
+        """The contents of `size_table` for numbers.json."""
         numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
             with_any = len(counts) > 0
@@ -182,8 +183,8 @@ class StepSizes:
 def describe_exceedance(n_worlds: int) -> str:
     """Return a sentence on the probability that a further world has a larger error than all worlds measured.
 
-    Each of n + 1 worlds that are drawn alike is the worst of them with the same probability, 1 / (n + 1), whatever the
-    distribution of the errors. It does not hold for steps, because the steps of one world depend on each other.
+    If n + 1 worlds are drawn from one distribution, each has the largest error with probability 1 / (n + 1), whatever
+    the distribution. This does not hold for steps, because the steps of one world depend on each other.
     """
     if not n_worlds:
         return ""
@@ -217,7 +218,8 @@ class Divergence(NamedTuple):
     cause : str
         The quantity that was not finite or above mjMAXVAL, or MuJoCo's error.
     is_outside : bool
-        The quantity is the state or the unconstrained acceleration, so that this step's solve is not the cause.
+        Whether the quantity is the state or the unconstrained acceleration, so that the constraint solve of this step
+        is not the cause.
     """
 
     world: int
@@ -238,7 +240,7 @@ class Frame(NamedTuple):
     rows : (worlds,) int
         Number of rows that are not padding.
     contacts : (worlds,) int
-        Number of contacts that have such rows.
+        Number of contacts whose rows are not padding.
     """
 
     batch: Batch
@@ -433,7 +435,7 @@ class WarpWorlds:
     mj : module
         MuJoCo.
     model : mujoco.MjModel
-        With a dense Jacobian.
+        Model whose option for the Jacobian is dense.
     start_arrays : dict of (worlds, ...)
         State in which the worlds start, by the names of MjData.
     """
@@ -453,7 +455,7 @@ class WarpWorlds:
         self.start(start_arrays)
 
     def configure(self, model: Any) -> None:
-        """Use the options of a model that is otherwise equal."""
+        """Use the options of `model`, which otherwise equals the model of these worlds."""
         self.device_model = self.mjw.put_model(model)
         if hasattr(self.device_model.opt, "warn_overflow"):
             self.device_model.opt.warn_overflow = (
@@ -461,7 +463,7 @@ class WarpWorlds:
             )
 
     def start(self, start_arrays: dict[str, Any]) -> None:
-        """Continue from a state of all worlds."""
+        """Set the state of all worlds to `start_arrays`, arrays (worlds, ...) by the names of MjData."""
         for name, x in start_arrays.items():
             if x.size:
                 getattr(self.data, name).assign(x)

@@ -1,10 +1,10 @@
-"""Explain why contacts slip: solve the step of an engine again, replacing one property of its model after the other.
+"""Explain why contacts slip: solve an engine's step again in variants, each of which replaces one more property.
 
     explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
     print(explanation.table); print(explanation.sentence)
 
 The sliding speed of a contact is the norm of the tangential relative velocity v_t = J_t v+ after the step. It is
-computed from these impulses, each with the replacements of the ones before it:
+computed from the impulses of these variants; each variant includes the replacements of the variants above it:
 
     engine      the engine's answer
     solved      the exact solution of the engine's own problem
@@ -12,11 +12,11 @@ computed from these impulses, each with the replacements of the ones before it:
     hard        friction rows without compliance and with target velocity 0, in place of softened ones
     coulomb     Coulomb's law in place of the convex relaxation
 
-The difference of two neighbours is the part of the slip that the replaced property causes: unfinished iterations, the
-shape of the cone, compliance, the relaxation. The rest is sliding that Coulomb friction cannot prevent, because the
-load along the surface exceeds mu times the normal force. The parts are norms of vector differences, so the parts of one
-contact can add up to more than its speed. If the last problem has several solutions, the range of the speed over the
-solutions that were found is given.
+The difference of v_t between two consecutive variants is the part of the slip that the replaced property causes:
+unfinished iterations, the shape of the cone, compliance, the relaxation. The sliding in the last variant cannot be
+prevented by Coulomb friction, because the load along the surface exceeds mu times the normal force. The parts are
+norms of vector differences, so the parts of one contact can add up to more than its speed. If the last problem has
+several solutions, the range of the speed over the solutions that were found is given.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from lavender.problem import Problem
 from lavender.problem.data import check_problem
 from lavender.solving.solve import solve
 
-#: Causes in the order of replacement: cause of the difference from the next variant, variant of the larger slip.
+#: {variant: cause of its difference from the next variant}, in the order of replacement.
 CAUSES = {
     "engine": "unfinished solving",
     "solved": "shape of the cone",
@@ -54,8 +54,8 @@ REMEDIES = {
     "convex relaxation": "an engine with Coulomb's law; shorter time steps reduce this part",
     "load above the friction limit": "a larger friction coefficient or normal force",
 }
-# Slip below this speed is not explained: it is far below the speeds at which objects leave a gripper, and above the
-# velocity error of solutions to 1e-9.
+# [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
+# above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 MAX_SEARCHED_ROWS = 120  # Several solutions are searched for only in problems of at most this many rows.
@@ -74,7 +74,7 @@ class SlipVariant:
     relative : float
         Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
     note : str
-        Reason why the variant is the same as the one before, or why its solution is not accepted; "" otherwise.
+        Reason why the variant equals the previous one, or why its solution is not accepted; "" otherwise.
     speed_range : (2, contacts) array or None, m/s
         Smallest and largest speed of each contact over several solutions; None if one solution was found.
     """
@@ -179,8 +179,8 @@ def explain_slip(
     contacts : block indices, names or a part of names, optional
         Contacts to explain, of `disk` if it is given. Default: all contacts with tangents.
     disk : Problem, optional
-        The same step with friction cones in place of pyramids, over the same velocities. It is needed if `problem` has
-        the edges of pyramids as rows, because these rows do not state what a contact is.
+        The problem of the same step with friction cones in place of pyramids, over the same velocities. It is needed
+        if the rows of `problem` are edges of pyramids, because such rows do not show which rows form a contact.
     tol : float, default 1e-9
         Relative residual to which each variant is solved.
 
@@ -289,7 +289,7 @@ def _replace_soft_friction(problem: Problem) -> tuple[Problem, bool]:
     free_slip = (problem.jacobian @ problem.velocity(np.zeros(problem.m)))[rows]
     target = problem.b[rows] + free_slip
     soft = np.zeros(problem.m) if problem.compliance is None else np.array(problem.compliance)
-    # b holds the difference of target and J v*: a target below its rounding counts as 0.
+    # The target is computed as b + J v*; it counts as 0 if it is below the rounding of this sum.
     rounding = 8.0 * np.finfo(float).eps * (np.abs(problem.b[rows]) + np.abs(free_slip))
     if not soft[rows].any() and not (np.abs(target) > rounding).any():
         return problem, False
@@ -380,9 +380,9 @@ class AverageSlip:
     Parameters
     ----------
     contact : str
-        Both geoms, without the number of the contact.
+        Names of both geoms, without the number of the contact.
     count : int
-        Number of points, summed over all steps.
+        Number of contact points between these geoms, summed over all steps.
     speeds : (variants,) m/s
     parts : dict
         Cause -> part of the slip [m/s].
@@ -409,7 +409,7 @@ def average_slip(explanations: Iterable[SlipExplanation]) -> list[AverageSlip]:
         for i, contact in enumerate(explanation.contacts):
             key = (
                 contact.partition(" (")[2].rstrip(")") or contact
-            )  # The geoms, without the contact's number.
+            )  # Names of the geoms, without the contact's number.
             speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
             sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
             for cause, sizes in explanation.parts.items():

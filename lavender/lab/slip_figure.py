@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Colours of Okabe and Ito, which colour-blind readers can distinguish, in the order of `CAUSES`.
 CAUSE_COLORS = ("#D55E00", "#CC79A7", "#56B4E9", "#E69F00", "#999999")
-MAX_DRAWN_CONTACTS = 20  # The contacts that slide fastest are drawn.
+MAX_DRAWN_CONTACTS = 20  # Of more contacts, only this many with the largest sliding speeds are drawn.
 WIDTH, BAR_HEIGHT, MARGIN_HEIGHT = 8.0, 0.45, 1.7  # [inches]
 
 

@@ -71,9 +71,8 @@ __all__ = [
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
 CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
-SPIN_COEFFICIENT_LABEL = (
-    "mu patch_radius (of boxes and ellipses mu_2)"  # Messages name the product of mu and patch_radius so.
-)
+# Messages name the product of mu and patch_radius so.
+SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"
 # For each kind of contact: minimum and maximum number of rows, its name, and its permitted rows.
 CONTACT_ROWS = {
     CONTACT: (1, 3, "a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),

@@ -38,12 +38,10 @@ from lavender_ext.factor.graph import least_degree
 # |M_ij - M_ji| above this fraction of sqrt(M_ii M_jj) is an error: rounding of sums over bodies in float64 causes less.
 MAX_ASYMMETRY = 1e-12
 MAX_ASYMMETRY_FLOAT32 = 2.0**-16  # The same if M has dtype float32; its lower triangle is used.
-MIN_TREE_ORDERING_VELOCITIES = (
-    400  # With fewer velocities, a factorisation costs less than the search of an order.
-)
-MAX_FACTOR_ENTRIES = (
-    50_000_000  # If the factor of M in the original order has more entries, another order is used.
-)
+# With fewer velocities, a factorisation costs less than the search of an order.
+MIN_TREE_ORDERING_VELOCITIES = 400
+# If the factor of M in the original order has more entries, another order is used.
+MAX_FACTOR_ENTRIES = 50_000_000
 # Skip the search of an order of trees if each tree shares rows with more than this many trees on average: J^T J then
 # fills in under every order.
 MAX_MEAN_TREE_COUPLINGS = 100

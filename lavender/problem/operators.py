@@ -24,9 +24,8 @@ from lavender_ext.judge import measure
 # A matrix counts as positive semidefinite if A + SEMIDEFINITE_SHIFT D has a Cholesky factor, D = diag(d). Rounding of
 # the entries causes negative eigenvalues of about -m 2^-53 in the metric of D.
 SEMIDEFINITE_SHIFT = 1e-12
-MAX_SAFE_ENTRY = (
-    1e15  # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
-)
+# If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
+MAX_SAFE_ENTRY = 1e15
 MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
 
 

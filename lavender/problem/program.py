@@ -60,9 +60,8 @@ from lavender_ext.judge.measure import all_finite, compute_program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
-MAX_SINGULAR_PIVOT = (
-    1e-13  # P is singular if a pivot of its Cholesky factor does not exceed this share of the diagonal entry.
-)
+# P is singular if a pivot of its Cholesky factor does not exceed this share of the diagonal entry.
+MAX_SINGULAR_PIVOT = 1e-13
 # P is semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor: rounding may cause negative eigenvalues.
 SEMIDEFINITE_SHIFT = 1e-12
 # If q is 0, all forces may vanish at the solution. They are then compared with this share of the terms of P x.

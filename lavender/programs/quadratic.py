@@ -31,9 +31,8 @@ from lavender.solving.solve import solve
 
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
 MIN_TOL = 1e-15  # The smallest tol of such a solve.
-TOL_RATIO = (
-    0.1  # The next tol is this fraction of the tol expected to suffice if error and tol are proportional.
-)
+# The next tol is this fraction of the tol expected to suffice if error and tol are proportional.
+TOL_RATIO = 0.1
 # The backend is called first if n 2^-53 cond(M) is above this share of tol, as the judge then refines M^-1.
 MAX_LOSS = 0.1
 # After any other status the budget is used up, or a smaller tol does not change the result.

@@ -20,19 +20,19 @@ from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import exceeds_default_budget
 from lavender.solvers.registry import specs
 
-CANDIDATE_TIME_RATIO = (
-    1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
-)
+# A solver is a candidate if its time is at most this multiple of the best: a rerun may rank it first.
+CANDIDATE_TIME_RATIO = 1.6
 MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
-# Fractions of a time to which `time_limit` is set; set-up and judge take the remaining time.
+# Fractions of a time budget to which `time_limit` of a call is set; set-up and judge need the remaining time.
 TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
 def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallSpec]:
     """List the calls to time alternately.
 
-    These are calls to the middle tolerance, the same as a batch, and calls with each time limit in `times` [s]. Without
-    `times`, the time limits are the ones from `choose_time_budgets` that are short enough to be reported.
+    These are calls to the middle tolerance for single problems and for a batch, and calls with a time limit for each
+    time budget in `times` [s]. If `times` is empty, the budgets are those from `choose_time_budgets` that are short
+    enough to be reported.
     """
     call_specs: list[CallSpec] = []
     for subject in list_subjects(records, times):
@@ -43,7 +43,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallS
         near = [c for i, c in enumerate(equal) if i < 2 or c.score <= CANDIDATE_TIME_RATIO * best.score]
         for solver in [c.solver for c in near[:MAX_CANDIDATES]]:
             max_iter = _find_required_max_iter(records, solver, tolerance)
-            # Carrying impulses takes time: if steps are quick, a cold start may be faster.
+            # Mapping the previous step's impulses to the next takes time: if steps are quick, a cold start may win.
             for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
                 call_specs.append(
                     CallSpec(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
@@ -65,7 +65,11 @@ def _find_required_max_iter(records: Records, solver: str, tolerance: float) -> 
 def _list_time_limited_calls(
     records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, tolerance: float
 ) -> list[CallSpec]:
-    """List time limits for the solvers that come closest, and the budgets of sweeps that stay within the time."""
+    """List calls for one time budget, `advice.target` [s].
+
+    The best solvers without third-party code get a `time_limit`; the best calls with a fixed number of sweeps that
+    serve a case within the budget follow.
+    """
     start = "carried" if subject.timing_mode == "steps" else "cold"
     own = [
         c.solver for c in advice.ranking if not (s := specs().get(c.solver)) or not (s.external or s.requires)

@@ -31,11 +31,14 @@ from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
 MAX_RANK_ROWS = 300  # The rank of A is computed up to this many rows, in a fraction of a second.
-# Singular values up to this fraction of the largest count as zero. No condition number in practice is so large.
+# Singular values up to this fraction of the largest count as zero; condition numbers in practice stay below 1e12.
 ZERO_SINGULAR_VALUE_TOL = 1e-12
-MAX_MANIFOLD_BLOCKS = 8  # Largest number of contacts between one pair of bodies.
-LARGE_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is much more accurate.
-MAX_MECHANICAL_ASYMMETRY = 0.1  # Relative asymmetry of A; recorded contact problems stay below a hundredth.
+# Up to this many contacts with equal couplings count as contacts of one pair of bodies.
+MAX_MANIFOLD_BLOCKS = 8
+# Problems from this mass ratio on are "large mass ratio": J and M are more accurate than A.
+LARGE_MASS_RATIO = 1e3
+# A matrix with a larger relative asymmetry is not the A of bodies; recorded contact problems stay below 0.01.
+MAX_MECHANICAL_ASYMMETRY = 0.1
 MAX_SEEDS = 1_000_000  # Largest number of seeds in one run: name and path of each case take a kilobyte.
 DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
 
@@ -54,15 +57,16 @@ class Item:
     reason : str
         Property that the case tests.
     sequence : str
-        Sequence of which it is a step.
+        Name of the sequence that contains the case as a step; empty for a single case.
     step : int
-        Number of the step; -1 if it is not a step.
+        Number of the step; -1 for a single case.
     in_memory : Problem, optional
         The problem itself, if it was passed as an object.
     load_stored : callable
         Returns the answer stored with the problem (m,) [N s], or None.
     named : bool
-        It was requested by name, not found in a folder: if it does not load, the request is wrong.
+        Whether the user named this case. False if it was found in a folder. A named case that does not load is an
+        error of the request.
     """
 
     name: str
@@ -86,7 +90,7 @@ class Item:
     def judge_stored_answer(
         self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
     ) -> Residual | None:
-        """Judge the stored answer; None if there is none, or if its length belongs to another problem."""
+        """Judge the answer stored with the problem; return None if there is none, or if it does not have m entries."""
         impulse = self.load_stored()
         if impulse is None or impulse.shape != (self.problem.m,):
             return None
@@ -98,7 +102,7 @@ class Item:
 
 
 def is_path(word: Source) -> bool:
-    """Whether a file or folder is meant, even if it does not exist, and not a case of the suite."""
+    """Return whether `word` names a file or folder, which need not exist, and not a case of the suite."""
     if isinstance(word, Path):
         return True
     return isinstance(word, str) and (
@@ -131,7 +135,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
     if sequences is not None:
         check_bool("sequences", sequences)
     items: list[Item] = []
-    visited: set[Path] = set()  # Folders: a link in one of them may lead back to another.
+    visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
     sources = (
         [sources]
         if isinstance(sources, Source)
@@ -190,7 +194,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
 
 
 def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
-    """Resolve the source of one item in another process. An error is raised when the problem is loaded."""
+    """Create the item of a source in a worker process; an invalid source raises an error when it is loaded."""
     try:
         (item,) = resolve_sources([source])
     except Exception as error:  # The file was removed, or reading its folder raises an error.
@@ -247,7 +251,7 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     Raises
     ------
     InputError
-        It is not a folder, or it holds fewer than two problem files.
+        `folder` is not a folder, or it holds fewer than two problem files.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -270,7 +274,8 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
 def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     """Raise InputError if a folder holds steps of several recordings.
 
-    They do if two files have one number, names have two prefixes, or the engine's list does not contain a file.
+    It does if two files have the same number, if file names have different prefixes, or if the list of steps that the
+    engine wrote to the folder does not contain a file.
     """
     numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
@@ -445,7 +450,10 @@ def describe_case(item: Item, run: str) -> CaseInfo:
 
 
 def _classify_guess(item: Item) -> str:
-    """Return the value of `CaseInfo.guess`; an answer is a stored one, or a guess at which a solve would end."""
+    """Return the kind of the problem's guess for `CaseInfo.guess`: "", "start" or "answer".
+
+    A guess is an answer if it is the stored answer, or if its residual is at most `DEFAULT_SOLVE_TOL`.
+    """
     guess = item.problem.guess
     if guess is None:
         return ""
@@ -477,7 +485,10 @@ def hash_problem(problem: Problem) -> str:
 
 
 def compute_mass_ratio(problem: Problem) -> float:
-    """Compute the largest mass over the smallest, or for a matrix the ratio of A's diagonal on rows and normals."""
+    """Return the largest body mass divided by the smallest.
+
+    If bodies are not known, it is the ratio of the largest to the smallest d over bounded rows and contact normals.
+    """
     if problem.rows is not None:
         x = problem.rows.inv_mass
     else:
@@ -497,7 +508,8 @@ def classify_structure(problem: Problem) -> tuple[str, ...]:
       pairs: "dense".
     - "redundant": there are fewer independent rows than rows, if the rank is cheap to compute or the counts prove it.
     - "friction": the law. "ellipses": contacts with two coefficients. "large mass ratio": 1000 or more.
-    - "asymmetric": A is not symmetric. A matrix that is not nearly symmetric comes from no scene of bodies, and gets no
+    - "asymmetric": A is not symmetric. A matrix that is not nearly symmetric comes from no scene of bodies, and gets
+    no
       word for its graph or masses.
     """
     check_problem(problem)
@@ -542,7 +554,7 @@ def _classify_coupling_graph(problem: Problem) -> str:
 
 
 def _is_bilateral(problem: Problem) -> bool:
-    """Whether most couplings are joints, or, in a matrix, rows without bounds."""
+    """Return whether more pairs of bodies share a joint than a contact; for a matrix, whether most blocks are free."""
     if problem.law == "linear":
         return True
     r, c = problem.rows, problem.cones
@@ -567,13 +579,14 @@ def _build_body_graph(problem: Problem) -> Edges:
     pairs = np.unique(np.sort(ends[(ends >= 0).any(axis=1)], axis=1), axis=0)
     bodies, indices = np.unique(pairs, return_inverse=True)
     indices = indices.reshape(pairs.shape)[pairs[:, 0] >= 0]
-    # The ground, -1, comes first if there is one; bodies count from it.
+    # `bodies` is sorted, so the number of static bodies, -1, comes first if it occurs. Moving bodies are numbered from
+    # 0.
     ground = int(len(bodies) > 0 and bodies[0] < 0)
     return max(1, len(bodies) - ground), indices[:, 0] - ground, indices[:, 1] - ground
 
 
 def _build_block_graph(problem: Problem) -> Edges:
-    """Return the graph of blocks that A couples; blocks with equal couplings are the points of one manifold."""
+    """Return the graph of blocks that A couples; blocks with equal couplings, as of one body pair, are one node."""
     import scipy.sparse as sp
 
     c = problem.cones
@@ -586,7 +599,7 @@ def _build_block_graph(problem: Problem) -> Edges:
     patterns = [graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)]
     count = Counter(patterns)
     groups: dict[bytes | int, int] = {}
-    # More blocks with equal couplings than a manifold has points mean a dense matrix.
+    # More blocks with equal couplings than a pair of bodies has contacts mean a dense matrix: keep them separate.
     keys = [p if count[p] <= MAX_MANIFOLD_BLOCKS else k for k, p in enumerate(patterns)]
     label = np.array([groups.setdefault(key, len(groups)) for key in keys])
     g = graph.tocoo()

@@ -28,7 +28,8 @@ from lavender.solvers.registry import get, known, specs
 from lavender.solving.solve import solve
 from lavender_ext.sweep import serial
 
-#: Expected hashes of the parts of the self-test: starts are exact numbers, and kernels round equally everywhere.
+#: Expected hash of each part of the self-test. The data are exact in binary and kernels round equally on every
+#: machine.
 HASHES = {
     "pgs, coulomb": "4d51c4d5ba92212c",
     "block_gauss_seidel, coulomb": "c08c92ae0a6354d6",
@@ -44,7 +45,8 @@ HASHES = {
 def run_self_test() -> dict[str, str]:
     """Compute the hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of scenes.
 
-    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the library.
+    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the
+    library.
     """
     results = {}
     for name, law in (
@@ -57,7 +59,8 @@ def run_self_test() -> dict[str, str]:
     for name in ("sequential_impulses", "anderson"):
         results[f"{name}, bodies"] = solve(_build_test_bodies(), name, tol=0.0, max_iter=12).impulse
     results["stack, 60 steps"] = simulate_positions("stack", 60)
-    # The starts of scenes are tested, too. The rotations of a pile are drawn by NumPy and may depend on the C library.
+    # The initial positions of scenes are hashed, too. A pile's rotations are drawn by NumPy and may depend on its
+    # libm.
     gallery_scenes = [
         name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"
     ]

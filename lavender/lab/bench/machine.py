@@ -23,9 +23,8 @@ from lavender.base.errors import require_packages
 from lavender.lab.bench.record import Run
 from lavender_ext.sweep import serial
 
-BACKEND_MEMORY_FRACTION = (
-    0.5  # The processes of backends may use this fraction of the machine's memory together.
-)
+# The processes of backends may use this fraction of the machine's memory together.
+BACKEND_MEMORY_FRACTION = 0.5
 MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled code do not start.
 
 BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
@@ -143,7 +142,7 @@ def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: st
     own : number of processes of the measurement itself
     """
     known = [load for load in loads if load is not None]
-    # The margin of 0.5 covers processes of the system.
+    # The mean load may exceed the number of cores by 0.5, since the system's own processes run, too.
     if not known or fmean(known) <= max(cores, own) + 0.5:
         return ""
     return (

@@ -1,10 +1,11 @@
-"""Rank solvers: for each structure and sequence, to each tolerance and within each time.
+"""Rank solvers for each structure and sequence: by time to each tolerance, and by residual within each time budget.
 
-To a tolerance, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
-times; only runs to a tolerance count. Within a time, and with a budget of sweeps, they rank by the number of cases
-served (up to half of the start's residual is left), then by the 90th percentile of the residual; a solver is
-recommended only if it serves nine cases of ten. A case without a result in the time counts with residual 1, as the zero
-impulse. A solver with a false claim on one of the cases ranks behind all solvers without one.
+To a tolerance, solvers rank by the number of cases that they solve to it, then by the shifted geometric mean of their
+times. Only runs to a tolerance count. Within a time budget, or with a fixed number of sweeps, solvers rank by the
+number of cases served, then by the 90th percentile of the residual. A case is served if at most half of the start's
+residual remains. A solver is recommended only if it serves nine cases of ten. A case without a result within the
+budget counts with residual 1, the residual of the zero impulse. A solver with a false claim on one of the cases ranks
+behind all solvers without a false claim.
 """
 
 from __future__ import annotations
@@ -33,13 +34,11 @@ from lavender.lab.bench.statistics import (
 from lavender.lab.bench.store import Records
 
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
-SERVED_QUANTILE = (
-    0.9  # Quantile of residuals over the cases that ranks within a time; a mean would hide misses.
-)
-PREFERRED_SOLVER = "auto"  # It comes first among equals: the only name that needs no choice.
-SHORT_TIME_RATIO = (
-    0.5  # A time gets a separate sentence if it is below this fraction of the time to the tolerance.
-)
+# Within a time budget, solvers rank by this quantile of the residuals over the cases; a mean hides misses.
+SERVED_QUANTILE = 0.9
+PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
+# The report has a sentence on a time budget if it is below this fraction of the time to the tolerance.
+SHORT_TIME_RATIO = 0.5
 
 
 @dataclass(frozen=True)
@@ -49,25 +48,26 @@ class Choice:
     solver: str
     solved: int
     cases: int
-    # Ranks solvers and is shown: shifted geometric mean of times [s], or the 90th percentile of residuals [-].
+    # Value by which solvers rank: shifted geometric mean of times [s], or 90th percentile of relative residuals [-].
     score: float
-    # 95th percentile over the cases of the values that `score` summarises; inf: not reached.
+    # 95th percentile over the cases of the times [s] or residuals [-] in `score`; inf if over 5 % of the cases were
+    # missed.
     p95: float = math.nan
     worst: float = math.nan
-    hardest: str = ""  # The case of `worst`.
-    how: str = ""  # The budget, and for a sequence, whether impulses are carried.
-    iterations: int = 0  # Iterations of that budget; 0 without a budget.
+    hardest: str = ""  # Name of the case with the value `worst`.
+    how: str = ""  # Description of the call: its budget, and for a sequence, whether impulses are carried.
+    iterations: int = 0  # Iterations of a fixed budget; 0 for runs to a tolerance.
     overrun: float = math.nan  # 95th percentile of the call's time divided by its time limit.
 
     def solves_share(self, share: float) -> bool:
-        """Return whether it solves at least this share of the cases, and at least one case."""
+        """Return whether the solver solves at least this share (0 to 1) of the cases, and at least one case."""
         return self.solved >= max(1, share * self.cases)
 
     @classmethod
     def from_case_values(
         cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any
     ) -> Choice:
-        """Create it from the value of each case: a time [s] or the remaining residual [-]."""
+        """Create a choice from the value of each case: a time [s], or the remaining relative residual [-]."""
         each = list(values.values())
         return cls(
             solver=solver,
@@ -87,7 +87,8 @@ class Advice:
     family: str
     target: float  # Tolerance [-] or time [s].
     ranking: tuple[Choice, ...]
-    equal: int = 1  # Number of solvers that are equally good as the first within noise; their order is fixed.
+    # Number of leading solvers of `ranking` whose results are equal within noise, in a fixed order.
+    equal: int = 1
     min_share: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
 
     @property
@@ -105,7 +106,11 @@ RankedChoice = tuple[tuple[float, ...], Choice]  # A smaller key ranks first, wh
 
 
 def rank_choices(family: str, target: float, choices: Iterable[RankedChoice], noise: float) -> Advice:
-    """Rank by key, then by score; solvers within a factor `noise` of the best by name, so that a rerun agrees."""
+    """Rank solvers by key, then by score.
+
+    Solvers with the best key and a score of up to `noise` times the best score count as equal. They are sorted by name
+    after `PREFERRED_SOLVER`, so that a rerun gives the same order.
+    """
     order = sorted(choices, key=lambda entry: (entry[0], entry[1].score, entry[1].solver))
     if not order:
         return Advice(family, target, ())
@@ -123,7 +128,7 @@ class FamilyAdvice:
     name: str
     cases: tuple[str, ...]
     sequence: bool
-    left_out: int  # Number of steps that did not load.
+    left_out: int  # Number of steps of the sequence that did not load and are not ranked.
     by_tolerance: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
     by_sweeps: Mapping[float, Advice]
@@ -176,7 +181,7 @@ class _RunGroup:
     runs: dict[str, list[Record]] = field(default_factory=dict)  # Runs of each case.
 
     def describe_budget(self, runs: Sequence[Record]) -> dict[str, Any]:
-        """Return `how` and `iterations` of a choice from these of its runs: the median number of sweeps, if known."""
+        """Return the fields `how` and `iterations` of a choice, from the median number of sweeps in its runs."""
         if self.how or self.iterations:
             return {"how": self.how, "iterations": self.iterations}
         sweeps = [r.work["sweeps"] for r in runs if "sweeps" in r.work]
@@ -232,8 +237,8 @@ def rank_to_tolerance(
 ) -> Advice:
     """Rank the solvers that bring these cases, or steps, to a tolerance.
 
-    Only runs to a tolerance count; steps of several sequences count together, by calls with this or a tighter
-    tolerance. If `groups` is given, the records are not grouped again.
+    Only runs to a tolerance count. For steps of sequences, calls with this or a tighter tolerance count, and the steps
+    of several sequences are ranked together. `groups` is `_group_runs(records)` if it was computed before.
     """
     limit, liars = get_penalty_time_of_miss(records), _list_false_claims(records, cases)
     modes = get_modes_to_tolerance(records)
@@ -262,8 +267,8 @@ def rank_within_time(
 ) -> Advice:
     """Rank solvers by the residual that they leave on these cases, or steps, within a time [s].
 
-    A run with a time equal to the limit within noise is in it in one report and not in the next: a solver that would be
-    the best with such runs is as good as the best.
+    Whether a run whose time equals the limit within noise counts is a matter of chance. A solver that would rank first
+    with a limit that is larger by the noise is therefore listed as equally good as the best.
     """
     selected = _select_groups(cases, _group_runs(records) if groups is None else groups)
     liars = _list_false_claims(records, cases)
@@ -280,7 +285,7 @@ def rank_within_time(
 
     choices = _keep_best_of_each_solver(rank_group(group, limit) for group in selected)
     advice = rank_choices(family, limit, choices, RESIDUAL_NOISE_FACTOR)
-    # Solvers that serve fewer cases have a residual of 1 at the 90th percentile, so that noise would rank them.
+    # Recommend no solver that serves fewer cases than this quantile: its score is then a residual near 1.
     advice = replace(advice, min_share=SERVED_QUANTILE)
     if advice.best is None or math.isinf(limit):
         return advice

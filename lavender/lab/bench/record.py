@@ -50,8 +50,8 @@ _ESCAPE_SEQUENCES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 def escape_unprintable(text: str, lines: bool = False) -> str:
     """Replace characters that a terminal, file or page cannot show by their codes.
 
-    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With `lines`,
-    line ends and tabs are kept, as in messages; without, the result is one line.
+    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With
+    `lines`, line ends and tabs are kept, as in messages; without, the result is one line.
     """
     if text.isprintable():
         return text
@@ -106,9 +106,9 @@ class Run(_PrintableEntry):
     build : mapping
         Commit, hash of the kernels, compiler, BLAS, clock.
     load : float or None
-        Mean number of runnable processes in the minute before.
+        Mean number of runnable processes in the minute before the run.
     whole : bool
-        False from the start of the run until all measurements are made.
+        Whether all measurements of the run were made; False while it runs.
     """
 
     run: str
@@ -168,7 +168,7 @@ class CaseInfo(_PrintableEntry):
     condition : float or None
         Condition number of A on its range, scaled to a unit diagonal; None if it was not computed.
     proof : str
-        Distance of an enclosed exact solution, or the reason why none is; empty if it was not requested.
+        Distance of a proved exact solution, or the reason why no proof exists; empty if no proof was requested.
     """
 
     run: str
@@ -234,18 +234,21 @@ class Record(_PrintableEntry):
     status : str
         Name of a Status, ERROR, KILLED or CRASHED.
     relative : float
+        Relative residual, computed by the judge, as `energy`, `velocity` and `roundoff_floor` are.
     energy : float, sqrt J
+        Residual in the energy norm.
     velocity : float, m/s
+        Largest velocity error of a row.
     roundoff_floor : float
-        Residual, by the judge.
+        Relative residual that rounding alone can cause.
     motion_error : float or None
         Relative motion error; None if it was not requested, or if there is none.
     motion_speed : float or None, m/s
-        Motion error of the body with the largest one, or of a row without bodies.
+        Largest motion error of a body, or of a row if bodies are not known.
     bound : float or None, sqrt J
         Proved bound of the motion error.
     boundary_fraction : float or None
-        Fraction of blocks at a boundary; None if no error has a bound.
+        Fraction of blocks that rounding could move to another state; None if no bound of the answer's error is known.
     solution_hash : str
         Hash of the answer: equal for answers with equal bits.
     worst_row : int

@@ -1,9 +1,9 @@
 """Rank calls that were timed alternately, and measure the certainty of the ranking by resampling.
 
-A resampling draws the cases and the repetitions with replacement (the steps of a sequence in blocks of consecutive
-ones, since neighbours are alike). In each resampling the calls are ranked by the rule of `recommendation`; every call
-within noise of the best wins it. Noise is the difference of a score between repetitions of the whole measurement, not
-between repetitions in one loop.
+A resampling draws the cases and the repetitions with replacement. Steps of a sequence are drawn in blocks of
+consecutive steps, since neighbours are alike. In each resampling the calls are ranked by the rule of
+`recommendation`; every call with a score within noise of the best score wins the resampling. Noise is the difference
+of a score between repetitions of the whole measurement, not between repetitions in one loop.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_penalty_time_of_m
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
-SAMPLES = 500  # Resamplings of a ranking.
-MAX_ARRAY_ENTRIES = 1_000_000  # Numbers of the resamplings that are computed at a time.
+SAMPLES = 500  # Number of resamplings for each ranking.
+# Resamplings are computed in groups whose arrays have at most this many entries.
+MAX_ARRAY_ENTRIES = 1_000_000
 CERTAIN_SHARE = 0.8  # A second solver is named if the first wins a smaller share of the resamplings.
 # A solver that wins this share of the resamplings is as good a choice as the first.
 EQUAL_SHARE = 0.2
 MIN_TIME_NOISE = 1.05  # Times within this factor always count as equal: users do not notice it.
 SEQUENCE_BLOCKS = 10  # The steps of a sequence are cut into this many blocks, which are drawn as a whole.
-# The time of a call is this quantile of its repetitions, since other processes only add time.
+# The time of a call is this quantile of the times of its repetitions, since other processes can only lengthen them.
 TIME_QUANTILE = 0.25
 MIN_TIME = 1e-12  # [s] Smaller times are replaced by this, so that their logarithm exists.
 IN_TIME_SHARE = 0.95  # Share of the repetitions that must end in time.
@@ -91,7 +92,11 @@ class ResampledRanking:
 
     @property
     def named_calls(self) -> tuple[str, ...]:
-        """The recommended solver and the equally good ones; the second one if the first is not certain."""
+        """Names of the recommended solver and of solvers that win at least `EQUAL_SHARE` of the resamplings.
+
+        If no other solver does and the first wins less than `CERTAIN_SHARE`, the solver with the next largest share is
+        named, too.
+        """
         solvers = [choice.solver for _, choice in self.ranking]
         others = [s for s, share in zip(solvers[1:], self.shares[1:], strict=True) if share >= EQUAL_SHARE]
         if not others and self.shares[0] < CERTAIN_SHARE and len(solvers) > 1:
@@ -104,8 +109,8 @@ def select_calls_with_most_cases(
 ) -> list[TimedCall]:
     """Select the calls of a timing mode ("call", "steps", "batch") that ran on the largest number of cases.
 
-    With `interleaved` these are calls that were timed alternately. Without it they are runs that were measured
-    one after the other; records of earlier versions have no others.
+    With `interleaved`, calls that were timed alternately are selected; without it, runs that were measured one after
+    the other. Records of earlier versions contain only the second kind.
     """
     groups: dict[tuple[object, ...], dict[str, Record]] = {}
     for r in records:
@@ -124,7 +129,8 @@ def select_calls_with_most_cases(
     ]
     if timing_mode != "batch":
         return calls
-    # A batch of some of the cases cannot be compared with a call on all of them.
+    # A batch of some cases cannot be compared with single calls on all cases: keep batches of equal sets of cases
+    # only.
     complete = {
         (f.as_record.solver, *sorted(f.runs))
         for one in ("call", "steps")
@@ -137,7 +143,7 @@ STARTS = {"cold": "cold", "carried": "warm from the previous step"}
 
 
 def _keep_best_of_each_solver(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
-    """Keep one call of each solver: the start that brings more cases to the tolerance, then the faster one."""
+    """Keep the call of each solver that misses the tolerance on the fewest cases; among equal calls, the fastest."""
     best: dict[str, TimedCall] = {}
     for call in sorted(
         calls, key=lambda f: (sum(not r.relative <= tolerance for r in f.runs.values()), f.mean_time)
@@ -151,7 +157,8 @@ def rank_calls_to_tolerance(
 ) -> ResampledRanking | None:
     """Rank calls by the number of cases that they bring to the tolerance, then by the geometric mean of times.
 
-    `cases` is the number of all cases, if calls were timed on fewer. Returns None without such a call.
+    `cases` is the number of all cases, if the calls were timed on fewer. Return None if no call has this or a tighter
+    tolerance.
     """
     calls = _keep_best_of_each_solver(
         [f for f in calls if f.as_record.mode == "tol" and f.as_record.tol <= tolerance], tolerance
@@ -208,10 +215,11 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
 def recommend_for_cases(
     records: Records, alone: Advice, calls: Sequence[TimedCall], cases: Sequence[str]
 ) -> Advice:
-    """Rank solvers to a tolerance on some cases by the rule and the times of the report's first sentence.
+    """Rank solvers on `cases`: solvers of calls that were timed alternately come first, then the others of `alone`.
 
-    Solvers of `calls`, which were timed alternately, come first, then the others of `alone`. Returns `alone` if no call
-    was timed on these cases, or if the calls solve fewer of them.
+    `calls` are ranked by `rank_calls_to_tolerance`, as in the first sentence of a report. `alone` is the ranking by
+    runs that were measured one after the other. It is returned unchanged if none of `calls` was timed on these cases,
+    or if the best call solves fewer of them than its best solver.
     """
     parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
     resampled = rank_calls_to_tolerance(records, [f for f in parts if f.runs], alone.target, len(cases))
@@ -238,10 +246,10 @@ def recommend_for_cases(
 def rank_calls_in_time(
     records: Records, calls: Sequence[TimedCall], limit: float, cases: int = 0
 ) -> ResampledRanking | None:
-    """Rank calls within a time [s] by the number of cases served, then by the residual at the 90th percentile.
+    """Rank calls within a time budget `limit` [s]: by the cases served, then by the 90th percentile of the residual.
 
-    A case is served if in 95 of 100 repetitions the call took no more than the time and left at most half of the
-    start's residual. Returns None if no call has a budget or a shorter time limit.
+    A case is served if, in 95 of 100 repetitions, the call took at most the time budget and left at most half of the
+    start's residual. Return None if no call has a fixed number of iterations or a time limit below `limit`.
     """
     calls = [
         f
@@ -299,7 +307,10 @@ def _list_cases(calls: Sequence[TimedCall]) -> list[str]:
 def _stack_repetitions(
     calls: Sequence[TimedCall], names: Sequence[str], values_of: Callable[[Record], Sequence[float]]
 ) -> FloatArray:
-    """Return values by (calls, cases, repetitions): nan if a case did not run, repeated if repetitions are fewer."""
+    """Return an array (calls, cases, repetitions) of `values_of` each record.
+
+    Entries of cases that did not run are nan. If a call has fewer repetitions than another, its values are repeated.
+    """
     max_repeats = max(len(values_of(r)) for f in calls for r in f.runs.values())
     return np.array(
         [
@@ -359,7 +370,7 @@ def _rank_by_resampling(
     false_claims = np.array([any(r.status_conflict for r in f.runs.values()) for f in calls])
     for cases, repetitions in _draw_samples(blocks, repeats, max(1, MAX_ARRAY_ENTRIES // values.size)):
         sampled = score(values[:, cases[:, :, None], repetitions[:, None, :]])  # Shape (calls, samples).
-        # A false claim comes last, then the call that misses more cases.
+        # Calls with a false claim rank last; the others rank by the number of missed cases, then by score.
         behind = missed[:, cases].sum(axis=2) + 1e6 * false_claims[:, None]
         first = behind == behind.min(axis=0)
         best = np.where(first, sampled, math.inf).min(axis=0)
@@ -368,7 +379,7 @@ def _rank_by_resampling(
         for lost, ratios, own in zip(losses, sampled / best, won, strict=True):
             lost.extend(ratios[~own])
     shares = wins / SAMPLES
-    # Among calls that win about as often as the best, the preferred solver, then by name: a rerun agrees.
+    # Calls that win about as often as the best are sorted by name after the preferred solver, so that reruns agree.
     order = sorted(
         range(n),
         key=lambda i: (

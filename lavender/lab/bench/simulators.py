@@ -4,14 +4,14 @@ Each model is simulated under random controls. At some of its steps the constrai
 solved from a cold start by both solvers to the same judged residual:
 
     MuJoCo      `mj_fwdConstraint` with the Newton solver, at the loosest tolerance with an accepted answer
-    lavender    `lavender.solve(problem)`: prepare, solve and judge; `solve` of one that was prepared for the same
-                structure; `solve_many`; and `from_mujoco` with `lavender.solve`
+    lavender    four calls: `lavender.solve(problem)`, which prepares, solves and judges; `Prepared.solve` of an object
+                prepared for the same structure; `solve_many`; and `from_mujoco` followed by `lavender.solve`
 
-Except in the last, building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of
-the same number of repetitions for both.
+Only the fourth includes building the problem and factoring M, as MuJoCo's time does not include `mj_factorM`. Times
+are minima of the same number of repetitions for both solvers.
 
-`measure_model_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the
-impulses of the last step, matched by key. MuJoCo has its own tolerance.
+`measure_model_warm` measures consecutive steps: MuJoCo starts from the accelerations of the step before, lavender from
+the impulses of the step before, matched by key. MuJoCo uses the tolerance of the model.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
 TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
-STRICT_RESIDUAL = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
+STRICT_RESIDUAL = 1e-9  # Tolerance of a second run of lavender's solver, whose residual is reported.
 MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # The loosest tolerance comes first.
 N_REPEATS = 20
 BATCH_SIZE = 64  # Number of problems in one call of solve_many.
@@ -87,7 +87,8 @@ class Step(WarmStep):
     strict : float
         Relative residual of lavender's solver with the tolerance STRICT_RESIDUAL.
     coulomb : float or None
-        The same under Coulomb's law; None if a contact has more than two tangents.
+        Relative residual of lavender's solver under Coulomb's law with the tolerance STRICT_RESIDUAL; None if a
+        contact has more than two tangents.
     """
 
     nv: int
@@ -116,7 +117,10 @@ def measure_min_time(run: Callable[[], Any], repeats: int = N_REPEATS) -> float:
 
 
 def time_mujoco_newton(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
-    """Return (tolerance, time, residual) of MuJoCo's Newton at the loosest accepted tolerance, or 0, its default."""
+    """Return (tolerance, time [s], relative residual) of MuJoCo's Newton solver at the loosest sufficient tolerance.
+
+    If no tolerance of MUJOCO_TOLERANCES gives TARGET_RESIDUAL, the model's own tolerance is used and returned as 0.
+    """
     model = copy.copy(model)
     default = model.opt.tolerance
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
@@ -133,7 +137,7 @@ def time_mujoco_newton(mj: Any, model: Any, data: Any, problem: Problem) -> tupl
 
 
 def time_one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solution]:
-    """Return the minimum time of a solve [s], and its solution, which is always the same."""
+    """Solve repeatedly; return the minimum time [s] and the solution, which is equal in all repetitions."""
     best = np.inf
     for _ in range(N_REPEATS):
         cold_problem = copy_without_guess(problem)
@@ -149,7 +153,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
     batch_time, residual_found = np.inf, solution.residual.relative
     for _ in range(N_REPEATS):
         batch = [copy_without_guess(problem) for _ in range(BATCH_SIZE)]
-        begin = thread_time()  # CPU time: the batch takes milliseconds and may be interrupted.
+        begin = thread_time()  # CPU time, as a call of milliseconds may be interrupted by other processes.
         solutions = solve_many(batch, tol=TARGET_RESIDUAL)
         batch_time = min(batch_time, (thread_time() - begin) / BATCH_SIZE)
         residual_found = max(residual_found, *(solution.residual.relative for solution in solutions))

@@ -29,13 +29,12 @@ STRUCTURE_ORDER = (
 )  # Order in which tables list structures.
 DEATH_STATUSES = ("ERROR", "KILLED", "CRASHED")
 EASY_RESIDUAL = 1e-3  # Relative residual to which sweeps are counted as a measure of difficulty.
-TIME_NOISE_FACTOR = (
-    1.25  # Times within this factor are equal: a busy machine changes the minimum of repeats by it.
-)
-RESIDUAL_NOISE_FACTOR = (
-    2.0  # Residuals within this factor are equal: one run more or less in a time changes as much.
-)
-MEAN_TIME_SHIFT = 1e-5  # [s] Added to times in geometric means, since Python dominates shorter calls.
+# Times within this factor count as equal: a busy machine changes the minimum of repeats by this much.
+TIME_NOISE_FACTOR = 1.25
+# Residuals within this factor count as equal: one run more or less within a time budget changes as much.
+RESIDUAL_NOISE_FACTOR = 2.0
+# [s] Shift of geometric means of times. In shorter calls, the overhead of Python dominates.
+MEAN_TIME_SHIFT = 1e-5
 
 
 def get_tolerances(records: Records) -> tuple[float, ...]:
@@ -52,7 +51,7 @@ def get_modes_to_tolerance(records: Iterable[Record]) -> frozenset[str]:
 
 
 def group_runs_by_pair(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
-    """Group runs in the given order of blocks by (case, solver, start)."""
+    """Group the runs with the sweep order "given" by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
         if r.order == "given" and r.step < 0 and not r.interleave_group:
@@ -63,8 +62,8 @@ def group_runs_by_pair(records: Iterable[Record]) -> dict[tuple[str, str, str], 
 def group_cases_by_family(records: Records) -> dict[str, list[str]]:
     """Group cases by structure. A case is in the family of every word that describes it.
 
-    A structure with cases of several laws is a family for each law: "pile, coulomb". Words that describe the same
-    cases are one family: "stack / friction".
+    If the cases of a word have several friction laws, each law is a family: "pile, coulomb". Words that describe the
+    same set of cases form one family: "stack / friction".
     """
     cases_by_word: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     ran = {r.case for r in records if r.step < 0}
@@ -117,7 +116,7 @@ class Reach:
     motion_error : float
         Relative motion error of the best run; nan without one.
     bound : float, sqrt J
-        Its proved bound; nan without one.
+        Proved bound of this motion error; nan without one.
     """
 
     case: str
@@ -155,7 +154,8 @@ class Difficulty:
         Fraction of blocks at a boundary in the best answer, of the blocks with a bounded error.
     proof : str
     same : tuple of str
-        Solvers that returned the same bits without an iteration: they share a shortcut, which their times measure.
+        Solvers that returned bit-identical answers without an iteration. They took the same shortcut, so their
+        times measure the shortcut and not the solvers.
     """
 
     case: str
@@ -176,9 +176,10 @@ class Claims:
     solver : str
     runs : int
     claims, wrong : int
-        Runs with the status CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE, and those that the judge contradicts.
+        Number of runs with the status CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE, and number of these statuses that the
+        judge contradicts.
     attempted, reached : int
-        Runs to a tolerance, and those that reached it by the judge.
+        Number of runs to a tolerance, and number of these runs whose judged residual reached it.
     crashed : int
         Runs with the status ERROR, KILLED or CRASHED.
     """
@@ -204,7 +205,7 @@ class Spread:
 
     @property
     def worst_to_best_ratio(self) -> float:
-        """Ratio of the worst to the best order, with residuals below the floor raised to it."""
+        """Ratio of the largest to the smallest residual of an order; residuals below the floor count as the floor."""
         values = [
             max(v, self.roundoff_floor) for v in self.by_order.values() if max(v, self.roundoff_floor) > 0.0
         ]
@@ -246,7 +247,7 @@ def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None 
 
 
 def _repeats_earlier_run(r: Record) -> bool:
-    """Return whether an interleaved run repeats an earlier one; runs with a time limit have no earlier one."""
+    """Return whether a run times a call again that was measured before: an interleaved call without a time limit."""
     return bool(r.interleave_group) and r.mode != "time"
 
 
@@ -329,7 +330,7 @@ def compute_order_spreads(records: Records) -> list[Spread]:
 
 
 def group_runs_by_budget(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
-    """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
+    """Return (iterations, residual) of runs with a fixed budget and the order "given", by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
         if r.mode != "budget" or r.interleave_group:
@@ -360,7 +361,7 @@ class Change:
 
     @property
     def kind(self) -> str:
-        """reached | lost | faster | slower | same."""
+        """Kind of the change: "reached", "lost", "faster", "slower" or "same"."""
         if math.isfinite(self.new) != math.isfinite(self.old):
             return "reached" if math.isfinite(self.new) else "lost"
         if not math.isfinite(self.new) or self.old / self.noise <= self.new <= self.old * self.noise:
@@ -371,8 +372,9 @@ class Change:
 def compare_times(old: Records, new: Records) -> list[Change]:
     """Compare times to each tolerance of two runs, on cases with the same numbers in both.
 
-    Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
-    Earlier times are multiplied by the drift of the case, if both runs have measured it.
+    `Change.noise` is the larger of `TIME_NOISE_FACTOR` and 1 + 2 (r - 1), with r the largest ratio of median to
+    minimum time in either run. Earlier times are multiplied by the machine's drift on the case
+    (`compute_machine_drift`).
     """
     tolerances = get_tolerances(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
@@ -395,7 +397,11 @@ def compare_times(old: Records, new: Records) -> list[Change]:
 
 
 def compute_machine_drift(old: Records, new: Records, case: str = "") -> float:
-    """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
+    """Return the time of the calibration loop in the new run divided by its time in the old run.
+
+    Each time is a median over the runs of `case`, or over all runs if `case` is empty. The ratio is 1 if a run did not
+    measure the loop.
+    """
     medians = []
     for records in (old, new):
         some = [r.calibration_time for r in records if r.calibration_time and (not case or r.case == case)]
@@ -428,7 +434,10 @@ def compute_quantile(values: Sequence[float], q: float) -> float:
 
 
 def collect_times_to_tolerance(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
-    """Return the time [s] to a tolerance from a cold start by case and solver, inf if missed, without refused cases."""
+    """Return {case: {solver: time [s] to the tolerance from a cold start}}.
+
+    A missed tolerance has the time inf. A solver that refuses a case has no entry.
+    """
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for reach in summarize_runs_by_case(records, [tolerance]):
         if reach.start == "cold":
@@ -451,15 +460,15 @@ def count_sweeps_and_products(record: Record) -> float:
 
 
 def find_solvers_with_other_work(records: Iterable[Record]) -> set[str]:
-    """Return the solvers with a run with other work than passes over A (`count_sweeps_and_products`)."""
+    """Return the solvers with work that is not sweeps or products with A (`count_sweeps_and_products`) in some run."""
     return {r.solver for r in records if r.is_usable and math.isnan(count_sweeps_and_products(r))}
 
 
 def count_sweeps_and_products_to_tolerance(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
-    """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
+    """Return {case: {solver: number of passes over A to the tolerance from a cold start}}; inf for a missed tolerance.
 
-    As for times, only runs to a tolerance count. Solvers with other work in their runs are left out
-    (`find_solvers_with_other_work`). Less than one pass counts as one.
+    As for times, only runs to a tolerance count. Solvers that do other work (`find_solvers_with_other_work`) are left
+    out. A number below one counts as one pass.
     """
     modes = get_modes_to_tolerance(records)
     groups = {k[:2]: group for k, group in group_runs_by_pair(records).items() if k[2] == "cold"}
@@ -479,9 +488,9 @@ def get_penalty_time_of_miss(records: Records) -> float:
 
 
 def compute_mean_times_by_law(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
-    """Return (shifted geometric mean [s], solved, cases) by law, tolerance and solver; a miss takes the time limit.
+    """Return {law: {tolerance: {solver: (shifted geometric mean of times [s], solved cases, all cases)}}}.
 
-    A law's table has the solvers that accept every case of it.
+    A missed tolerance counts with the time limit. Only solvers that accept every case of a law are included.
     """
     limit = get_penalty_time_of_miss(records)
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
@@ -577,10 +586,11 @@ def _select_solvers_with_all_times(
 
 
 def compute_profiles(records: Records, measure: str = "time") -> list[Profile]:
-    """Compute the share of cases that a solver solves within `ratio` times the best; a miss is infinite.
+    """Compute Dolan-More performance profiles, one for each law and tolerance.
 
-    The cases have one law and are of one run (`Records.select_latest_run`); a case that no solver solves is a miss of
-    all.
+    A profile gives the share of cases that a solver solves within a multiple of the best solver's time or work. A case
+    that a solver misses counts with an infinite multiple. The cases of a profile have one law and belong to one run
+    (`Records.select_latest_run`); a case that no solver solves counts as missed by all solvers.
 
     Parameters
     ----------
@@ -621,7 +631,7 @@ class Robustness:
     family: str
     solver: str
     cases: int
-    reached: Mapping[float, int]  # Tolerance -> number of cases with a run to a tolerance that reached it.
+    reached: Mapping[float, int]  # Tolerance -> number of cases that the solver solved to this tolerance.
     wrong: int  # Number of contradicted claims.
     died: int
     budgets: Mapping[int, tuple[float, float]]  # Iterations -> median and 95th percentile of the residual.
@@ -708,7 +718,7 @@ class Pass:
         cold, carried = self.residuals.get("cold"), self.residuals.get("carried")
         if not cold or not carried:
             return math.nan
-        # A pass that was stopped has fewer steps.
+        # A pass that was stopped has fewer steps than the other: compare the steps that both solved.
         pairs = [(c, w) for c, w in zip(cold, carried, strict=False) if w > 0.0 and math.isfinite(c)]
         return median(c / w for c, w in pairs) if pairs else math.nan
 
@@ -741,7 +751,7 @@ def group_runs_by_pass(records: Records) -> list[Pass]:
 
 
 def _get_step_time(r: Record) -> float:
-    """Return the time of a step: its limit if it has no result."""
+    """Return the time [s] of a step, or its time limit if it has no result."""
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 

@@ -1,7 +1,7 @@
 """Measure the time that a backend spends in its own solve during a call of `lv.solve`.
 
-The class or function of the backend's own interface is wrapped while the call runs. The time of backends that set up
-within one function (daqp, quadprog, scs) includes that set-up.
+The class or function of the backend's own interface is wrapped while the call runs. For backends that set up and solve
+in one function (daqp, quadprog, scs), the time includes the set-up.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 
 SETUP_METHODS = ("setup", "init")  # Methods of the backends' classes that receive the data.
 
-#: Entry points of each backend, as lavender.external and qpsolvers look them up: module:class.method or
-#: module:function.
+#: Functions of each backend that are timed, as "module:class.method" or "module:function". These are the names by
+#: which lavender.external and qpsolvers call them.
 BACKEND_ENTRY_POINTS = {
     "clarabel": ("clarabel:DefaultSolver.solve",),
     "clarabel_cone": ("clarabel:DefaultSolver.solve",),
@@ -34,7 +34,7 @@ BACKEND_ENTRY_POINTS = {
 
 
 def excludes_setup(solver: str) -> bool:
-    """Return whether the time of a backend's own solve has no set-up: it is a method, and data come to it before."""
+    """Return whether the measured time of a backend excludes its set-up, which is then a call of its own."""
     entry_points = BACKEND_ENTRY_POINTS.get(solver, ())
     return bool(entry_points) and all("." in point.partition(":")[2] for point in entry_points)
 

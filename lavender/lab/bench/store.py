@@ -1,7 +1,7 @@
 """Store records on disk: one JSON object per line, appended and flushed as each is made; CSV and JSON on request.
 
-A run that was killed leaves at most one incomplete line, the last one, which is removed before the next is written. One
-process writes a file, under the lock of `lavender.io.stored.lock_output`.
+A run that was killed leaves at most one incomplete line, the last one, which is removed before the next is written.
+One process writes a file, under the lock of `lavender.io.stored.lock_output`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class Records:
     cases: dict[str, CaseInfo] = field(default_factory=dict)  # The latest description of each case.
     records: list[Record] = field(default_factory=list)
     source: str = ""
-    selected_from: tuple[str, ...] = ()  # All solvers with records, if these are a selection of them.
+    # If `of_solvers` selected these records: all solvers before the selection.
+    selected_from: tuple[str, ...] = ()
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
     # The identity of each sequence in its latest description.
     _sequences: dict[str, str] = field(default_factory=dict, repr=False)
@@ -63,7 +64,7 @@ class Records:
 
     @property
     def left_out(self) -> dict[str, list[Skip]]:
-        """Cases that did not load, by sequence ("" if none). All numbers leave them out, and each table states this."""
+        """Cases that did not load, by sequence ("" for single cases). No number of a report counts them."""
         found: dict[str, list[Skip]] = {}
         for skip in self._skips.values():
             if not skip.solver:
@@ -73,7 +74,7 @@ class Records:
     def add(self, entry: Entry) -> None:
         """Add one entry. A description, note or run replaces the earlier one."""
         if isinstance(entry, Run):
-            self.runs.pop(entry.run, None)  # The newest run becomes the last one.
+            self.runs.pop(entry.run, None)  # Insert the run again at the end, where the newest run is.
             self.runs[entry.run] = entry
         elif isinstance(entry, CaseInfo):
             if (
@@ -84,7 +85,8 @@ class Records:
                 self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
                 self._sequences[entry.sequence] = entry.identity
             self.cases[entry.case] = entry
-            self._skips.pop((entry.run, entry.case, ""), None)  # The case loads now.
+            # Remove an earlier note that the case does not load.
+            self._skips.pop((entry.run, entry.case, ""), None)
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
         else:
@@ -108,7 +110,7 @@ class Records:
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
         ]
-        # Calls that were timed alternately.
+        # Keep only the newest group of calls that were timed alternately.
         newest = next((r.interleave_group for r in reversed(mine) if r.interleave_group), "")
         mine = [r for r in mine if r.interleave_group in ("", newest)]
         cases = {r.case for r in mine}
@@ -119,7 +121,7 @@ class Records:
     def with_records(
         self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
     ) -> Records:
-        """Return other records of the same runs, with the descriptions and notes that `keep` accepts."""
+        """Return a copy that holds `records`, and the runs, case descriptions and notes that `keep` accepts."""
         found = Records(source=self.source, selected_from=self.selected_from)
         entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips]
         for entry in (*filter(keep, entries), *records):
@@ -148,7 +150,7 @@ class Records:
 
     @property
     def solvers(self) -> set[str]:
-        """The solvers with records, and those that a selection left out."""
+        """The solvers with records, and the solvers that `of_solvers` removed."""
         return {*self.selected_from, *(r.solver for r in self.records)}
 
     def is_successful(self, record: Record) -> bool | None:
@@ -230,12 +232,12 @@ class Store:
         self._synced = time.monotonic()
 
     def add(self, entry: Entry) -> None:
-        """Write one entry and hand it to the operating system before anything else happens.
+        """Write one entry and flush it to the operating system before returning.
 
         Raises
         ------
         InputError
-            The disk is full; earlier entries are stored. Or the file was removed.
+            The disk is full (earlier entries are stored), or the file was removed.
         """
         line = json.dumps(to_json(entry), allow_nan=False)
         try:
@@ -257,7 +259,7 @@ class Store:
         self.records.add(entry)
 
     def close(self) -> None:
-        """Close the file and release its lock. A full disk was reported when an entry was added."""
+        """Close the file and release its lock. Errors of the disk are ignored here: `add` has raised them."""
         with contextlib.suppress(OSError):
             self.file.close()
         self._lock.close()
@@ -295,7 +297,7 @@ def read_records(path: str | Path) -> Records:
     Raises
     ------
     InputError
-        No such file, or a line that is not a record.
+        The file does not exist, or a line is not a record.
     """
     path = as_path(path)
     if path.is_dir():
@@ -320,7 +322,7 @@ def read_records(path: str | Path) -> Records:
                 "a complete records.jsonl is needed"
             )
         found.add(entry)
-    # A repeated measurement replaces the earlier one, in its place.
+    # A repeated measurement takes the place of the earlier one in the list.
     newest = {(r.run, r.key): r for r in found.records}
     found.records = list(newest.values())
     return found

@@ -7,7 +7,7 @@ from typing import Any
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.solvers import registry
 
-COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # Removes the guess of a problem.
+COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # Python expression of a problem without its guess.
 CARRIED_START = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
@@ -42,9 +42,9 @@ def _format_exactly(x: float, short: str) -> str:
 
 
 def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
-    """Return the lines with which a record was measured; the last one was timed.
+    """Return the lines of Python with which a record was measured; the last line is the timed call.
 
-    `guessed`: some problems have a guess, which a cold start removes.
+    If `guessed` is true, some problems have a guess, and the lines of a cold start remove it.
     """
     arguments = make_call_arguments(record, record.iterations)
     text = {

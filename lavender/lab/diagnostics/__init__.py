@@ -9,10 +9,11 @@ that hold for the data of real bodies:
     targets     target = b + J v*: zero on tangents, not negative if bodies overlap                     (3)
     speeds      v* is a velocity, not g = 9.81 m/s^2; targets and approach speeds are plausible         (4)
 
-For a problem in J and M, (1) is checked if all contacts belong to free rigid bodies: six velocities in the world frame,
-coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm r.
+For a problem in J and M, (1) is checked if all contacts belong to free rigid bodies: six velocities in the world
+frame, coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm
+r.
 
-Every threshold keeps a distance from the values in the built-in suite, the scenes of the gallery, robots and recorded
+Thresholds are well outside the values that occur in the built-in suite, the scenes of the gallery, robots and recorded
 problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the diagnostic says so.
 """
 
@@ -37,10 +38,11 @@ def diagnose(
 ) -> tuple[Diagnostic, ...]:
     """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
-    Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
-    the guess. Up to 1000 rows, it also searches a proof that the convex relaxation has no solution (Newton's method)
-    and names the conflicting blocks. A diagnostic need not be an error: a hook has normals against its arms, a conveyor
-    has targets on tangents. An empty result proves nothing.
+    Checked are the signs and order of normals, bodies and their sizes, masses, the order of rows, targets,
+    coefficients, keys and the guess. For up to 1000 rows, Newton's method also searches for a proof that the convex
+    relaxation has no solution, and the conflicting blocks are named. A diagnostic need not be an error: a hook has
+    normals against its arms, a conveyor has targets on tangents. An empty result does not prove that the data are
+    right.
 
     Parameters
     ----------
@@ -48,10 +50,11 @@ def diagnose(
     impulse : (m,) N s, optional
         A solution to examine; default: the problem's guess.
     velocity : (n, 6) for bodies, (nv,) for J and M, m/s and rad/s, optional
-        Velocity before the step. Only a comparison of v* with it shows accelerations that lack dt or are missing.
+        Velocity before the step. It is compared with v*, which shows accelerations that were not multiplied by dt or
+        were left out.
     gap : (n_contacts,), m, optional
-        Distance between the surfaces of each contact, negative if they overlap; requires `dt`. Only a comparison of the
-        targets with it shows a wrong sign, or a factor dt too many or too few.
+        Distance between the surfaces of each contact, negative if they overlap; requires `dt`. It is compared with the
+        targets, which shows a wrong sign, or a factor dt too many or too few.
     dt : float, s, optional
         Step size.
 

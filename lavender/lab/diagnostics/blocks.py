@@ -14,10 +14,9 @@ from lavender.problem import Problem
 from lavender.solvers.certify import find_conflict
 
 MAX_PLAUSIBLE_FRICTION = 10.0  # [-] No pair of materials has a larger friction coefficient.
-MAX_CONFLICT_ROWS = (
-    1000  # Larger problems are not searched for a proof that no solution exists: it takes seconds.
-)
-CONFLICT_TOL = 1e-6  # [-] The proof must exclude answers with this relative residual.
+# [rows] For larger problems, no proof that no solution exists is searched: it takes seconds.
+MAX_CONFLICT_ROWS = 1000
+CONFLICT_TOL = 1e-6  # [-] A proof counts only if it excludes every answer with up to this relative residual.
 
 
 def diagnose_friction(p: Problem) -> Iterator[Diagnostic]:
@@ -56,7 +55,8 @@ def diagnose_row_order(p: Problem) -> Iterator[Diagnostic]:
             p, "all normals first", reason + "tangent, tangent, then the next contact", full
         )
         return
-    # Only b is left to check. Along a normal it is an approach velocity: gravity, a bounce, a penetration depth.
+    # For a matrix, only b can be checked. On a normal row, b is an approach velocity from gravity, bounce or
+    # penetration.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
     whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
     size = whole.sum()
@@ -103,7 +103,8 @@ def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
         seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
         if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
             opposed += [other, i]
-    if len(again) > max(2, 0.3 * len(contacts)):  # Collision detection occasionally repeats a point.
+    # Fewer duplicates are normal: collision detection repeats points.
+    if len(again) > max(2, 0.3 * len(contacts)):
         yield make_diagnostic(
             p, "duplicate rows", f"{len(again)} contacts have the same rows as an earlier one", again
         )

@@ -20,9 +20,8 @@ MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problem
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
     ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
 )
-MAX_CENTRE_DISTANCE = (
-    0.25  # [-] The centres of one pair of bodies may differ between contacts by this fraction of the arms.
-)
+# [-] Contacts of one pair of bodies may imply centre distances that differ by this fraction of the arms.
+MAX_CENTRE_DISTANCE = 0.25
 
 
 def reconstruct_bodies(p: Problem) -> Rows | None:
@@ -33,7 +32,10 @@ def reconstruct_bodies(p: Problem) -> Rows | None:
 
 
 def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
-    """Compute the result of `reconstruct_bodies`; `rows` (c, 3): rows of J of each contact, if not the cones'."""
+    """Compute the result of `reconstruct_bodies`.
+
+    `rows` (c, 3) holds the rows of J of each contact; the default is the rows of the problem's cones.
+    """
     g, c = p.generalized, p.cones
     contact = c.is_contact
     if g is None or g.nv > MAX_DENSE_VELOCITIES or not contact.any() or np.any(c.n_tangents[contact] != 2):
@@ -42,7 +44,7 @@ def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) ->
         rows = c.ptr[:-1][contact][:, None] + np.arange(3)
     mass, part = g.mass.toarray(), g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
-    for j in find_free_bodies(mass):  # The angular velocity of a ball has equal inertias, too.
+    for j in find_free_bodies(mass):  # Three equal entries of M may also be the rotational inertia of a ball.
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
             six.append(np.arange(j, j + 6))
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
@@ -116,7 +118,7 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
         yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
     if p.rows is None:
-        return  # `blocks.diagnose_duplicate_contacts` compares the rows of J
+        return  # Without reconstructed bodies, `blocks.diagnose_duplicate_contacts` compares the rows of J.
     again, opposed = _find_coincident(r, size)
     if len(again):
         reason = f"{len(again)} contacts are at the position of another contact of the pair"
@@ -142,10 +144,14 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
 
 
 def _find_coincident(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return contacts that repeat another of their pair to rounding, and contacts that oppose one within 1 %."""
+    """Return two index arrays of contacts, each compared with the other contacts of its pair of bodies.
+
+    The first holds contacts that are equal to another up to rounding, the second contacts that are opposite to another
+    within 1 %.
+    """
     pair = np.sort(r.contact_body, axis=1)
     sign = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
-    # The arm on the body with the larger number, which moves.
+    # Compare the arms on the body with the larger number, which is a moving body.
     arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
     n = sign * r.normal
     order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
@@ -176,7 +182,8 @@ def _compute_centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatA
     to_centres = incidence.T.tocsr()
     a, b = pair.T
     diagonal = np.arange(n)
-    # Positions of the weights in incidence^T weight incidence; the constructor adds entries at one position.
+    # Positions of the weights in incidence^T weight incidence. The sparse constructor adds entries with equal
+    # positions.
     positions = (np.r_[a, b, a, b, diagonal], np.r_[a, b, b, a, diagonal])
     scale = np.abs(between).max()
     if not 0.0 < scale < np.inf:
@@ -208,7 +215,8 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
         return
     m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
     given = MISTAKEN_READINGS[p.generalized is not None]
-    readings = {  # (2), with each number read as given, or as its inverse
+    # Left side of (2) with mass and inertia as given, and with one or both replaced by the inverse.
+    readings = {
         "": (1.0 / e).sum(axis=1) * m,
         given[0]: (1.0 / e).sum(axis=1) / m,
         given[1]: e.sum(axis=1) * m,
@@ -286,7 +294,7 @@ def diagnose_inverted_matrices(p: Problem) -> Iterator[Diagnostic]:
 
 
 def find_free_bodies(mass: FloatArray) -> list[int]:
-    """Return the first of each three uncoupled velocities of equal mass: the linear velocities of a free body."""
+    """Return the index of the first linear velocity of each free body: the first of three uncoupled, equal masses."""
     n = len(mass)
     d = mass.diagonal()
     at = np.arange(n - 2)

@@ -18,14 +18,14 @@ from lavender.problem.rows import Rows
 G = 9.81  # [m/s^2]
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
 MAX_SEPARATION_TARGET = 30.0
-MAX_APPROACH_TARGET = (
-    1000.0  # [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
-)
-MIN_RESTITUTION = 0.05  # [-] Smaller ratios are not a bounce but targets with a factor dt too many.
-RESTITUTION_ROUNDING = (
-    1e-6  # [-] Equal coefficients of restitution, computed from velocities, differ by less.
-)
-# [m/s] Approach speeds in this range suggest a target without dt; larger speeds are in other units.
+# [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
+MAX_APPROACH_TARGET = 1000.0
+# [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
+MIN_RESTITUTION = 0.05
+# [-] Coefficients of restitution that are computed from velocities count as equal up to this difference.
+RESTITUTION_ROUNDING = 1e-6
+# [m/s] Approach speeds in this range suggest a target that lacks a factor dt; larger speeds suggest other units than
+# m/s.
 SUSPICIOUS_APPROACH = 30.0, 1e4
 
 
@@ -40,7 +40,8 @@ def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, 
     else:
         return None
     target = p.b + u
-    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0  # This is rounding of b and J v*.
+    # Smaller targets are rounding of b + J v*.
+    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0
     return u, target, v
 
 
@@ -86,7 +87,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     full = np.flatnonzero(c.n_tangents == 2)
     each = np.abs(target[c.ptr[full][:, None] + np.arange(3)])
     used, largest = each.any(axis=0), each.max(axis=1, initial=0.0)
-    # The targets of a conveyor are equal.
+    # Equal targets on tangents are a conveyor's and plausible.
     if not used[:1].any() and used[1:].sum() == 1 and np.ptp(largest) > 0.01 * largest.max():
         reason = (
             f"the {'second' if used[1] else 'third'} row of contacts has targets, the first never; the rows "
@@ -141,10 +142,10 @@ def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
 
 
 def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if static bodies push falling bodies further down.
+    """Yield a diagnostic if the normals of static bodies push falling bodies further down.
 
-    Checked if most bodies have the same v*, the velocity change of gravity in one step: static bodies then support them
-    from below.
+    The check is made only if most bodies have the same v*. This v* is the velocity change by gravity in one step, and
+    static bodies must then support the others from below.
     """
     r = reconstruct_bodies(p)
     if r is None or np.count_nonzero(r.inv_mass) < 2:
@@ -208,7 +209,7 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= MAX_DENSE_VELOCITIES:
             push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
-        # Use free bodies if there are any: the light links of a robot are accelerated more.
+        # Use free bodies only, if there are any: light links of a robot have larger accelerations than gravity.
         fall = np.linalg.norm(push, axis=1) if len(push) else change
         fall = fall[fall > 0.01 * fall.max()]  # Ignore bodies on which no force acts.
         typical = float(np.median(fall)) if len(fall) else 0.0
@@ -240,7 +241,11 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
 
 
 def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which targets (c,) are -e times the approach before the step (c,) with one e, independent of gaps."""
+    """Return a mask (c,) of the contacts whose targets are bounces, which do not depend on gaps.
+
+    A target is a bounce if it is -e times the normal velocity `before` the step (c,) [m/s], with the same restitution
+    coefficient e for all of these contacts.
+    """
     approach = before < 0.0
     e = np.zeros(len(target))
     np.divide(-target, before, out=e, where=approach)

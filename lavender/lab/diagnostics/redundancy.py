@@ -6,9 +6,10 @@ elimination of the rows before it,
 
     p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
 
-does not exceed `tol`^2 A_ii: sqrt(p_i / A_ii) is the new fraction of its direction, in the metric of the masses. If J
-is known, this fraction is computed from J, and a direction that is new in J alone counts, too: next to a body that is
-1e25 times heavier, the masses hide it. If only A is known, its rounding hides fractions below MIN_NEW_FRACTION_OF_A.
+does not exceed `tol`^2 A_ii. The new fraction of the row's direction, sqrt(p_i / A_ii), is the length of its component
+outside the span of the rows B, in the metric of the masses. If J is known, the fraction is computed from J, and a
+direction that is new in J alone counts, too: next to a body that is 1e25 times heavier, the metric of the masses hides
+it. If only A is known, its rounding hides fractions below MIN_NEW_FRACTION_OF_A.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from lavender.problem.operators import analyse_symmetric_matrix, has_shifted_cho
 from lavender.problem.ordering import group_rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
-# Smallest new fraction of a row's direction that differs from rounding of A. A holds squares of fractions, and rounding
-# of its products and of their elimination leaves about 1e-14 of the diagonal, rarely 1e-13.
+# Smallest new fraction of a row's direction that differs from rounding of A. A holds squares of fractions, and
+# rounding of its products and of their elimination leaves about 1e-14 of the diagonal, rarely 1e-13.
 MIN_NEW_FRACTION_OF_A = 1e-6
-# The same for float32 data: equal rows differ by roundings of 2^-24, of which about ten add up.
+# Smallest new fraction that differs from rounding of float32 data: equal rows differ by about ten roundings of 2^-24.
 MIN_NEW_FRACTION_FLOAT32 = 1e-6
 MAX_DENSE_ISLAND_ROWS = 1200  # Islands of up to this many rows are decomposed as dense matrices.
 # In larger islands, pivots up to this fraction of d times the number of rows count as zero.
 PIVOT_TOL_PER_ROW = 1e-12
 # In larger islands, rows with pivots up to this fraction of d are left out of the sparse factor and tested afterwards.
-# A smaller fraction spoils later pivots by rounding, a larger one leaves more rows out; the next one is used if more
-# than MAX_DENSE_ISLAND_ROWS rows may be new. Of 851 matrices, 1e-2 gives each its rank, 1e-3 gives 843, a factor alone
-# 822.
+# A smaller fraction spoils later pivots by rounding; a larger fraction leaves more rows out. The next entry is used if
+# more than MAX_DENSE_ISLAND_ROWS of the rows left out may be new. Of 851 matrices, 1e-2 gives the right rank for all,
+# 1e-3 for 843, and a factor of all rows for 822.
 LEFT_OUT_PIVOTS = (1e-2, 1e-4, 1e-6)
 N_PROBE_VECTORS = 3  # Products with this many random vectors show which of the rows left out are new.
-# Up to this fraction of the largest entry of its row, A_ii is examined separately, and d is that entry.
+# If A_ii is at most this fraction of the largest entry of its row, d is that entry, and A_ii may still be exact.
 MAX_HIDDEN_DIAGONAL = 1e-10
 # If A_ii does not exceed this fraction of a d that two rows share, the units of the two rows differ.
 MAX_SHARED_SCALE_FRACTION = 1e-3
@@ -64,13 +65,13 @@ class Redundancy:
     rank : int
         Rank of A.
     tol : float
-        Largest threshold that was used: a row is redundant if the new fraction of its direction does not exceed this.
+        Largest threshold that was used [-]. A row is redundant if the new fraction of its direction is at most this.
     method : str
         Description of the decompositions.
     rows : tuple of int
         Redundant rows: each depends on the rows that are not redundant.
     impulse_is_unique : (m,) bool
-        Rows with an impulse that no redundancy can change.
+        Whether all solutions have the same impulse on a row.
     """
 
     problem: Problem
@@ -126,12 +127,16 @@ class Redundancy:
 def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     """Compute the rank of A, find the redundant rows, and list the quantities that are unique.
 
-    Islands (rows that share no body, directly or through others) are decomposed separately. Up to 1,200 rows: by QR of
-    J M^-1/2 and of J with column pivoting if J is given without compliance (nothing is squared); otherwise by Cholesky
-    with pivoting, which works on squares, so that `tol` is at least 1e-6; by QR for asymmetric or indefinite A. More
-    rows: by a sparse Cholesky factor, where pivots up to 1e-12 d times the number of rows count as zero: `tol` is at
-    least 1e-6 times the square root of that number. If the problem's data were float32, `tol` is at least 1e-6. The
-    result's `tol` and `method` have the value that was used.
+    Islands (sets of rows that share bodies, directly or through others) are decomposed separately:
+
+    - up to 1,200 rows, J known and no compliance: QR of J M^-1/2 and of J with column pivoting;
+    - up to 1,200 rows, otherwise: Cholesky factorisation of A with pivoting. Its pivots are squares of fractions, so
+      `tol` is at least 1e-6. QR replaces it for asymmetric or indefinite A;
+    - more rows: a sparse Cholesky factor, in which pivots up to 1e-12 d times the number of rows n count as zero, so
+      `tol` is at least 1e-6 sqrt(n).
+
+    If the problem's data were float32, `tol` is at least 1e-6. `Redundancy.tol` and `Redundancy.method` hold the value
+    and the decompositions that were used.
 
     Parameters
     ----------
@@ -147,7 +152,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     InputError
         `tol` is not between 0 and 1.
     CapabilityError
-        A is asymmetric or indefinite and an island has more than 1,200 rows, or products of the numbers exceed float64.
+        A is asymmetric or indefinite and an island has more than 1,200 rows, or products of the numbers exceed
+        float64.
     """
     check_problem(problem)
     if not check_float("tol", tol, low=0.0) < 1.0:
@@ -179,7 +185,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
             used = max(used, limit)
             if len(dependent_rows):
                 basis = _compute_null_basis(a.toarray(), dependent_rows)
-                if unit is not scale:  # Convert to the metric of d.
+                if unit is not scale:  # Convert from rows scaled by A_ii to rows scaled by d.
                     basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
                 unique[island] = np.abs(basis).max(axis=1) <= NULL_VECTOR_TOL
         else:
@@ -201,7 +207,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 def _find_dependent_rows_densely(
     a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
 ) -> tuple[IndexArray, float, list[str]]:
-    """Find the dependent rows of a symmetric island; if A is `sound`, each depends on rows before it.
+    """Find the dependent rows of a symmetric island. If A is `sound` (semidefinite), each depends on rows before it.
 
     Returns
     -------
@@ -248,10 +254,10 @@ def _find_dependent_rows_of_large_island(
 def _compute_unit_diagonal_factors(problem: Problem, scale: FloatArray) -> FloatArray:
     """Compute factors (m,) that scale the diagonal of A to one.
 
-    They are d^-1/2, unless d differs from a sound A_ii. Next to rows of very much heavier bodies (1e20 times and more),
-    d is the largest entry of the row instead of A_ii. If no entry of the row exceeds sqrt(A_ii A_jj), as in every
-    semidefinite A, A_ii is not a rounding error, and the row is scaled by it. The same holds for one of two rows that
-    share a d (their mean) although their units differ.
+    A factor is d^-1/2, or A_ii^-1/2 if d differs from A_ii although A_ii is not a rounding error. The two differ next
+    to rows of very much heavier bodies (1e20 times and more), where d is the largest entry of the row, and in two rows
+    of different units that share a d (the mean of both A_ii). A_ii is not a rounding error if no entry A_ij of the row
+    exceeds sqrt(A_ii A_jj), as in every semidefinite A.
     """
     a = problem.csr
     own = a.diagonal()
@@ -275,7 +281,8 @@ def _compute_unit_diagonal_factors(problem: Problem, scale: FloatArray) -> Float
 def _build_unit_row_roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
     """Build two matrices of unit rows that have the rank of A: J M^-1/2, and J with unit masses in place of M.
 
-    Each hides what is small in it: the first hides motion that only heavy bodies have, the second small entries of J.
+    A direction counts as new if it is new in either: the first matrix hides motion of heavy bodies, the second hides
+    small entries of J.
     """
     root_of_a = problem.velocity_form().jacobian
     if problem.generalized is not None:
@@ -377,7 +384,10 @@ def _find_dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> In
 
 
 def _find_rows_dependent_on_earlier(a: FloatArray, tail: IndexArray, tol: float) -> IndexArray:
-    """Return as many rows as `tail` has, each dependent on rows before it; `tail` itself if the numbers differ."""
+    """Return dependent rows such that each depends on rows before it, as many as in `tail`.
+
+    `tail` is a set of dependent rows. It is returned unchanged if the search finds another number of them.
+    """
     if len(tail) == 0:
         return tail
     m = len(a)

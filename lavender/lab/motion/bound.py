@@ -14,20 +14,20 @@ Proof. The projection (1) implies (p - y + D^-1 w).D (c - p) >= 0 for every c in
 
     (A y - b').(c - p) >= 0;     take c = y*:   (A y - b').(y* - p) >= 0.
 
-y* solves its problem, so (A y* - b').(p - y*) >= 0. The sum of both, with X = y - y* and p = y - e, is
-A X.(e - X) >= 0, hence |X|_A^2 <= X.A e <= |X|_A |e|_A. The second part is the triangle inequality. If cones leave the
-infimum of the dual unattained, y* is a minimising sequence, along which velocities converge. y only has to be finite; a
-good y makes both numbers small.
+y* solves the problem with b', so (A y* - b').(p - y*) >= 0. With X = y - y* and p = y - e, the sum of the last two
+inequalities is A X.(e - X) >= 0, hence |X|_A^2 <= X.A e <= |X|_A |e|_A. The second part of (2) is the triangle
+inequality. If no impulse attains the infimum of the dual, as may happen with cones, y* is a minimising sequence, along
+which velocities converge. y only has to be finite; a good y makes |x - y|_A and |e|_A small.
 
-Half the square of (2) is the energy of the difference of velocities plus the difference of energy stored in compliance.
-The kinetic part of a difference does not exceed the sum, which bounds the speed of every body: 1/2 m |dv|^2 <= E^2.
+1/2 |x - y*|_A^2 is the kinetic energy of the difference of velocities dv plus the energy of the difference of impulses
+in compliance. With E the right-hand side of (2) times sqrt(1/2), 1/2 m |dv|^2 <= E^2 for the speed of every body.
 
-Rounding goes outward: w, p, |x - y|_A and |e|_A are computed with bounds of their float64 rounding errors, so (2) holds
-for real numbers, with A = J M^-1 J^T + diag(theta) of the numbers as stored. For a witness at its round-off floor, the
-targets move by about 1e-16 of themselves, and |e|_A is as small relative to the motion.
+Rounding goes outward: w, p, |x - y|_A and |e|_A are computed with bounds of their float64 rounding errors, so (2)
+holds for real numbers, with A = J M^-1 J^T + diag(theta) of the numbers as stored. For a witness at its round-off
+floor, the targets move by about 1e-16 of themselves, and |e|_A is as small relative to the motion.
 
-A bound by the duality gap, |x - y*|_A^2 <= 2 gap, needs no metric but is a square root: a gap known to 1e-16 gives only
-1e-8. (2) is linear in e.
+A bound by the duality gap, |x - y*|_A^2 <= 2 gap, needs no metric but is a square root: a gap known to 1e-16 gives
+only 1e-8. (2) is linear in e.
 
 Two answers l1, l2 with errors e1, e2, Delta = l1 - l2 and eps = e1 - e2 satisfy
 
@@ -62,9 +62,9 @@ class Witness:
     impulse : (m,) N s
         y.
     radius : float, sqrt J
-        At least sqrt(1/2) |e|_A.
+        Upper bound of sqrt(1/2) |e|_A.
     moved : float, m/s (rad/s on angular rows)
-        At least max d |e|, the largest shift of a target.
+        Upper bound of max d |e|, the largest shift of a target.
     shift : (m,) m/s
         D e as computed.
     """
@@ -98,11 +98,12 @@ def subtract_impulses(operator: Operator, x: FloatArray, y: FloatArray) -> tuple
 
 
 def _bound_projection_rounding(problem: Problem, y: FloatArray, w: FloatArray) -> FloatArray:
-    """Bound (m,) [N s] the rounding of e = y - Pi(y - w / d) of the numbers y, w, d from above."""
+    """Return an upper bound (m,) [N s] of the rounding error of e = y - Pi(y - w / d), for exact y, w and d."""
     d, c = problem.d, problem.cones
     size = np.abs(y) + np.abs(w) / d
     uncertainty = 8.0 * U * size
-    # A contact takes about twenty operations on the entries of sqrt(d) (y - w / d), any of which may mix its rows.
+    # The projection of a contact takes about twenty operations on entries of sqrt(d) (y - w / d); each may mix its
+    # rows.
     count = np.diff(c.ptr)
     coupled = np.repeat(c.is_contact & (count > 1), count)
     if coupled.any():
@@ -139,14 +140,17 @@ def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, flo
         )
         rounding_square = 2.0**-50 * (max_stiffness * delta_d) ** 2
         return delta_norm, float(np.sqrt((1.0 + 1e-9) * allowed_square + rounding_square))
-    # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
+    # x^2 <= x eps_a + eps_d delta_d bounds x = |Delta|_A by the larger root. `rounding` is the error of Delta.A Delta.
     rounding = 2.0**-50 * max_stiffness * delta_d
     allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
     return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
 
 
 def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
-    """Compute A x (m,) without forming A if J and M are known; with transform=abs, a bound of abs(A) x for x >= 0."""
+    """Compute A x (m,), without forming A if J and M are known.
+
+    `transform` is applied to the entries of each factor; with `abs`, the result is a bound of |A| x for x >= 0.
+    """
     if problem.generalized is not None:
         y = transform(problem.whitened)
         return y @ (y.T @ x) + problem.compliance * x

@@ -15,8 +15,8 @@ from lavender.lab.motion.operator import U
 from lavender.lab.motion.reference import Reference, get_motion_cache
 from lavender.problem import Problem
 
-# Motions at a distance below this fraction of the constraints' own motion count as the same: a residual of 1e-10
-# moves by up to 1e-7 of it on the worst conditioned piles of the suite.
+# Two motions count as equal if their distance is below this fraction of the motion M^-1 J^T lambda of the constraints.
+# On the worst conditioned piles of the suite, a residual of 1e-10 changes the motion by up to 1e-7 of it.
 SAME_MOTION_FRACTION = 1e-6
 
 # Fields that become None if their numbers are not finite.
@@ -35,14 +35,14 @@ MOTION_ERROR_FIELDS = (
 
 @dataclass(frozen=True, eq=False)
 class MotionError:
-    """Distance of one impulse from the solution; `str()` gives one line. A number without a meaning is None.
+    """Distance of one impulse from the solution; `str()` gives one line. A number that does not apply is None.
 
     Parameters
     ----------
     kinetic : float or None, sqrt J
         Energy norm of the difference of body velocities; None if M is not known.
     energy : float or None, sqrt J
-        The same plus the energy stored in compliance.
+        `kinetic` with the energy in compliance added under the root.
     relative : float or None
         `kinetic` (or `energy`) divided by the norm of the constraints' own motion M^-1 J^T lambda*.
     speed : float or None, m/s
@@ -68,11 +68,11 @@ class MotionError:
     spread : float or None, sqrt J
         Coulomb: largest distance between two motions that both solve the problem, as far as they were searched.
     spread_speed : float or None, m/s
-        The same as a speed of a body, or of a row if bodies are not known.
+        Coulomb: largest difference of a body's speed between two such motions; of a row's if bodies are not known.
     count : int
-        Number of motions of which the nearest was taken.
+        Number of known motions; the distance is measured from the nearest of them.
     unique : str
-        Criterion that proves that the motion is unique; empty if none does.
+        Criterion that proves that the motion is unique; empty if no criterion holds.
     """
 
     kinetic: float | None
@@ -103,7 +103,7 @@ class MotionError:
 
     @property
     def _row_unit(self) -> str:
-        """Unit of `rows`: that of `row`, if bodies are known, otherwise that of a velocity or an angular velocity."""
+        """Unit of `rows`: " m/s" or " rad/s" by the kind of the row, or " m/s or rad/s" if bodies are not known."""
         if self._problem is None or self._problem.rows is None or self.row < 0:
             return " m/s or rad/s"
         row = self._problem.jacobian[[self.row]]
@@ -220,7 +220,10 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
 
 
 def convert_to_ellipse_rows(problem: Problem, x: FloatArray, error: MotionError) -> MotionError:
-    """Convert `rows` and `row` of an error on the disks to the problem's ellipses; x (m,) [N s] is on the disks."""
+    """Convert `rows` and `row` of an error to the problem's friction ellipses.
+
+    The error and x (m,) [N s] belong to the equivalent problem with disks (one coefficient per contact).
+    """
     if error.rows is None:
         return error
     delta = x - error.reference.impulse

@@ -7,9 +7,10 @@ Each contact is open, stuck, or slides in one of two directions, and each bounde
     slides  w_n = 0,  lambda_t = -s mu lambda_n, s = +-1    s w_t >= 0,  lambda_n >= 0
     row     lambda at a bound, or w = 0                     w away from the bound, or lambda within
 
-Every solution is in one of these modes, so all modes together contain every solution: four to the power of the number
-of contacts. If a mode's system is singular, its solutions are x + N y; they are one motion if A N = 0 and some y
-satisfies the inequalities. With two tangents, a contact may slide in a continuum of directions, which cannot be listed.
+Every solution is in one of these modes, of which there are four to the power of the number of contacts. If a mode's
+system is singular, its solutions are x + N y, with the columns of N its null vectors. They are one motion if A N = 0
+and some y satisfies the inequalities. With two tangents, a contact may slide in a continuum of directions, which
+cannot be listed.
 """
 
 from __future__ import annotations
@@ -25,11 +26,10 @@ from lavender.problem import Problem
 MAX_ENUMERATED_CONTACTS = 8  # Problems with more contacts are not enumerated.
 MAX_MODES = 4**MAX_ENUMERATED_CONTACTS  # Problems with more modes are not enumerated.
 MODES_PER_BATCH = 4096  # Number of systems that are in memory at once.
-# At most this many singular modes with several dimensions of solutions are examined, by a linear program each.
+# At most this many singular modes with two or more null vectors are examined; each needs a linear program.
 MAX_SINGULAR_MODES = 300
-INEQUALITY_TOL = (
-    1e-9  # Rounding may violate an inequality by this fraction of the largest number of a system.
-)
+# Rounding may violate an inequality by this fraction of the largest number of a system.
+INEQUALITY_TOL = 1e-9
 # Singular values of a scaled system count as zero if they do not exceed this fraction of the largest.
 NULL_VALUE_TOL = 1e-11
 
@@ -56,11 +56,11 @@ class _BlockModes(NamedTuple):
 
 
 def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
-    """Compute the impulses (m,) [N s] of every mode that has a solution, and whether their motions are all motions.
+    """Compute the impulses (m,) [N s] of every mode that has a solution, and whether the list is complete.
 
-    Returns None if the problem has more than eight contacts or 65,536 modes, a contact with friction in two tangents or
-    torsional friction, or if intermediate numbers exceed float64. The motions are not all if a mode has a continuum of
-    motions, or if too many modes are singular.
+    The list is not complete if a mode has a continuum of motions, or if more than MAX_SINGULAR_MODES modes need a
+    linear program. Return None if the problem has more than eight contacts or 65,536 modes, a contact with friction in
+    two tangents or torsional friction, or if intermediate numbers exceed float64.
     """
     c = problem.cones
     contact = c.is_contact
@@ -117,7 +117,7 @@ def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
 def _list_block_modes(
     problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: FloatArray
 ) -> Iterator[_BlockModes]:
-    """Yield the modes of each row of a block, or of the contact."""
+    """Yield the modes of a contact, or the modes of each row of a joint."""
     c = problem.cones
     unit_row = np.eye(problem.m)
     zero_row, zero = np.zeros(problem.m), 0.0
@@ -178,7 +178,7 @@ def _to_arrays(mode_list: list[Any], m: int) -> _BlockModes:
 
 
 def _build_mode_systems(block_modes: list[_BlockModes]) -> Iterator[tuple[FloatArray, ...]]:
-    """Yield E (k, m, m), e, F and f of all modes, MODES_PER_BATCH at a time."""
+    """Yield the arrays E (k, m, m), e, F and f of the modes of all contacts, with k <= MODES_PER_BATCH at a time."""
     counts = [len(w.rhs) for w in block_modes]
     for first in range(0, int(np.prod(counts)), MODES_PER_BATCH):
         mode = np.unravel_index(np.arange(first, min(first + MODES_PER_BATCH, int(np.prod(counts)))), counts)

@@ -47,16 +47,17 @@ from lavender.solving.solve import solve
 N_SEARCH_RUNS = 12  # Number of runs of a search, in addition to `auto`'s.
 SEARCH_SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
 SEARCH_ORDERS = ("given", "reverse", "random")
-# Relative residual tolerance of a search run; it is below the floor, so a run ends when its solver stalls.
+# Relative residual tolerance of a search run. It is below most round-off floors, so a run ends when its solver stalls.
 SEARCH_TOL = 1e-11
-SWEEP_WORK_LIMIT = 2e9  # In units of `Data.work`, about nanoseconds: largest cost of the sweeps of one run.
-SWEEP_RANGE = (400, 20_000)  # Smallest and largest number of sweeps of one run.
+SWEEP_WORK_LIMIT = 2e9  # [units of `Data.work`, about 1 ns] The sweeps of one run may cost at most this much.
+SWEEP_RANGE = (400, 20_000)  # The number of sweeps of one run is clipped to this range.
 SELECTION_RULES = ("nearest", "dissipation", "compliant")
-# The rule "compliant" starts with a compliance of this multiple of d; each step multiplies the compliance by the second
-# number, down to the third.
+# The rule "compliant" of `SolutionSet.select` solves with a compliance of LARGEST_COMPLIANCE_FRACTION times d, then
+# multiplies it by COMPLIANCE_STEP and solves again, down to SMALLEST_COMPLIANCE_FRACTION times d.
 LARGEST_COMPLIANCE_FRACTION, COMPLIANCE_STEP = 1.0, 0.1
 SMALLEST_COMPLIANCE_FRACTION = 1e-12
-# An enumerated impulse that is not a solution because of rounding is within this `Distance.relative_distance` of one.
+# If rounding alone makes an enumerated impulse miss the residual of a solution, a solution is within this
+# `Distance.relative_distance` of it; otherwise the enumeration counts as incomplete.
 NEAR_SOLUTION_FRACTION = 1e-6
 MAX_COMPARED_MOTIONS = 100  # At most this many motions of an enumeration are compared with each other.
 
@@ -112,7 +113,7 @@ class Distance(NamedTuple):
     energy : float, sqrt J
         sqrt(1/2) |.|_A of the difference; m/s of a row if A is not an energy.
     relative_distance : float
-        `energy` divided by the larger of the two motions' energies.
+        `energy` divided by the larger of the energy norms of the two motions.
     """
 
     speed: float
@@ -128,7 +129,7 @@ class Pick(NamedTuple):
     motion : int
         Index of the nearest motion.
     distance : float, m/s
-        Distance from it: above rounding if the search has not found the solver's motion.
+        Distance from this motion. If it is above rounding, the search has not found the solver's motion.
     """
 
     motion: int
@@ -148,13 +149,14 @@ class SolutionSet:
     spread_energy : float or None, sqrt J
         Largest sqrt(1/2) |.|_A of a difference; None if A is not an energy.
     unique : str
-        Criterion that proves that there is one motion; empty if none does.
+        Criterion that proves that there is one motion; empty if no criterion holds.
     runs : int
         Number of runs that ended at a solution.
     failed : int
-        Number of runs that did not.
+        Number of runs that did not end at a solution.
     all : bool
-        There are no other motions: it is proved, or every mode of the contacts was enumerated.
+        Whether `motions` is complete: a proof shows that there is one motion, or every mode of the contacts was
+        enumerated.
     """
 
     problem: Problem = field(repr=False)
@@ -173,7 +175,7 @@ class SolutionSet:
         return len(self.motions)
 
     def __bool__(self) -> bool:
-        return True  # A search without a result is a result, too.
+        return True  # A set without motions is true, too, so that `if solutions:` tests for None only.
 
     def __getitem__(self, i: Any) -> Any:
         """Return motion i, or a list of motions."""
@@ -186,9 +188,10 @@ class SolutionSet:
         Parameters
         ----------
         choice : {"nearest", "dissipation", "compliant"}
-            "nearest": nearest to a warm start. "dissipation": friction dissipates the most energy. "compliant": the
-            limit of vanishing compliance d s on every row, s from 1 to 1e-12 in factors of ten, each solved from the
-            one before; the motion found that is nearest to the end of this path.
+            "nearest": the motion nearest to a warm start. "dissipation": the motion in which friction dissipates the
+            largest energy. "compliant": the motion nearest to the limit of vanishing compliance. That limit is
+            computed with a compliance s d on every row and s from 1 to 1e-12 in factors of ten, each solve starting
+            from the result of the one before.
         impulse : (m,) N s, optional
             With "nearest": the warm start. Default: the problem's guess, otherwise the zero impulse.
 
@@ -228,7 +231,7 @@ class SolutionSet:
         tol : float
             Relative residual tolerance, at least twice the round-off floor.
         max_iter : int
-            Largest number of iterations of solvers that sweep; the others keep their own limits.
+            Largest number of iterations of sweep solvers; other solvers keep their own limits.
         """
         p = self.problem
         out: dict[str, Pick | None] = {}
@@ -304,7 +307,8 @@ def find_solutions(
         ]
         solved = [end for end in ends if end.is_accepted]
         solutions += [(end, "every mode") for end in solved]
-        # An impulse that passes an inequality only by rounding must be next to a solution; else the list has a gap.
+        # An impulse that satisfies an inequality only by rounding must be near a solution; else the list is
+        # incomplete.
         distances = (
             min(
                 (measure_motion_distance(problem, e.impulse, s.impulse).relative_distance for s in solved),
@@ -345,9 +349,10 @@ def find_solutions(
 
 
 def _make_motion_key(problem: Problem, x: FloatArray) -> bytes:
-    """Return a key of a motion: w rounded to 1e-9 of the largest |b|, in m/s and in sqrt(J).
+    """Return a key that is equal for equal motions: the slack w, rounded on two scales.
 
-    The second scale distinguishes slow motions of heavy bodies.
+    w [m/s] is rounded to 1e-9 of the largest |b|. w scaled to sqrt(J) is rounded, too, which distinguishes slow
+    motions of heavy bodies.
     """
     parts = []
     for unit in (np.ones(problem.m), 1.0 / np.sqrt(problem.d)):
@@ -357,15 +362,15 @@ def _make_motion_key(problem: Problem, x: FloatArray) -> bytes:
 
 
 def get_solutions(problem: Problem, n: int = N_SEARCH_RUNS) -> SolutionSet:
-    """Return the motions of an earlier search, whatever its number of runs, or search with `n` runs."""
+    """Return the motions of an earlier search with any number of runs; if there is none, search with `n` runs."""
     return get_motion_cache(problem).motions or find_solutions(problem, n)
 
 
 def converge_to_solution(problem: Problem, impulse: Any) -> Reference:
-    """Return the solution that an impulse (m,) [N s] leads to: by sweeps to the floor, then by `newton` if they stall.
+    """Return the solution to which sweeps from an impulse (m,) [N s] converge; `newton` continues if they stall.
 
-    If Coulomb's law has several motions, this is the one that a solver stopped early would have reached. It is not
-    stored with the problem; `accepted` shows whether it is a solution.
+    If a problem under Coulomb's law has several motions, this is the motion that a solver would have reached if it had
+    not stopped early. It is not stored with the problem. `Reference.is_accepted` shows whether it is a solution.
     """
     check_problem(problem)
     best = None
@@ -423,8 +428,8 @@ def search_solutions(
             label += f" {options['order']}"
             if options["order"] == "random":
                 options["seed"] = int(rng.integers(2**31))
-        # The first two cycles start from rest, in different orders; a solver without orders gets a new start each
-        # cycle.
+        # Solvers with a sweep order use start 0 in the first two cycles, in different orders. Other solvers get a new
+        # start in each cycle.
         start = _make_start(problem, reference, rng, max(cycle - spec.order, 0))
         limit = budget if spec.resumable else spec.max_iter
         try:
@@ -457,7 +462,10 @@ def _make_start(
 
 
 def _merge_equal_motions(problem: Problem, solutions: list[tuple[Reference, str]]) -> list[Motion]:
-    """Merge solutions with equal motions into one `Motion`, the best solved of each; most frequent first."""
+    """Return one `Motion` for each set of solutions with equal motions, the most frequent first.
+
+    It holds the solution of the set with the smallest residual.
+    """
     groups: list[list[tuple[Reference, str]]] = []
     for first in solutions:
         for group in groups:
@@ -527,9 +535,9 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 
         kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
 
-    so that two impulses with a difference that moves nothing (a table on four legs) have distance 0. The bound does not
-    depend on trust in the reference: with e the judge's error of lambda* and targets moved by d e, the solution is
-    within sqrt(1/2) |e|_A of it (proof in `lavender.lab.motion.bound`).
+    so that two impulses whose difference moves no body (a table on four legs) have distance 0. The bound holds for any
+    reference, also an inaccurate one: with e the judge's error of lambda*, the solution of the problem with targets
+    shifted by d e is within sqrt(1/2) |e|_A of lambda* (proof in `lavender.lab.motion.bound`).
 
     Parameters
     ----------
@@ -537,14 +545,15 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     impulse : (m,) N s
     reference : (m,) N s, Solution or Reference, optional
         The solution to compare with. Default: the result of `auto` at the round-off floor, solved once and stored with
-        the problem; under Coulomb's law the nearest of the motions that `lavender.find_solutions` finds and of the one
-        that the impulse itself leads to.
+        the problem. Under Coulomb's law, the default is the nearest of the motions that `lavender.find_solutions`
+        finds and of the motion to which sweeps from `impulse` converge.
 
     Returns
     -------
     MotionError
-        Estimates are None if the reference is not a solution (relative above 1e-10 and above twice its floor);
-        energies if A is asymmetric or indefinite; bounds under Coulomb's law. `note` gives the reason.
+        Distances are None if the reference is not a solution, that is, if its relative residual is above 1e-10 and
+        above twice its floor. Energies are None if A is asymmetric or indefinite; bounds are None under Coulomb's law.
+        `note` gives the reason.
 
     Raises
     ------
@@ -555,7 +564,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     """
     check_problem(problem)
     x = problem.on_disk(problem.impulse_array(impulse))
-    if problem.cones.has_ellipse:  # The motion is measured on its disks.
+    if problem.cones.has_ellipse:  # Measure the motion on the equivalent problem with friction disks.
         if reference is not None and not isinstance(reference, Reference):
             impulse_of_reference = problem.impulse_array(
                 getattr(reference, "impulse", reference), "reference"
@@ -564,7 +573,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
         error = motion_error(problem.disk, x, reference)
         with np.errstate(over="ignore", invalid="ignore"):
             return convert_to_ellipse_rows(problem, x, error)
-    with np.errstate(over="ignore", invalid="ignore"):  # `note` names numbers that are not finite.
+    with np.errstate(over="ignore", invalid="ignore"):  # Results that are not finite are reported in `note`.
         if reference is not None:
             return measure_distance(problem, x, as_reference(problem, reference))
         if problem.law != "coulomb":
@@ -573,7 +582,10 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 
 
 def measure_distance_to_nearest(problem: Problem, x: FloatArray, solutions: SolutionSet) -> MotionError:
-    """Compute the distance of an impulse x (m,) from the nearest of several motions and of the one that it leads to."""
+    """Compute the distance of an impulse x (m,) [N s] from the nearest of several motions.
+
+    The motion to which sweeps from x converge (`converge_to_solution`) is one of them.
+    """
     references = [motion.reference for motion in solutions]
     spread, energy = solutions.spread, solutions.spread_energy
     if not solutions.unique:

@@ -24,21 +24,20 @@ U = 2.0**-53  # Unit round-off of float64.
 # Rounding may make an eigenvalue of an inverse inertia negative by up to this fraction of the largest one; a more
 # negative eigenvalue makes the inverse inertia indefinite.
 NEGATIVE_EIGENVALUE_TOL = 1e-12
-MAX_TREE_VELOCITIES = (
-    2000  # Largest number of generalised velocities of one tree: its M is inverted as a dense matrix.
-)
+# Largest number of generalised velocities of one tree: its M is inverted as a dense matrix.
+MAX_TREE_VELOCITIES = 2000
 
 
 @dataclass(frozen=True)
 class Size:
-    """sqrt(1/2 |x|_A^2) of a change of impulse x with given uncertainty [sqrt J].
+    """Energy norm sqrt(1/2 |x|_A^2) [sqrt J] of an impulse difference x that is known up to a given uncertainty.
 
     Parameters
     ----------
     kinetic : float or None
-        As computed; None if M is not known.
+        Root of the kinetic part, as computed; None if M is not known.
     energy : float
-        As computed, including the elastic part.
+        Root of the kinetic and elastic part, as computed.
     upper_bound : float
         Upper bound of `energy` of any x within the uncertainty, rounding included.
     """
@@ -71,7 +70,7 @@ class Operator:
         return self.a @ x - self.b, self.slack_gamma * (self.abs_a @ np.abs(x) + np.abs(self.b))
 
     def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
-        """Compute sqrt(1/2 x.A x) [sqrt J], and an upper bound for all x within `uncertainty` (m,) of it."""
+        """Compute sqrt(1/2 x.A x) [sqrt J], and its upper bound for every impulse within `uncertainty` (m,) of x."""
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
         rounding = (self.slack_gamma + _bound_sum_rounding(len(x) + 1)) * float(y @ (self.abs_a @ y))
@@ -110,7 +109,7 @@ def make_operator(problem: Problem) -> Operator:
 
 
 class _Factored(Operator):
-    """J and M^-1, with M^-1 uncertain by `off` (same shape, or None if it is exact as stored)."""
+    """Operator of J and M^-1. `off` is an entrywise error bound of M^-1, or None if M^-1 is exact as stored."""
 
     def __init__(self, problem: Problem, minv: sp.csr_array, off: sp.csr_array | None) -> None:
         assert problem.compliance is not None
@@ -124,7 +123,7 @@ class _Factored(Operator):
         column, row, minv_entries = (
             int(np.diff(x.indptr).max(initial=0)) for x in (self.jac_t, self.jac, minv)
         )
-        # Numbers of operations on one entry of J^T x, of M^-1 J^T x, and of J M^-1 J^T x + theta x - b.
+        # Relative rounding bounds of one entry of J^T x, of M^-1 J^T x, and of J M^-1 J^T x + theta x - b.
         self.wrench_gamma = _bound_sum_rounding(column + 1)
         self.velocity_gamma = _bound_sum_rounding(column + minv_entries + 1)
         self.slack_gamma = _bound_sum_rounding(column + row + minv_entries + 5)
@@ -141,7 +140,7 @@ class _Factored(Operator):
     def compute_energy_norm(self, x: FloatArray, uncertainty: FloatArray) -> Size:
         g = self.jac_t @ x
         h = np.abs(g)
-        off = self.abs_jac_t @ (self.wrench_gamma * np.abs(x) + 1.01 * uncertainty)  # Error bound of g.
+        off = self.abs_jac_t @ (self.wrench_gamma * np.abs(x) + 1.01 * uncertainty)  # Error bound of J^T x.
         square = max(float(g @ (self.minv @ g)), 0.0)
         rounding = _bound_sum_rounding(self.nv + 4) * float(h @ (self.abs_minv @ h))
         if self.off is not None:
@@ -204,7 +203,7 @@ class _Bodies(_Factored):
         return f"body {i}"
 
     def bound_speeds(self, energy: float) -> tuple[float, float | None] | None:
-        # 1/2 m |v|^2 <= E^2 holds for every body; 1e-9 covers the rounding of eigenvalues.
+        # 1/2 m |v|^2 <= energy^2 holds for every body. The factor 1 + 1e-9 covers the rounding of eigenvalues.
         return self.speed_per_root_energy * energy * (1.0 + 1e-9), self.spin_per_root_energy * energy * (
             1.0 + 1e-9
         )

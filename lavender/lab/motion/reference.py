@@ -26,12 +26,10 @@ from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
 REFERENCE_SOLVER = "auto"
-REFERENCE_TOL = (
-    1e-15  # Relative residual tolerance of the reference solve; it is below the floor, where `auto` stops.
-)
-REFERENCE_MAX_RESIDUAL = (
-    1e-10  # An impulse is accepted as a reference up to this relative residual, or at its floor.
-)
+# Relative residual tolerance of the reference solve; it is below the floor, where `auto` stops.
+REFERENCE_TOL = 1e-15
+# An impulse is accepted as a reference up to this relative residual, or at its floor.
+REFERENCE_MAX_RESIDUAL = 1e-10
 PROOF = "proof: "  # Prefix of `Reference.solver` for an impulse that `enclose_reference` stored.
 REFERENCE_SUFFIX = ".reference"  # Appended to a problem's file name.
 CONVEX_LAWS = ("linear", "lcp", "cone")
@@ -39,7 +37,7 @@ CONVEX_LAWS = ("linear", "lcp", "cone")
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """An impulse that is compared with as the solution, or the best that was found; `str()` gives one line.
+    """An impulse that stands for the solution in comparisons: the best that was found. `str()` gives one line.
 
     Parameters
     ----------
@@ -48,9 +46,10 @@ class Reference:
     solver : str
         The solver that found it, and its message, e.g. "auto: direct 1 factorisations".
     refusal : str
-        Reason why energies cannot be computed: asymmetric or indefinite A; empty if they can.
+        Reason why energies cannot be computed, an asymmetric or indefinite A; empty if they can be computed.
     witness : Witness or None
-        The bound that it proves; None under Coulomb's law, or if `refusal` is not empty.
+        Proved bound of the distance of `impulse` from the solution; None under Coulomb's law, or if `refusal` is not
+        empty.
     """
 
     impulse: FloatArray = field(repr=False)
@@ -61,7 +60,7 @@ class Reference:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether distances to it are reported: its relative residual is at most 1e-10, or at its floor."""
+        """Whether it counts as a solution: its relative residual is at most 1e-10, or at its round-off floor."""
         return self.residual.relative <= REFERENCE_MAX_RESIDUAL or self.residual.at_floor
 
     @property
@@ -109,9 +108,9 @@ def get_motion_cache(problem: Problem) -> MotionCache:
 
 
 def get_reference(problem: Problem) -> Reference:
-    """Return the problem's reference; `auto` solves for it at the first call, and it is stored with the problem.
+    """Return the problem's reference. At the first call, `auto` computes it, and it is stored with the problem.
 
-    It is the best impulse that was found, even if it is not a solution: see `Reference.is_accepted`.
+    The reference is the best impulse that was found, which need not be a solution: see `Reference.is_accepted`.
     """
     cache = get_motion_cache(problem)
     if cache.reference is None:
@@ -146,7 +145,7 @@ def as_reference(problem: Problem, value: Any) -> Reference:
     if isinstance(value, Reference):
         if value.residual._problem is problem:
             return value
-        # The reference belongs to another or to an equal problem: judge its impulse again.
+        # The reference was made for another problem object: judge its impulse on this problem.
         solver, impulse = value.solver, value.impulse
     elif isinstance(value, Solution):
         solver, impulse = value.solver.name, value.impulse
@@ -167,8 +166,8 @@ def save_reference(
 ) -> Path:
     """Write a problem's reference next to its file `path` and return the path of the reference.
 
-    The reference is `impulse` (m,) [N s] with its `source`, or by default the stored one, which is solved for if there
-    is none. Raises InputError if nothing solved the problem.
+    The reference is `impulse` (m,) [N s], described by `source`. By default it is the problem's stored reference,
+    which is computed if there is none. Raise InputError if no solver solved the problem.
     """
     out = check_writable(_make_reference_path(path))
     if impulse is not None:
@@ -183,9 +182,9 @@ def save_reference(
 
 
 def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | None:
-    """Load the reference of a problem's file and store it with the problem, if it exists and solves the problem.
+    """Load the reference of a problem's file and store it with the problem.
 
-    Returns None if there is no file, or if the impulse solves another problem: the reference is then solved for again.
+    Return None if there is no file, or if its impulse does not solve this problem; `get_reference` then computes one.
     """
     location, problem = _make_reference_path(path), problem.disk
     if not location.is_file():

@@ -1,7 +1,7 @@
-"""Criteria that prove that one motion alone solves a problem; none of them proves that there are several.
+"""Criteria that prove that the motion of a problem is unique. If none holds, there may be one motion or several.
 
-Islands (blocks that no body, directly or through others, connects) are examined separately. The motion of an island is
-unique if one of these holds:
+Islands (sets of blocks that moving bodies connect) are examined separately. The motion of an island is unique if one
+of these holds:
 
     the law is convex    A symmetric positive semidefinite, no friction in it or the law `cone`:
                          w and the velocities are those of a convex program
@@ -10,15 +10,17 @@ unique if one of these holds:
                          disk, and the remaining problem is convex. Example: one contact on a body, its normal through
                          the centre
     friction is small    kappa < 1, below: a contraction has one fixed point
-    nothing slides       a solution has w = 0 on all rows and so much unused friction that no other can exist, (3)
+    nothing slides       a solution has w = 0 on all rows, and its friction is so far from the bounds that no other
+                         solution exists, (3)
 
-De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem in which the normal targets
-are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
-Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu) on the
-friction rows (mu r on torsional rows, mu_r on rolling rows), and any positive diagonal T (one entry a contact),
+De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem in which the normal
+targets are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux,
+Lemarechal, Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu)
+on the friction rows (mu r on torsional rows, mu_r on rolling rows), and any positive diagonal T (one entry a contact),
 
     |D lambda|_A^2 <= - D s . D lambda_n <= |D s|_Z |D lambda|_A          the cone is convex, A positive definite
-    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2   c friction components of a contact
+    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2   c friction components of a
+    contact
 
     kappa^2 = c max eig(T S A_tt S T) max eig(T^-1 Z T^-1)                                               (1)
 
@@ -34,7 +36,7 @@ so D lambda = 0 or h < |D lambda|_A <= kappa (|D lambda|_A - h). Since w'.lambda
 
     |lambda|_A <= h    or    (kappa - 1) |lambda|_A < kappa h                                            (3)
 
-(2) and (3) are results of this project; w counts as 0 up to the rounding of a solution at the floor.
+(2) and (3) are results of this project. Slacks w up to ZERO_SLACK_FRACTION of the largest |b| count as 0.
 
 Haslinger 1983 (Math. Meth. Appl. Sci. 5, 422-437) shows that friction that is small against the coupling leaves one
 solution; Klarbring 1990 (Ing.-Archiv 60, 529-541) shows that larger friction need not, even for one contact.
@@ -53,22 +55,22 @@ from lavender.problem.cones import Cones
 from lavender.problem.ordering import group_rows_by_island
 
 MAX_DENSE_PROOF_ROWS = 600  # (1) is tested on islands of up to this many rows, as dense matrices.
-UNCOUPLED_TOL = 1e-14  # A_tn is pure rounding up to this fraction of sqrt(d_t d_n).
+UNCOUPLED_TOL = 1e-14  # A_tn counts as zero up to this fraction of sqrt(d_t d_n).
 CRITERION_MARGIN = 1e-6  # Margin of (1) and (3) for the rounding of eigenvalues.
-ZERO_SLACK_FRACTION = 1e-10  # w is pure rounding up to this fraction of the largest |b| of an island.
+ZERO_SLACK_FRACTION = 1e-10  # w counts as zero up to this fraction of the largest |b| of an island.
 # A is positive definite if the smallest eigenvalue of D^-1/2 A D^-1/2 is above this.
 MIN_DEFINITE_EIGENVALUE = 1e-10
 
 
 @dataclass(frozen=True)
 class Uniqueness:
-    """Result of `prove_uniqueness`: whether one motion alone is proved to solve a problem.
+    """Result of `prove_uniqueness`: whether the motion of a problem is proved to be unique.
 
     Parameters
     ----------
     proved : bool
     reason : str
-        The criterion that proves it, or the contact at which none does.
+        The criterion that proves it, or the first contact for which no criterion holds.
     kappa : float
         Largest contraction number (1) that was needed; 0 if none was needed, inf if none was computed.
     """
@@ -85,10 +87,10 @@ class Uniqueness:
 
 
 def prove_uniqueness(problem: Problem) -> Uniqueness:
-    """Prove that a problem has one motion; return the criterion that holds, or the first contact at which none does.
+    """Prove that a problem has only one motion; the result names the criterion, or a contact for which none holds.
 
-    For the last criterion, a problem with friction that is not small is solved by `auto`, once. Islands of more
-    than 600 rows with friction are not proved.
+    If friction is not small, `auto` solves the problem once to test the last criterion. Uniqueness is not proved for
+    islands with friction of more than 600 rows.
     """
     refusal = get_motion_cache(problem).refusal
     if refusal:

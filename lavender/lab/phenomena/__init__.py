@@ -1,7 +1,7 @@
 """Scenes with known motion, measured in every stepper of LavenderSim and in other engines.
 
-A phenomenon is data: parameters with ranges, an exact motion with its derivation, quantities with bounds. An engine
-returns poses over time, from which the quantities are measured, in the same way for all engines.
+A phenomenon (`Phenomenon`) is a scene with an exact motion, its derivation, parameters with ranges, and quantities
+with bounds. An engine returns poses over time. The quantities are computed from them in the same way for all engines.
 """
 
 from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant

@@ -1,4 +1,4 @@
-"""Analytic solutions of phenomena that need more than a line."""
+"""Analytic solutions of phenomena whose formulas need a function of their own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from lavender.lab.phenomena.parts import GRAVITY
 
 
 def compute_period_of_pendulum(inertia: float, torque: float, angle: float) -> float:
-    """Compute the period [s] of a pendulum of `inertia` about its hinge [kg m^2], released at `angle` [rad] from below.
+    """Compute the period [s] of a pendulum of `inertia` [kg m^2] about its hinge, released at `angle` [rad].
+
+    The angle is measured from the lowest position.
 
     From I phi'^2/2 = m g l (cos phi - cos phi0), `torque` = m g l [N m]:
 
@@ -63,12 +65,12 @@ def compute_tipping_time(width: float, height: float, slope: float, angle: float
 
 
 def compute_arch_thrust_bounds(stones: int, lean: float, thick: float) -> tuple[float, float]:
-    """Compute the smallest and the largest thrust at the apex of a pointed arch, divided by the weight of a stone.
+    """Compute the smallest and the largest thrust H at the apex of a pointed arch that stands, in weights of a stone.
 
-    All joints bear a thrust between these. A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from
-    upright; both legs meet at their upper inner edges, at which the thrust H is horizontal by symmetry. A joint at
-    distance D from the top bears the weight D of D blocks. The resultant must pass it within its thickness t; moments
-    about its inner and its outer edge give
+    Each leg consists of `stones` blocks of length 1 and thickness t = `thick` on a skewback, at a = `lean` [rad] from
+    upright. Both legs meet at their upper inner edges, where the thrust H is horizontal by symmetry. A joint at
+    distance D from the top carries the weight D of D blocks. The resultant must pass the joint within its thickness.
+    Moments about the inner and the outer edge of the joint give
 
         H >= (D tan a - t)/2,        H (D cos a - t sin a) <= D (D sin a + t cos a)/2
 

@@ -14,8 +14,8 @@ from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantit
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import make_quaternion
 
-ROD_SIZE = (0.1, 0.1, 1.0)  # [m]
-FREE_BODY_SIZE = (0.2, 0.6, 1.0)  # [m]
+ROD_SIZE = (0.1, 0.1, 1.0)  # [m] Edges of the pendulum's rod.
+FREE_BODY_SIZE = (0.2, 0.6, 1.0)  # [m] Edges of the free body, a box with three different inertias.
 FREE_ROTATION_PERIODS = 3  # The free rotation is simulated for this many periods of the flip.
 
 

@@ -18,7 +18,7 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a scene: default, range, meaning with unit. If the default is an int, the parameter is a count."""
+    """A scene parameter: default, range, and meaning with unit. A default of type int marks an integer parameter."""
 
     default: float
     low: float
@@ -28,7 +28,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured number, as distance from its exact value.
+    """A measured quantity of a phenomenon, expressed as its deviation from the exact value.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Motion of a scene in an engine, at equidistant times; bodies in the scene's order, including static ones.
+    """Motion of a scene in an engine at k equidistant times; the n bodies (also static ones) have the scene's order.
 
     Parameters
     ----------
@@ -104,13 +104,13 @@ class Phenomenon:
     cases : tuple of mappings
         Parameter values that a run measures.
     quantities : tuple of Quantity
-        The table shows the first.
+        Measured quantities; the table of all phenomena shows the first.
     needs : frozenset of str
         Features that an engine must have: "box", "sphere", "spin", "rolling", "ball joint", "hinge".
     build : callable
         Builds the scene from parameter values and from scene parameters that the engine prescribes.
     seconds : callable
-        Returns the simulated time [s].
+        Returns the duration to simulate [s] for parameter values.
     measure : callable
         Computes the quantities from a track.
     interval : float, s
@@ -169,7 +169,7 @@ class Record:
     case : dict
         Parameter values.
     values : dict
-        Measured quantities by name; nan if the engine does not return one.
+        Measured quantities by name; a quantity that the engine does not return is nan.
     passed : bool
         All quantities are within their bounds.
     cpu : float, s

@@ -26,7 +26,7 @@ MAX_TRACK_SIZE = 2**30  # [bytes] A process that sends a larger track is killed.
 
 
 class EngineProcess(ProcessBackend):
-    """Steps scenes in another process, which is started again if it ended; `limit` [s] is for one track."""
+    """Steps scenes in another process, which is restarted if it ended; `limit` [s] is the time limit of one track."""
 
     def __init__(self, limit: float = TRACK_TIME_LIMIT) -> None:
         super().__init__(record_track_of_engine)
@@ -94,7 +94,9 @@ def select_phenomena(names: Sequence[str] = ()) -> list[Phenomenon]:
 def select_variants(
     steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None
 ) -> list[EngineVariant]:
-    """Return variants by the names of steppers and engines, or of one setting of them; None selects all.
+    """Return the variants with the given names of steppers and engines; None selects all of either kind.
+
+    The name of an engine selects all of its settings, the name of a variant selects one.
 
     Raises
     ------
@@ -204,7 +206,7 @@ def _measure_variant(
 def _simulate_case(
     variant: EngineVariant, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess
 ) -> Track | str:
-    """Simulate one case, third-party engines in the other process; return the reason if that fails."""
+    """Simulate one case and return its track, or the reason of a failure; third-party engines run in `process`."""
     seconds = phenomenon.seconds(case)
     try:
         scene = phenomenon.build_scene(case, **variant.scene)

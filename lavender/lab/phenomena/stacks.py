@@ -23,8 +23,8 @@ from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import make_quaternion
 
 TIP_ANGLE = 0.5  # [rad] Tilt at which a box counts as tipped.
-BRICK_SIZE = (1.0, 0.5, 0.25)  # m
-MAX_STANDING_DROP = 0.1  # [m] A brick or stone that ends lower than this does not stand.
+BRICK_SIZE = (1.0, 0.5, 0.25)  # [m] Length, width and height of a brick.
+MAX_STANDING_DROP = 0.1  # [m] A stack or arch has fallen if a brick or stone ends lower by more than this.
 WRONG_TIPPING = Quantity("wrong side", "", 0.0, "1 if it tips and should stand, or stands and should tip")
 WRONG_DROP = Quantity(
     "wrong side", "", 0.0, "1 if it drops by 0.1 m and should stand, or stands and should drop"

@@ -1,4 +1,4 @@
-"""Tables of records: a row per engine variant, a column per phenomenon; and the cases of lavender out of bound."""
+"""Tables of phenomena records, with a row per engine variant and a column per phenomenon; list of failed cases."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _get_worst_value(group: Sequence[Record], phenomenon: Phenomenon) -> float:
 
 
 def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
-    """Format a cell of the table: worst value, and the number of cases that passed; bold unless all did."""
+    """Format a cell of the table: worst value and number of cases that passed; bold unless all cases passed."""
     measured = [r for r in group if not r.note]
     if not measured:
         return "–"
@@ -45,7 +45,10 @@ def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
 
 
 def format_markdown_table(records: Sequence[Record]) -> str:
-    """Build a Markdown table: worst value of the first quantity, cases that passed of those run; bold if one failed."""
+    """Build a Markdown table whose cells have the worst value of the first quantity and the number of passed cases.
+
+    A cell is bold if a case failed.
+    """
     groups = _group_records(records)
     names = [n for n in PHENOMENA if any(key[1] == n for key in groups)]
     lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]

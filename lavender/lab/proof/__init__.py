@@ -8,20 +8,20 @@ friction components sticks or slides. The case fixes some impulses; the others s
     slides                   lambda_i s_g + c_i^2 w_i lambda_n = 0                                        (1)
 
 and the inequalities lambda within its bounds, w >= 0 at a lower bound, |lambda_g / c| <= lambda_n, and, if a contact
-is open, w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a box X
-around x~,
+is open, w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). Let F(x) = 0 be the equations (1) in the unknown impulses
+x. With x~ an approximate zero, Y ~ F'(x~)^-1 and a box X around x~,
 
     K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
 
 (Krawczyk 1969; Neumaier 1990, theorem 5.1.8). F is evaluated in ball arithmetic, and the problem's float64 numbers
 count as exact. If each inequality holds over the box of the zero, the zero is a solution. Rows that depend on others
-exactly, target included, keep the impulse of the answer: the impulses are then one of a family, and all members have
-the same velocities.
+exactly, target included, keep the impulse of the answer. The solution is then one of a family: a set of impulses that
+all give the same velocities.
 
-Ball arithmetic cannot distinguish a zero from a small number. A row with zero impulse and w = 0 is proven if it
-depends, also exactly, on rows with non-zero impulse, or if a solution in rational numbers shows it (nothing slides, at
-most MAX_RATIONAL_UNKNOWNS unknowns). Otherwise it is named as on the boundary of two cases, unless a proof that starts
-from an answer of INTERIOR_SOLVERS, inside a family, succeeds.
+Ball arithmetic cannot distinguish a zero from a small number. That a row has both zero impulse and w = 0 is proven if
+it depends exactly on rows with non-zero impulse, or if a solution in rational numbers shows it (nothing slides, at
+most MAX_RATIONAL_UNKNOWNS unknowns). Otherwise the row is named as on the boundary of two cases, unless a proof
+succeeds that starts from an answer of INTERIOR_SOLVERS, whose impulses are inside a family.
 
 Needs python-flint (extra `proof`).
 """
@@ -46,7 +46,8 @@ __all__ = ["Enclosure", "enclose_reference", "prove", "require_python_flint"]
 
 # [bits] A case that is undecided with the first precision is tried again with the second.
 BALL_PRECISIONS = (128, 256)
-# If impulses are a family, an answer at the family's edge is between two cases; these solvers end inside it.
+# If several impulses give the same velocities, an answer at the edge of that set is between two cases. These solvers
+# end in its interior.
 INTERIOR_SOLVERS = ("newton", "admm")
 INTERIOR_SOLVERS_MAX_ROWS = 2000  # Larger problems are not solved again with INTERIOR_SOLVERS.
 PROOF_SOLVE_TIME_LIMIT = 10.0  # [s] Time limit of each additional solve.
@@ -70,8 +71,8 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     Returns
     -------
     Enclosure
-        An unproven answer is a result, too: `reason` names the undecided block, or the obstacle. `infeasible`: a
-        certificate, of the answer or of `auto`, proves that the problem has no solution.
+        If nothing is proven, `reason` names the undecided block, or the obstacle. If `infeasible` is true, a
+        certificate of the answer or of `auto` proves that the problem has no solution.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
 
 
 def _check_certificate(problem: Problem, certificate: FloatArray) -> Enclosure:
-    """Check a certificate (m,) on the problem's numbers as exact ones."""
+    """Check a certificate of infeasibility (m,) in exact arithmetic on the problem's numbers."""
     proof = certificates.prove_infeasibility(problem, certificate)
     holds = not proof.reason and proof.impulse_bound == math.inf
     return Enclosure(False, reason=proof.reason or proof.message, infeasible=holds)

@@ -1,4 +1,4 @@
-"""Rows that depend on others exactly: found modulo a prime, confirmed by the rank of J over the integers."""
+"""Find rows of J that depend on others exactly: by elimination modulo a prime, confirmed by the rank over integers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ SPARSE_GRAM_SHIFT = 1e-13  # Fraction of the diagonal that is added to it; depen
 
 
 def order_by_dependence(j: Any) -> tuple[Any, int]:
-    """Order the rows of J such that those that depend on others to rounding come last; return also how many do not."""
+    """Order the rows of J such that rows that depend on others up to rounding come last.
+
+    Return the order, and the number of rows that are independent.
+    """
     size = np.maximum(np.sqrt(j.multiply(j).sum(axis=1)), np.finfo(float).tiny)
     unit = sp.csr_array(sp.diags_array(1.0 / size) @ j)
     gram = sp.csc_array(unit @ unit.T)
@@ -39,7 +42,7 @@ def order_by_dependence(j: Any) -> tuple[Any, int]:
     shifted = gram + SPARSE_GRAM_SHIFT * sp.eye_array(m)
     options = {"SymmetricMode": True}
     factor = factor_sparse_lu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    # Pivots of a Cholesky factor: the squared distances of rows from the span of those before them.
+    # Each pivot of the Cholesky factor is the squared distance of a row from the span of the rows before it.
     independent = abs(factor.U.diagonal()[factor.perm_c]) > ROUNDING_DEPENDENCE_TOL
     return np.concatenate([np.flatnonzero(independent), np.flatnonzero(~independent)]), int(
         np.count_nonzero(independent)
@@ -55,10 +58,11 @@ MAX_INTEGER_RANK = 600
 def find_dependent_rows(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
     """Return rows of J that are independent of those before them, and dependent rows with contradicting targets.
 
-    Rows that are independent modulo a prime are independent. If they span all columns that they use, the other rows
-    depend on them; otherwise the rank over the integers decides, with the targets as one more column for the rows that
-    contradict nothing. The first `sure` rows are independent to rounding: if a component has as many of them as
-    columns, they are its basis, which the inverse of their equations proves.
+    Rows that are independent modulo a prime are independent. If their number equals the number of columns that they
+    use, the other rows depend on them. Otherwise the rank over the integers decides; the targets are an additional
+    column for rows with consistent targets. The first `sure` rows are independent up to rounding. If a connected
+    component of J has as many of these rows as columns, they are its basis, which the inverse of their equations
+    proves.
 
     Raises
     ------
@@ -132,7 +136,10 @@ def _group_connected_rows(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
 def _residual_rows_depend_on_others(
     flint: Any, integer_rows: list[list[int]], rows: list[int], residuals: dict[int, int]
 ) -> bool | None:
-    """Whether the rows in `residuals` depend on the others, targets included if theirs is 0; None: too many."""
+    """Return whether the rows in `residuals` depend exactly on the others; None if there are too many to decide.
+
+    A row's target is included if its residual modulo the prime is 0.
+    """
     independent = [k for k in rows if k not in residuals]
     if len(independent) == len(rows):
         return True

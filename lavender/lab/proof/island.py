@@ -5,8 +5,8 @@ computed in portions. Each sum of k products of float64 numbers p_i q_i has an e
 
     k UNIT / (1 - k UNIT) sum |p_i q_i|                                                                 (3)
 
-in any order (Higham 2002, section 3.1), so |I - Y F'| needs only float64 arithmetic. If that does not contract and the
-island is small, an inverse in balls is tried.
+in any order (Higham 2002, section 3.1), so |I - Y F'| needs only float64 arithmetic. If this norm is not below 1 and
+the island is small, an inverse in ball arithmetic is tried.
 """
 
 from __future__ import annotations
@@ -23,41 +23,40 @@ from lavender.base.lu import factor_sparse_lu
 from lavender.lab.proof.numbers import UNIT, max_abs, round_up_magnitude
 from lavender.lab.proof.operator import MAX_DENSE_FLOAT_ROWS, Part, Rounded, round_up
 
-MAX_BALL_INVERSE_UNKNOWNS = (
-    200  # Up to this many unknowns, an inverse in more than float64 precision is tried.
-)
+# Up to this many unknowns, an inverse in more than float64 precision is tried.
+MAX_BALL_INVERSE_UNKNOWNS = 200
 
-MAX_INVERSE_ENTRIES = (
-    4_000_000  # Largest number of entries of the inverse that are in memory at once (32 MB).
-)
+# Largest number of entries of the inverse that are in memory at once (32 MB).
+MAX_INVERSE_ENTRIES = 4_000_000
 
 # A friction component with a speed of up to this fraction of the largest b may stick in the solution.
 STICKING_SPEED_FRACTION = 1e-9
 
 MAX_BOX_ENLARGEMENTS = 10  # The box X is enlarged at most this often.
 
-# Larger than all numbers that underflow next to numbers that are scaled to about 1.
+# Bound of products that underflow to zero; it is negligible next to the numbers, which are scaled to about 1.
 UNDERFLOW_BOUND = 2.0**-300
 
 
 class Sticks(Exception):
-    """Some friction `components` hardly slide, or their speed may be zero."""
+    """Raised if friction `components` that were assumed to slide have a very small speed, or possibly zero speed."""
 
     def __init__(self, components: list[Any]) -> None:
         self.components = components
 
 
 class NoZero(Exception):
-    """No box proves a zero; `slope` (n, n) is F' at the answer."""
+    """Raised if no box X with K(X) inside X is found; `slope` (n, n) is F' at the answer."""
 
     def __init__(self, slope: Any) -> None:
         self.slope = slope
 
 
 class Island:
-    """Equations (1) of some rows: `part` of A, sliding friction components with their normals.
+    """Equations (1) of `lavender.lab.proof` for the rows of one island, with sliding friction components.
 
-    `lam` holds the impulses of all rows, `base` their slacks without the impulses of these rows.
+    `part` is A of these rows. `lam` holds the impulses of all rows of the problem, and `base` their slacks if the
+    impulses of the island's rows are zero.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class Island:
         self.base = [base[r] for r in which]
 
     def evaluate_equations(self, x: list[Any]) -> tuple[list[Any], Any]:
-        """Compute F, and (w, s) of each sliding component."""
+        """Compute F(x), and the slacks w and speed s of each sliding component."""
         number, index = self.number, self.index
         w = [p + q for p, q in zip(self.part.multiply(x), self.base, strict=True)]
         out, speeds = list(w), []
@@ -93,7 +92,10 @@ class Island:
         return out, speeds
 
     def compute_slope(self, x: list[Any], speeds: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Return F' = left A + right over a box: entries of `left` that differ from I, nonzero ones of `right`."""
+        """Compute the Jacobian F' = left A + right over a box x.
+
+        Return the entries of `left` that differ from the identity, and the non-zero entries of `right`.
+        """
         number, index = self.number, self.index
         left: dict[Any, Any] = {}
         right: dict[Any, Any] = {}
@@ -101,7 +103,7 @@ class Island:
             at = [
                 (index[r], number(c) * number(c)) for r, c in zip(part.rows, part.coefficients, strict=True)
             ]
-            gradient = [c2 * w[k] / s for k, c2 in at]  # This gives ds = gradient . dw.
+            gradient = [c2 * w[k] / s for k, c2 in at]  # Derivative of the speed s by the slacks w.
             normal = x[index[first]] if first in index else self.lam[first]
             for k, c2 in at:
                 for (q, _), ds in zip(at, gradient, strict=True):
@@ -166,7 +168,7 @@ class Island:
                 return enclosure
             if len(start) > MAX_BALL_INVERSE_UNKNOWNS:
                 break
-        # A component that hardly slides at the answer may stick.
+        # A component with a very small sliding speed at the answer may stick in the solution.
         _, speeds = self.evaluate_equations(start)
         slow = [
             p
@@ -184,7 +186,7 @@ class Island:
         for step in range(30):
             value, speeds = self.evaluate_equations(x)
             if any(not (s > 0) for _, s in speeds):
-                break  # The component's case is wrong, or it is on the boundary of two.
+                break  # A component does not slide, or is on the boundary between sliding and sticking.
             if (
                 inverse is None
                 or moved > (1e-3 if self.sliding else 0.1) * last
@@ -284,7 +286,7 @@ class FloatInverse:
         return [self.island.number(q) for q in move.tolist()]
 
     def _iterate_rows(self, n: int) -> Iterator[tuple[int, FloatArray]]:
-        """Yield rows of Y as columns, in portions that fit MAX_INVERSE_ENTRIES, with the index of the first."""
+        """Yield (first row, transposed rows of Y) for consecutive blocks of at most MAX_INVERSE_ENTRIES entries."""
         if self.dense_inverse is not None:
             yield 0, self.dense_inverse.T
             return

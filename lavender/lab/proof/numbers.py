@@ -30,7 +30,7 @@ if hasattr(os, "register_at_fork"):  # It does not exist on Windows.
 
 @contextmanager
 def set_ball_precision(bits: int) -> Iterator[Any]:
-    """Set the precision of python-flint to `bits` until the context ends; one thread at a time.
+    """Set the precision of python-flint to `bits` in a context, which only one thread at a time can enter.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def multiply_sparse_by_vector(kind: Any, a: Any, x: list[Any], nonzeros_of_x: An
 
 
 def round_up_magnitude(x: Any) -> float:
-    """Return a float that is at least |x| for every number of a ball; converting the upper end may round it down."""
+    """Return a float that is at least |x| for every number x of a ball; the conversion to float is rounded up."""
     up = abs(x).upper()
     return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
 

@@ -1,4 +1,4 @@
-"""The operator A of float64 numbers that count as exact, in balls, in rationals and in float64 with error bounds."""
+"""The operator A of exact float64 entries in three arithmetics: balls, rationals, and float64 with error bounds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from lavender.lab.proof.numbers import UNIT, Balls, multiply_sparse_by_vector, r
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-# Largest number of coupled unknowns of J and M: M^-1 is a dense matrix of balls: about a minute and 0.3 GB.
+# Largest number of coupled velocities of M. M^-1 is a dense matrix of balls; at this size it takes a minute and 0.3
+# GB.
 MAX_COUPLED_UNKNOWNS = 2000
 
 MAX_DENSE_BALL_ROWS = 64  # Up to this many rows, A is a dense matrix of balls.
@@ -39,12 +40,12 @@ def _is_in_product_range(a: Any) -> bool:
 
 
 def round_up(x: Any) -> Any:
-    """Return upper bounds of sums that were rounded; no summand is negative."""
+    """Return upper bounds of rounded sums x of non-negative numbers."""
     return x * (1.0 + 1e-9)
 
 
 class Part:
-    """A of some rows and columns: in exact balls, times balls, and as float64 numbers with error bounds."""
+    """A of some rows and columns: as exact balls, as a product with balls, and as float64 with error bounds."""
 
     def __init__(self, operator: Operator, kind: Balls, which: Any) -> None:
         self.which, self._operator, self._kind = which, operator, kind
@@ -104,7 +105,7 @@ class Part:
         _, inner, j = self._matrices
         soft, inner_size, size = sp.diags_array(self._theta), abs(inner), abs(j)
         half, half_size = j @ inner, size @ inner_size
-        # Each entry is a sum of sums of up to k products.
+        # Each entry of A is a nested sum of at most k products.
         k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2
         off = 2.0 * k * UNIT * (half_size @ size.T + soft)
         return self._make_rounded(half @ j.T + soft, round_up(off))
@@ -123,7 +124,7 @@ def _list_row_entries(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
 
 
 class Operator:
-    """A of float64 numbers that count as exact: products with impulses, and blocks, in balls or rationals."""
+    """The operator A with exact float64 entries: products with impulses, and blocks, in balls or rationals."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem: Any = problem
@@ -136,7 +137,10 @@ class Operator:
         self._bias: dict[Any, list[Any]] = {}  # b in balls and in rationals.
 
     def _split_rhs(self) -> tuple[FloatArray, FloatArray | None]:
-        """Split b = target - J v*: return (target, v*), rounding noise of a target set to 0; (b, None) for a matrix."""
+        """Return (target, v*) with b = target - J v*, or (b, None) for a problem in matrix form.
+
+        Targets of the size of rounding errors are set to 0.
+        """
         problem = self.problem
         if problem.matrix is not None:
             return problem.b, None
@@ -191,7 +195,7 @@ class Operator:
         return a
 
     def compute_sparsity_pattern(self, which: Any) -> Any:
-        """Return a sparsity pattern that contains A's: float64 may round a sum of products to 0."""
+        """Return a sparsity pattern that contains the one of A, also entries that float64 arithmetic rounds to 0."""
         if self.transposed is None:
             return (self.rows[which][:, which] != 0).astype(float)
         generalized = self.problem.generalized
@@ -206,7 +210,8 @@ class Operator:
     def compute_slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
         """Compute w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
-        # A ball around 0 may contain other numbers, and `!=` is true only if it is certain: select entries by `not ==`.
+        # For a ball that contains 0 and other numbers, `!= 0` is false, as it is not certain: select entries by `not
+        # ==`.
         at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
         if self.transposed is None:
             a = multiply_sparse_by_vector(kind, self.rows, impulse, at)
@@ -238,7 +243,9 @@ class Operator:
 
 
 def _prove_semidefinite_by_cholesky(a: FloatArray) -> bool:
-    """Whether Cholesky factorisation of the symmetric (..., n, n) matrices a - c I succeeds; c bounds its rounding.
+    """Return whether symmetric matrices `a` (..., n, n) are proved semidefinite: a - c I has Cholesky factors.
+
+    c bounds the rounding errors of the factorisation.
 
     S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.
     """

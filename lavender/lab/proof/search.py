@@ -1,4 +1,4 @@
-"""The search for a case of each block such that the equations of all cases have a solution, and its enclosure."""
+"""Search the case of each block such that the equations of all cases have a solution, and enclose that solution."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class Enclosure:
     velocity_radius : float, m/s
         Largest |w_i - w_i*| of a row, rounded up; inf if nothing is proven.
     unique : bool
-        All solutions have the same velocities: proved for convex laws; under Coulomb's law only by
-        `motion.prove_uniqueness`.
+        Whether it is proved that all solutions have the same velocities. This holds for convex laws; under Coulomb's
+        law it needs `motion.prove_uniqueness`.
     reason : str
-        If nothing is proven: the cause and a remedy. If it is proven: rows with impulses of a family.
+        If nothing is proven: the cause and a remedy. If a solution is proven: the rows whose impulses are not unique.
     impulse : (m,) N s, or None
         The exact solution, rounded.
     boundary : tuple of str
@@ -94,17 +94,17 @@ class _Block:
     Parameters
     ----------
     index : int
-        Block of the problem.
+        Index of the block in the problem.
     first : int
-        Its first row: the normal of a contact.
+        First row of the block: the normal of a contact.
     parts : list of _FrictionComponent, or None
         Friction components of a contact; None for a row.
     loaded : bool
-        A contact has an impulse; a row is inside its bounds.
+        Whether the contact has a normal impulse, or the row is inside its bounds.
     at : float, N s
-        Bound at which a row is that is not inside its bounds.
+        Bound at which a row is, if it is not `loaded`.
     touches : bool
-        The block is at its bound, or open, and perhaps w = 0, too.
+        Whether w = 0 is possible although the block is not `loaded`.
     """
 
     index: int
@@ -116,7 +116,7 @@ class _Block:
 
 
 class _Undecided(Exception):
-    """Balls, or the maximum number of case changes, leave a condition undecided."""
+    """Raised if a condition stays undecided, by the precision of balls or by the maximum number of case changes."""
 
     def __init__(self, reason: str, boundary: tuple[str, ...] = ()) -> None:
         super().__init__(reason)
@@ -136,13 +136,13 @@ class Search:
         self.blocks = self._choose_initial_cases()
         self.family: Any = np.zeros(0, np.int64)
         self.singular = False  # The equations are singular in float64: a higher precision does not help.
-        # Rows of touching blocks that have w = 0 by rows they depend on.
+        # Rows of touching blocks (`_Block.touches`) that have w = 0 because they depend on rows with w = 0.
         self.still: Any = np.zeros(0, np.int32)
 
     # -- cases ----------------------------------------------------------------------------------
 
     def _choose_initial_cases(self) -> list[_Block]:
-        """Choose the case of each block by the point that one update would project: inside a bound or beyond it."""
+        """Choose each block's case by whether the point lambda - w/d, which the judge projects, is in its bounds."""
         cones = self.problem.cones
         lam, w, d = self.start, self.problem.slack(self.start), self.problem.d
         components: dict[int, list[_FrictionComponent]] = {}
@@ -179,11 +179,11 @@ class Search:
         return out
 
     def search_solution(self) -> Enclosure:
-        """Change cases until a solution is enclosed; return why none is if the search ends before."""
+        """Change cases until a solution is enclosed; if the search ends without one, the result has the reason."""
         try:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
-            exactly = False  # Continue in rational numbers once balls do not decide.
+            exactly = False  # Becomes true, for rational arithmetic, when balls do not decide.
             for _ in range(MAX_CASE_CHANGES):
                 key = tuple(
                     (b.loaded, b.at, b.touches, tuple(p.slides for p in b.components or ()))
@@ -226,7 +226,7 @@ class Search:
     # -- equations ------------------------------------------------------------------------------
 
     def _split_unknown_and_fixed(self) -> tuple[Any, list[Any]]:
-        """Return the rows that the case does not fix, and the impulses of all rows (floats if fixed)."""
+        """Return the rows with unknown impulses, and the impulses of all rows, as floats if a case fixes them."""
         fixed = [0.0] * self.problem.m
         unknown = []
         for block in self.blocks:
@@ -240,7 +240,7 @@ class Search:
         return np.array(sorted(unknown), np.int64), fixed
 
     def solve_equations(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
-        """Compute balls that contain a zero of the equations, or the zero in rationals: (lam, w) of all rows."""
+        """Solve the equations; return impulses and slacks (lam, w) of all rows as enclosing balls, or as rationals."""
         kind = Balls(self.flint) if kind is None else kind
         self.number = kind.number
         unknown, fixed = self._split_unknown_and_fixed()
@@ -280,7 +280,10 @@ class Search:
         return [free[label == k] for k in range(n)]
 
     def _select_independent_rows(self, unknown: Any, fixed: list[float]) -> Any:
-        """Return a maximal set of rows with w = 0 and independent J; the others must depend on it exactly, b too."""
+        """Return a maximal set of rows with w = 0 and independent rows of J.
+
+        Raise _Undecided unless the other rows with w = 0 depend on them exactly, with consistent b.
+        """
         still = set(unknown.tolist())
         for block in self.blocks:
             for component in block.components or ():
@@ -304,7 +307,7 @@ class Search:
         if numerical == len(rows) and not len(touching):
             return unknown
         own = rows[first]
-        while True:  # Rows with load have w = 0; a touching row has it only if it depends on rows with load.
+        while True:  # Loaded rows have w = 0; a touching row has w = 0 only if it depends on loaded rows.
             rows = np.concatenate([own, touching])
             try:
                 split = find_dependent_rows(self.flint, j[rows], self.operator.target[rows], numerical)
@@ -458,7 +461,7 @@ class Search:
                 continue
             for component in block.components:
                 if component.slides:
-                    continue  # |lambda / c| = lambda_n by (1), against w by its sign.
+                    continue  # By (1), |lambda / c| = lambda_n, opposite to w: no inequality is left.
                 y = sum(
                     (
                         (lam[k] / number(c)) ** 2
@@ -474,7 +477,7 @@ class Search:
         return None if changed else boundary
 
     def _compute_square_root(self, square: Any) -> Any:
-        """Compute a ball that contains the root; the ball of a square may extend below 0."""
+        """Compute a ball that contains the root of a number that is not negative; its ball may extend below 0."""
         square = self.flint.arb(square)
         return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
 
@@ -505,7 +508,7 @@ class Search:
 
 
 class _Recase(Exception):
-    """The cases of some blocks were changed before a zero was found."""
+    """Raised when cases were changed before a zero was found, so that the search starts again."""
 
 
 def _join_names(names: tuple[str, ...]) -> str:

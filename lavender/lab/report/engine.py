@@ -1,8 +1,8 @@
 """Read and rank the answers of the engine that recorded a folder of steps.
 
-The judge scores them like all results. Their time is measured inside the engine: it includes neither a copy of the
-problem nor the judge, and the engine starts from its previous step. `rank_engine` ranks it as
-solvers are ranked: by cases brought to a tolerance, then by the mean time.
+The judge computes the residuals of these answers, as of all results. The engine measures the time itself: the time
+includes neither a copy of the problem nor the judge, and the engine starts from its previous step. `rank_engine` ranks
+the engine as solvers are ranked: by the number of cases solved to a tolerance, then by the mean time.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class EngineAnswers:
     rows : median number of rows
     relative, worst : median and largest relative residual [-]
     above_floor : answers above the round-off floor
-    unconverged : answers with an error above the recording's threshold that stopped before convergence or are wrong
-    velocity, where : largest velocity error of a row, nan if it was not recorded [m/s]; and that row
+    unconverged : number of answers with an error above the recording's threshold [m/s] that rounding does not explain
+    velocity, where : largest velocity error of a row [m/s], nan if it was not recorded; and the name of that row
     answers : time inside the engine [s] and relative residual by file name
     """
 
@@ -117,9 +117,9 @@ def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
 def rank_engine(
     engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], tolerance: float
 ) -> Choice | None:
-    """Rank the engines' own answers to these cases to a tolerance as lines of solvers are ranked.
+    """Return the result of the engine that answered these cases, to be ranked with the solvers to a tolerance.
 
-    None unless an engine answered every case.
+    Return None if no engine answered every case.
     """
     answers: dict[str, tuple[float, float]] = {}
     solvers: dict[str, None] = {}

@@ -57,7 +57,7 @@ class Curve:
 
     @property
     def lower_front(self) -> Curve:
-        """The points in the order of x that are lower than all points before."""
+        """The curve through the points that are lower than all points with smaller x."""
         front: list[tuple[float, float]] = []
         for x, y in sorted(zip(self.x, self.y, strict=True)):
             if not front or y < front[-1][1]:
@@ -78,7 +78,7 @@ class Figure:
     x_log, y_log : whether the axes are logarithmic
     tolerances : horizontal lines
     roundoff_floor : dotted line; nan without one
-    left_out : solvers without a curve, so that the others can be distinguished
+    left_out : solvers that are not drawn because too many curves could not be distinguished
     note : a sentence that explains the curves, for the caption
     """
 
@@ -102,7 +102,7 @@ class Figure:
 
 
 def _sort_by_work(runs: list[Record]) -> list[Record]:
-    """Sort runs by iterations or tolerance: times of microseconds vary from run to run."""
+    """Sort runs by iterations or by tolerance, not by time, as times of microseconds vary from run to run."""
     if any(r.mode == "budget" for r in runs):
         return sorted(runs, key=lambda r: (r.iterations, r.time_min))
     return sorted(runs, key=lambda r: (-r.tol, r.time_min))
@@ -147,11 +147,11 @@ PASSES_NOTE = (
     "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "
     "factorise, pivot or solve linear systems do other work and are not compared"
 )
-GRID_SIZE = 49  # Times, or numbers of passes, at which the residuals of all cases are compared.
+GRID_SIZE = 49  # Number of points on the horizontal axis at which the residuals of all cases are evaluated.
 
 
 def build_overall_figure(records: Records, measure: str = "time") -> Figure:
-    """Plot the residual that a solver has reached by a time, over all cases: the median, and a band of the middle half.
+    """Plot the residual that each solver has reached by a time: median over all cases, and a band of the quartiles.
 
     A case without a result by that time counts with residual 1, as the zero impulse; so does a case that a solver
     does not accept, which the title states. Cases are single problems from a cold start. If there are only sequences,
@@ -161,7 +161,7 @@ def build_overall_figure(records: Records, measure: str = "time") -> Figure:
     ----------
     records : Records
     measure : {"time", "work"}
-        "work": by passes over A in place of time, of the solvers that do no other work.
+        Horizontal axis. "work": number of passes over A, for solvers whose work consists of such passes only.
     """
     by_work = measure == "work"
     single = any(r.step < 0 for r in records)
@@ -215,14 +215,16 @@ def build_budget_figure(records: Records, case: str) -> Figure:
             curves.append(
                 Curve.from_points(solver, format_run_name(solver, start), points, thin=start != "cold")
             )
-    # An iteration of admm solves a linear system, an iteration of pgs is a sweep.
+    # The axis is titled "sweeps" only if every solver's iteration is a sweep; an iteration of admm, for example, is
+    # not.
     swept = all("sweeps" in r.work for r in records if r.mode == "budget" and r.case == case and r.is_usable)
     title = "sweeps" if swept else "iterations, each solver's own unit"
     return _build_case_figure("budget", title, records, case, curves)
 
 
-MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead about the second place.
-MIN_COMPARED = 2  # At least this many other solvers are drawn with plug-ins.
+# Largest number of curves of a profile. More are hard to distinguish and mislead about ranks below 1.
+MAX_CURVES = 5
+MIN_COMPARED = 2  # At least this many built-in solvers are drawn, however many plug-ins are.
 
 
 def is_plug_in(solver: str) -> bool:
@@ -232,7 +234,11 @@ def is_plug_in(solver: str) -> bool:
 
 
 def select_drawn_solvers(ranked: Sequence[str], always: Sequence[str] = ()) -> list[str]:
-    """Select the solvers of a figure: plug-ins, the first of the others, `always`; up to `MAX_CURVES` in all."""
+    """Select the solvers that a figure shows, from `ranked`, best first.
+
+    All plug-ins, the solvers in `always` and the best other solvers are shown: `MAX_CURVES` in all, unless there are
+    many plug-ins.
+    """
     plug_ins = [name for name in ranked if is_plug_in(name)]
     required = [name for name in ranked if name in always and name not in plug_ins]
     others = [name for name in ranked if name not in (*plug_ins, *required)]
@@ -318,7 +324,7 @@ class Figures:
     profiles : performance profiles by law, one for each tolerance: by time, then by work
     sequences : figures by sequence
     cases : error against time and residual against iterations, by case
-    moved : the same with motion errors [m/s] in place of residuals, if they are known
+    moved : figures of `cases` with motion errors [m/s] in place of residuals, if motion errors were measured
     """
 
     over: Group = field(default_factory=dict)
@@ -329,7 +335,7 @@ class Figures:
 
     @property
     def groups_by_section(self) -> dict[str, Group]:
-        """The groups by name."""
+        """The groups of figures by the name of their section."""
         return {name: group for name, group in vars(self).items() if name != "moved"}
 
     def __iter__(self) -> Iterator[Figure]:
@@ -352,7 +358,7 @@ def build_figures(records: Records) -> Figures:
 
 
 def _relabel_for_motion(figures: Figures) -> Figures:
-    """Return figures of `convert_to_motion_errors`, with matching names and titles."""
+    """Return figures of records from `convert_to_motion_errors` with names and titles that mention motion errors."""
 
     def relabel(figure: Figure) -> Figure:
         return replace(
@@ -398,7 +404,7 @@ def _select_drawn_figures(*some: Figure) -> tuple[Figure, ...]:
 
 
 def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figure, ...]:
-    # The middle budget, and the middle tolerance.
+    # Draw each sequence at the middle budget and at the middle tolerance.
     budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
     middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
     tolerances = sorted({w.tol for w in passes if w.mode == "tol"}, reverse=True)

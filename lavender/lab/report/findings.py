@@ -1,4 +1,4 @@
-"""Compute the contents of a report once: its page, the terminal, the summary and a paper show them."""
+"""Compute the contents of a report, which the page, the terminal, the summary and a paper show."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ class Report:
     earlier : Records, optional
         An earlier run to compare with.
     time_budgets : s, optional
-        Times with a recommended solver; default: the times of the plan, or `recommendation.choose_time_budgets`.
+        Time budgets for which a solver is recommended. Default: the times of the plan, or
+        `recommendation.choose_time_budgets`.
     sweep_budgets : int, optional
-        Numbers of sweeps with a recommended solver; default: the budgets of the plan.
+        Numbers of sweeps for which a solver is recommended. Default: the budgets of the plan.
     engines : sequence of EngineAnswers
         Answers of the engines that recorded the steps: `lavender.lab.report.engine.read_engine_answers`.
     """
@@ -41,17 +42,17 @@ class Report:
 
     @cached_property
     def newest_run(self) -> Records:
-        """The newest run."""
+        """Records of the newest run."""
         return self.all_records.select_latest_run()
 
     @cached_property
     def ranked_records(self) -> Records:
-        """The newest run without cases that the zero impulse solves."""
+        """Records of the newest run without cases that the zero impulse solves."""
         return statistics.drop_cases_solved_at_zero(self.newest_run)
 
     @cached_property
     def earlier_run(self) -> Records | None:
-        """The newest run of the earlier records."""
+        """Records of the newest run in `earlier`; None without earlier records."""
         return None if self.earlier is None else self.earlier.select_latest_run()
 
     @cached_property
@@ -114,7 +115,7 @@ class Report:
 
     @cached_property
     def recommendation_times(self) -> tuple[float, ...]:
-        """Times [s] with a recommended solver."""
+        """Time budgets [s] for which a solver is recommended."""
         return tuple(self.time_budgets) or choose_time_budgets(self.ranked_records)
 
     @cached_property

@@ -1,13 +1,13 @@
 """Write PDF figures, LaTeX tables and a paragraph on the method of a report, for a paper.
 
-All times are of one call of `lv.solve`, for solvers of other packages, too. A table has the part of the call that these
-spend in their own interface.
+All times are times of one call of `lv.solve`, also for solvers of other packages. For these solvers, a table has the
+part of the time that is spent in their own interface.
 
 paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
-paper/work-over-all.pdf     error against passes over A, of the solvers that do no other work
-paper/class-FOLDER.pdf      both for each folder that the cases came from, if there are several
-paper/profile-LAW-X.pdf     performance profiles by time, for each problem class and tolerance
-paper/work-profile-....pdf  the same by passes over A, of the solvers that do no other work
+paper/work-over-all.pdf     error against passes over A, for solvers whose work consists of such passes only
+paper/class-FOLDER.pdf      these two figures for each folder that the cases came from, if there are several
+paper/profile-LAW-X.pdf     performance profiles by time, for each friction law and tolerance
+paper/work-profile-....pdf  performance profiles by passes over A, for solvers whose work consists of such passes only
 paper/sequence-....pdf      each step of a sequence
 paper/figures.tex           these figures with their captions
 paper/tables.tex            recommendations, mean times by law, own interfaces, claims against the judge (booktabs)
@@ -58,7 +58,7 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     Parameters
     ----------
     report : Report
-        Nothing is solved.
+        Report of a run with times.
     folder : path
         Created if it does not exist.
 
@@ -70,7 +70,7 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     Raises
     ------
     InputError
-        No runs with times (a campaign), or the folder cannot be written.
+        The report has no times (a campaign), or the folder cannot be written.
     """
     records = report.ranked_records
     if not len(records) or report.is_campaign:
@@ -117,9 +117,13 @@ def _build_folder_figures(records: Records) -> Group:
 
 
 def _reduce_figure_to_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
-    """Reduce a figure to plug-ins, leaders of the verdict, those that end lowest, and osqp; bands to two solvers."""
+    """Reduce a figure to a few solvers: plug-ins, `leaders`, solvers with the lowest ends of curves, and osqp.
+
+    Only the first two curves keep their bands.
+    """
     if all(c.steps for c in figure.curves):
-        return figure  # The curves of a profile are selected already.
+        # Step functions are performance profiles, whose solvers `build_profile_figure` has selected.
+        return figure
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
@@ -167,7 +171,7 @@ def _describe_unloaded_cases(records: Records) -> str:
 
 
 def _describe_times(report: Report, solvers: set[str], sequences: bool = False) -> str:
-    """Return a sentence on the code that the times of these solvers include, with the load if it was too high."""
+    """Return a sentence on which code the times of these solvers include, and on the machine's load if it was high."""
     records = report.ranked_records
     runs = [
         r for r in records

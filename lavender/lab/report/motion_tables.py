@@ -1,4 +1,4 @@
-"""Convert records so that all tables and figures show motion errors [m/s] in place of residuals; list idle cases."""
+"""Convert records so that tables and figures show motion errors [m/s], and list cases that the zero impulse solves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from lavender.lab.bench.record import format_tolerance
 from lavender.lab.bench.store import Records
 
-DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # [m/s] Used if the plan has none.
+DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # [m/s] Velocity tolerances of tables if the plan has none.
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,11 @@ from lavender.lab.report.text import (
 )
 from lavender.lab.report.verdict import Verdict
 
-MAX_NAMED = 7  # Solvers that are drawn in colour at first: the style sheet has so many colours.
-MAX_FAILURES = 500  # Failures on a page, so that a page of 200 problems has less than 3 MB.
-MAX_SPREADS = 100  # Spreads of sweep orders on a page: the widest ones.
+# Number of solvers that the page initially draws in colour; the style sheet has this many colours.
+MAX_NAMED = 7
+MAX_FAILURES = 500  # Largest number of failures on a page; a page of 200 problems then has less than 3 MB.
+# Largest number of comparisons of sweep orders on a page; those with the widest spread are kept.
+MAX_SPREADS = 100
 
 
 @functools.cache
@@ -69,7 +71,7 @@ def create_environment() -> Any:
     return environment
 
 
-#: A number with an exponent or a unit, or the name of an option, which are not broken across lines.
+#: Matches texts that are not broken across lines: a number with exponent or unit, or the name of an option.
 NUMBER = re.compile(
     r"(?<![\w.])\d[\d.]*(?:e-?\d+(?:\s(?:m/s|N\ss|√J))?|\s(?:µs|ms|s|m/s|rad/s|N\ss|√J|%|times|iterations?|sweeps?))"
     r"(?!\w)|(?<!\S)--[a-z][a-z-]*"
@@ -84,9 +86,10 @@ def keep_numbers_together(text: str) -> Any:
 
 
 def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
-    """Return the page. Every text from a file, a problem or a backend is escaped.
+    """Return the page as HTML. Every text from a file, a problem or a backend is escaped.
 
-    `figures` show the records of the report; `saved`: the folder of the page has them as SVG and PNG, too.
+    `figures` are the figures of the report's records. If `saved` is true, they are also SVG and PNG files in the
+    page's folder, to which the page links.
     """
     records = report.ranked_records
     return create_environment().get_template("index.html.j2").render(
@@ -99,7 +102,7 @@ def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
 
 
 def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> dict[str, Any]:
-    """Return the drawings by name, and for each section of the page the names of its drawings."""
+    """Return the SVG drawings by name, and the names of the drawings in each section of the page."""
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
     named = [*verdict.leaders, *(name for name in names if is_plug_in(name) and name not in verdict.leaders)]
@@ -121,7 +124,7 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
 
 
 def _list_drawing_names(figures: Figures) -> dict[str, dict[str, list[str]]]:
-    """Return the names of the drawings by place and subject."""
+    """Return the names of the drawings by section of the page and by subject (case, law or sequence)."""
     return {
         place: {name: [make_file_name(figure.name) for figure in some] for name, some in group.items()}
         for place, group in figures.groups_by_section.items()
@@ -155,7 +158,7 @@ def _describe_cases(report: Report) -> dict[str, Any]:
 
 
 def _map_rankings_to_anchors(lines: Sequence[recommendation.FamilyAdvice]) -> dict[str, str]:
-    """Return for each structure and sequence the part of the page that describes it."""
+    """Return, for each structure and sequence, the id of the part of the page that describes it."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
     return {name: f"{part}-{make_file_name(name)}" for name, part in parts.items()}
 

@@ -5,8 +5,8 @@ In files a solver of lavender has the same colour, dash and mark in all reports.
 in grey print. Plug-ins have colours of their own.
 
 Within a page the colours are from its style sheet, so that they follow the theme and the selected solvers. The drawing
-has classes in place of matplotlib's styles, whole coordinates, and the ranges of its axes, from which the page's script
-computes the values of points.
+has classes in place of matplotlib's styles, whole coordinates, and the ranges of its axes, from which the page's
+script computes the values of points.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ PLUG_IN_COLORS = (
 )  # Plug-ins; no solver of lavender has one of these colours.
 DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
-LEGEND_COLUMNS = 3  # Columns of a legend above the axes.
-MAX_PAGE_DOTS = 40  # A line with more points has no dots on a page; single points always have.
+LEGEND_COLUMNS = 3  # Number of columns of a legend above the axes.
+# On a page, a line with more points is drawn without dots; points without a line always have dots.
+MAX_PAGE_DOTS = 40
 MAX_MARKED_POINTS = 60  # A curve with more points has no marks: they would cover it.
 MAX_TITLE_LENGTH = 80  # [characters] Longer titles are cut.
 MAX_NAME_LENGTH = 24  # [characters] Longer names of solvers at the ends of curves are cut.
-MIN_DECADES = 1.0  # A logarithmic axis has at least this length.
+MIN_DECADES = 1.0  # [decades] A logarithmic axis has at least this length.
 AXIS_MARGIN = 0.03  # This fraction of the data's range is added at each end of an axis.
 AXIS_TIME_UNITS = (*TIME_UNITS, (1e-9, "ns"))
 
@@ -63,7 +64,7 @@ def choose_limits(values: Sequence[float], log: bool) -> tuple[float, float]:
 
 
 def choose_ticks(limits: tuple[float, float], log: bool) -> list[float]:
-    """Return at most seven decades, or round numbers if the axis has fewer than two decades or is linear."""
+    """Return ticks of an axis: up to seven powers of ten, or round numbers if it is linear or below two decades."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     locator: Any = MaxNLocator(6, steps=(1, 2, 5, 10))
@@ -93,7 +94,7 @@ def label_axis(
 
 
 def _mask_points_outside_axes(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
-    """Return the points of a curve, with nan for those that the axes cannot show: a line has a gap there."""
+    """Return the points of a curve; points outside the axes are nan, so that the line has a gap there."""
     points = []
     for x, y in zip(curve.x, curve.y, strict=True):
         is_shown = all(
@@ -106,7 +107,7 @@ def _mask_points_outside_axes(curve: Curve, figure: Figure) -> list[tuple[float,
 def _draw_figure(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, float]], Any, Any]]:
     """Draw curves, tolerances, floor and axes of a figure without colours.
 
-    Returns each curve that has a point with its points, its line and its band (None without one).
+    Return (curve, points, line, band) for each curve that has a point; the band is None if the curve has no band.
     """
     curves = [(c, points) for c in figure.curves for points in [_mask_points_outside_axes(c, figure)]]
     curves = [(c, points) for c, points in curves if any(not math.isnan(y) for _, y in points)]
@@ -175,8 +176,8 @@ class CurveStyle:
     marker: str
 
 
-# These solvers get the first styles, so that the solvers that are often compared have different colours. The last two
-# share the colour of one with which they are rarely drawn.
+# Solvers that get the first styles, so that solvers that are often compared have different colours. The last two share
+# the colour of a solver with which they are rarely drawn.
 FIRST_SOLVERS = (
     *("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses"),
     *("jacobi", "admm"),
@@ -186,8 +187,8 @@ FIRST_SOLVERS = (
 def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
     """Return a style for each solver.
 
-    A solver of lavender has a fixed style, by its place in `FIRST_SOLVERS`, then among the sorted names. Plug-ins have
-    the colours of `PLUG_IN_COLORS` in the order of their names; the first has a fixed one if it is the only one.
+    The style of a built-in solver is fixed by its place in `FIRST_SOLVERS`, followed by the other names in
+    alphabetical order. Plug-ins get the colours of `PLUG_IN_COLORS` in alphabetical order.
     """
     names = set(solvers)
     own = {name for name in registry.specs() if not is_plug_in(name)}
@@ -216,7 +217,7 @@ def plot_figure(
     entries = len(figure.curves) + (figure.roundoff_floor > 0.0)
     rows = -(-entries // LEGEND_COLUMNS) + bool(figure.left_out)
     right, top = (2.05, 0.41) if figure.title else (0.15, 0.17 * rows + 0.1)
-    # The axes have a fixed place: fitting it to the labels would take longer than the rest of the figure.
+    # The axes have a fixed position: fitting it to the labels would take longer than drawing the figure.
     width, height = 1.0 - (0.76 + right) / size[0], 1.0 - (0.6 + top) / size[1]
     axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], width, height))
     _draw_styled(axes, figure, styles)
@@ -265,7 +266,8 @@ def plot_panels(figures: Sequence[Figure], styles: Mapping[str, CurveStyle]) -> 
 
 def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) -> None:
     """Draw a figure with the colours, dashes and marks of its solvers, and with its title."""
-    has_bands = any(c.low for c in figure.curves)  # Points over all cases are not single runs.
+    # Figures with bands summarise cases, so points are not single runs.
+    has_bands = any(c.low for c in figure.curves)
     for c, points, line, band in _draw_figure(axes, figure):
         style = styles[c.solver]
         line.set(
@@ -287,7 +289,10 @@ def _escape_dollars_in_legend(legend: Any) -> Any:
 
 
 def save_figures(figures: Iterable[Figure], folder: Path, solvers: Iterable[str] = ()) -> None:
-    """Write each figure as NAME.svg and NAME.png; `solvers` without a curve count for the choice of colours, too."""
+    """Write each figure as NAME.svg and NAME.png.
+
+    `solvers` are solvers without a curve that get colours, too, so that colours agree with other figures.
+    """
     figures = list(figures)
     styles = assign_styles({*solvers, *(c.solver for figure in figures for c in figure.curves)})
     for figure in figures:
@@ -309,8 +314,8 @@ LEFT, RIGHT, TOP, BOTTOM = (
 )  # [units] Margins for the labels of the axes and the names at the ends of curves.
 FONT_SIZE = 22  # [units] The page's style sheet has the same size.
 TITLE_CHARACTER_WIDTH = 15  # [units] Mean width of a character of a title with the largest font, on a phone.
-TITLE_LINE_HEIGHT = 32  # [units]
-TITLE_MARGIN = 8  # [units] Between the title and the title of the vertical axis.
+TITLE_LINE_HEIGHT = 32  # [units] Height of one line of a title.
+TITLE_MARGIN = 8  # [units] Distance between the figure's title and the title of the vertical axis.
 MIN_NAME_DISTANCE = 30  # [units] Smallest distance between two names of leaders.
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -408,8 +413,8 @@ def _place_curve_names(
 ) -> dict[int, tuple[float, float]]:
     """Return the positions of the names of curves: at their ends, with a distance between the names of leaders.
 
-    In a figure with single points the names are a list to the right of the axes, which end at `edge`: beside a point
-    they would cover others.
+    If a curve is drawn as points without a line, all names are listed to the right of the axes, whose right end is
+    `edge`, because a name next to a point would cover other points.
     """
     if any(c.points for c in curves):
         return {i: (edge + 24.0, TOP + FONT_SIZE + MIN_NAME_DISTANCE * i) for i in range(len(curves))}
@@ -417,13 +422,13 @@ def _place_curve_names(
     for i, c in enumerate(curves):
         if not c.thin:
             last = places[i][-1][1]
-            # Next to the rightmost point at the height of the end.
+            # Place the name to the right of all points of the curve at about the height of its end.
             right = edge if c.steps else max(x for x, y in places[i] if abs(y - last) < MIN_NAME_DISTANCE)
             ends[i] = (right + 12.0, last + 8.0)
     leading = sorted((i for i in ends if curves[i].solver in leaders), key=lambda i: ends[i][1])
     for above, i in pairwise(leading):
         ends[i] = (ends[i][0], max(ends[i][1], ends[above][1] + MIN_NAME_DISTANCE))
-    lowest = HEIGHT - BOTTOM + 4.0  # Above the numbers of the axis.
+    lowest = HEIGHT - BOTTOM + 4.0  # Lowest position of a name, above the numbers of the horizontal axis.
     for i in reversed(leading):
         ends[i] = (ends[i][0], min(ends[i][1], lowest))
         lowest = ends[i][1] - MIN_NAME_DISTANCE
@@ -455,7 +460,7 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
         yield from _rewrite_texts(group, ' class="a"')
     for owner, parts in marked.items():
         c = curves[int(owner[1:])]
-        # "16" for 16 iterations: the page's script adds the word.
+        # Write "16" for "16 iterations": the page's script appends the word.
         notes = "|".join(note.removesuffix(" iterations") for note in c.notes)
         attribute = f' data-n="{escape(notes)}"' if notes else ""
         kinds = f"c s{number.get(c.solver, 0)}{' w' if c.thin else ''}"

@@ -72,7 +72,7 @@ def format_time_ratio_table(steps: Sequence[Step]) -> str:
 
 
 def format_warm_time_ratio_table(steps: Sequence[WarmStep]) -> str:
-    """Return the same over consecutive steps, both solvers started from their last step."""
+    """Return the table of `format_time_ratio_table` for consecutive steps, with both solvers warm-started."""
     rows = [
         [
             *_make_row_head(name, part),

@@ -40,7 +40,7 @@ class PageSection:
 
     @property
     def is_shown(self) -> bool:
-        """Whether it has contents: tables without rows and figures without curves do not count."""
+        """Whether the section has contents: a table with rows, a figure with curves, or lines to copy."""
         has_contents = any(t.rows for t in self.tables) or any(f.curves for f in self.figures)
         return has_contents or bool(self.code) or not (self.tables or self.figures)
 
@@ -54,7 +54,7 @@ class SummaryPage:
     title, head : title, summarising sentence
     sections : sections
     numbers : content of numbers.json
-    stopped : whether the measurement ended early, so that all numbers are of the completed part
+    stopped : whether the measurement ended early, so that all numbers describe only its completed part
     warning : a sentence on the measurement, such as a busy machine
     """
 

@@ -1,7 +1,7 @@
-"""Define tables as data. Each output format has one writer of them.
+"""Define tables as data, independent of the output format.
 
-These are `terminal`, `markdown`, `latex_export`, and the template `table.html.j2` for pages. The times of a table have
-one unit, and the sizes of a column one format.
+The modules `terminal`, `markdown` and `latex_export`, and the template `table.html.j2` for pages, write them. All
+times of a table have one unit, and all sizes of a column have one format.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from lavender.lab.report.text import format_sizes, format_times_in_one_unit
 
-#: Heads of columns of words; all other columns have numbers.
+#: Heads of the columns that contain words; all other columns contain numbers.
 WORDS = frozenset({
     "case", "solver", "status", "claim", "form", "structure", "law", "change", "target", "hardest", "sequence",
     "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "first here",
@@ -34,7 +34,8 @@ class Cell:
     link : id of the part of the page that the cell links to
     value : number by which the page sorts
     mark : key of `COLOURS`
-    quantity : "time" [s] or "size": the table writes `value`, in the format of its other times or of the column
+    quantity : "time" [s] or "size"; the table then formats `value` like its other times, or like the column's other
+    sizes
     """
 
     text: str
@@ -54,7 +55,7 @@ class Cell:
 
     @classmethod
     def size(cls, value: float, **more: Any) -> Cell:
-        """Create the cell of a number without a usual size."""
+        """Create the cell of a number of any magnitude, whose format the column chooses."""
         return cls("", value=value, quantity="size", **more)
 
     def __str__(self) -> str:
@@ -73,8 +74,8 @@ class Table:
     ----------
     heads, rows : heads of the columns, cells of the rows
     marks : key of `COLOURS` for each row; empty without marks
-    folds : whether cells have several words, which are wrapped in a narrow table
-    words : heads of columns of words
+    folds : whether cells contain several words, so that a narrow terminal shows each cell on a line of its own
+    words : heads of the columns that contain words
     """
 
     heads: Sequence[str]

@@ -1,4 +1,4 @@
-"""Describe every table of a report once: its page, the terminal, the summary and a paper show the same rows.
+"""Build every table of a report. The page, the terminal, the summary and a paper show the same tables.
 
 `list_sections` defines the order of the tables in the terminal and the summary. The page shows the same tables between
 its figures.
@@ -45,8 +45,8 @@ DIFFICULTY = (
 INTERLEAVED, ALONE = (
     "interleaved",
     "alone",
-)  # Marks of times: calls of the recommendation, repeated alternately; single runs.
-ENGINES_OWN = "engine's own"  # Column of the solver of the engine that recorded the cases.
+)  # Marks of times: of recommended calls, which were repeated alternately, and of single runs.
+ENGINES_OWN = "engine's own"  # Head of the column for the solver of the engine that recorded the cases.
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
 
@@ -133,10 +133,10 @@ def list_sections(report: Report) -> list[Section]:
 
 
 def build_short_table(report: Report) -> Table:
-    """Build the table of a short report, to the middle tolerance alone.
+    """Build the table of a short report, for the middle tolerance.
 
-    Its rows are structures with the first solver of each, or the solvers of the only structure; for a campaign shares
-    of cases.
+    A row is a structure with its best solver or, if there is one structure, a solver. For a campaign, the table has
+    the share of cases that each solver solves.
     """
     middle = len(report.tolerances) // 2
     if report.is_campaign:
@@ -166,7 +166,7 @@ def has_interleaved_calls(report: Report) -> bool:
 
 
 def _tabulate_solvers(report: Report, tolerance: float) -> Table:
-    """Tabulate the solvers of the only structure to a tolerance; the solvers of the first sentence come first."""
+    """Tabulate solvers by time to a tolerance, for records of one structure; recommended solvers come first."""
     raced = {
         choice.solver: (final.as_record, choice) for final, choice in report.verdict.ranking if choice.solved
     }
@@ -199,7 +199,7 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
 
 
 def format_advice(advice: Advice, in_time: bool) -> Cell:
-    """Return the first solver with its time or residual, the number of cases that it solves, and its budget."""
+    """Return a cell with the best solver of a ranking, its time or residual, number of solved cases, and budget."""
     best, ties = advice.best, advice.tied_solvers
     if best is None:
         most = advice.ranking[0] if advice.ranking else None
@@ -222,9 +222,9 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
 
 
 def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None = None) -> Table:
-    """Tabulate the first solver to each tolerance and within each time [s], for each structure and sequence.
+    """Tabulate the best solver to each tolerance and within each time [s], for each structure and sequence.
 
-    `links` are the parts of the page that a name leads to.
+    `links` maps the name of a structure or sequence to the id of the part of the page to which its cell links.
     """
     heads = [
         *(f"to {format_tolerance(x)}" for x in report.tolerances),
@@ -253,7 +253,7 @@ def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None
 
 
 def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
-    """Return the engine's own solver to the tolerance of the first sentence."""
+    """Return the cell of the engine's own solver, with its time to the tolerance of the recommendation."""
     if engine is None or not engine.solved:
         return Cell(NONE if engine is None else f"nothing to {format_tolerance(tolerance)}")
     text = format_seconds(engine.score) + format_solved_share(engine.solved, engine.cases)
@@ -261,7 +261,7 @@ def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
 
 
 def tabulate_best_solver_by_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
-    """Tabulate the first solver with each budget of sweeps; no rows if no budget was run."""
+    """Tabulate the best solver with each budget of sweeps; the table is empty if no budget was run."""
     budgets = sorted({n for line in lines for n in line.by_sweeps})
     heads = [format_count(int(n), "sweep") for n in budgets]
     rows: Rows = [
@@ -276,7 +276,7 @@ def tabulate_best_solver_by_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
 
 
 def tabulate_best_solver_by_motion_error(report: Report) -> Table:
-    """Tabulate the first solver to each motion error [m/s], for each structure."""
+    """Tabulate the best solver to each motion error [m/s], for each structure."""
     heads = [f"to {format_speed(x)}" for x in report.velocity_tolerances]
     rows: Rows = [
         [line.name, *(format_advice(a, False) for a in line.by_tolerance.values())]
@@ -292,7 +292,7 @@ def tabulate_best_solver_by_motion_error(report: Report) -> Table:
 def tabulate_cases(
     records: Records, fastest: Mapping[str, statistics.Reach | None], tolerance: float, stored: bool
 ) -> Table:
-    """Tabulate each case with its size, the first solver to the tolerance, and the residual of its stored answer."""
+    """Tabulate each case with its size, the fastest solver to the tolerance, and the residual of its stored answer."""
     rows: Rows = []
     for name, best in fastest.items():
         info = records.cases[name]
@@ -357,7 +357,7 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
 
 
 def tabulate_motion_errors(report: Report) -> Table:
-    """Tabulate time to each motion error, the smallest, relative, and its bound, of each case and solver."""
+    """Tabulate the time to each motion error, and the smallest motion error with its bound, by case and solver."""
     tolerances = report.velocity_tolerances
     rows: Rows = []
     for m in statistics.summarize_runs_by_case(report.records_by_motion_error, tolerances):
@@ -407,7 +407,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
 
 
 def tabulate_skipped_runs(skips: Sequence[Skip]) -> Table:
-    """Tabulate pairs of case and solver that were not run, or not to the end."""
+    """Tabulate pairs of case and solver that were not run, or whose runs were stopped."""
     return Table(["case", "solver", "reason"], [[s.case, s.solver, s.reason] for s in skips])
 
 
@@ -429,7 +429,7 @@ def tabulate_changed_times(old: Records, new: Records) -> Table:
 def tabulate_solved_shares(
     rows: Sequence[statistics.Robustness], tolerances: Sequence[float], unit: str = ""
 ) -> Table:
-    """Tabulate shares of cases brought to each tolerance, false claims, and residual (or motion error) by budget."""
+    """Tabulate the share of cases solved to each tolerance, false claims, and residual (or motion error) by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
     cells = [
         {
@@ -516,7 +516,7 @@ def tabulate_mean_times(by_tolerance: Mapping[float, Mapping[str, tuple[float, i
 
 
 def tabulate_backends(records: Records) -> Table:
-    """Tabulate the time of a call, its part in the own interface, the rest, and wins, of solvers of other packages."""
+    """Tabulate the times of third-party solvers: whole call, part in their own interface, remaining part, and wins."""
     rows: Rows = [
         [
             b.solver,
@@ -573,10 +573,10 @@ def tabulate_sequence_passes(passes: Sequence[statistics.Pass]) -> Table:
 
 
 def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
-    """Tabulate one row for each solver on a sequence: time of all steps to each tolerance, median residual by budget.
+    """Tabulate the solvers on a sequence: time of all steps to each tolerance, median residual by budget.
 
-    The steps have carried impulses, or start cold if the solver takes no start. Solvers are ordered by the number of
-    steps to the middle tolerance, then by time.
+    The steps start from carried impulses, or cold if the solver takes no start. Solvers are ordered by the number of
+    steps solved to the middle tolerance, then by time.
     """
     tolerances = sorted({w.tol for w in passes if w.mode == "tol"}, reverse=True)
     budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
@@ -612,7 +612,7 @@ def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
 
 
 def tabulate_engines(report: Report) -> Table:
-    """Tabulate engines' own answers, and the first solver here on the same cases, to the middle tolerance."""
+    """Tabulate engines' own answers, and lavender's recommended solver on the same cases, at the middle tolerance."""
     records, tolerance = report.ranked_records, report.tolerances[len(report.tolerances) // 2]
     rows = []
     for c in report.engines:
@@ -640,7 +640,7 @@ def tabulate_engines(report: Report) -> Table:
 
 
 def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) -> Choice | None:
-    """Return the solver that is recommended for the cases of a folder, by the rule of the first sentence."""
+    """Return the recommended solver for the cases of a folder, ranked as in the report's first sentence."""
     if not cases:
         return None
     timing_mode = "steps" if records.cases[cases[0]].sequence else "call"

@@ -20,13 +20,12 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table as RichTable
 
-MAX_LINES = 25  # Lines of a short report, with those that the command adds.
-COMMAND_LINES = (
-    5  # Lines that the command adds: a blank line, page, reused runs, paper, cases that did not load.
-)
+MAX_LINES = 25  # Largest number of lines of a short report, including the lines that the command adds.
+# Number of lines that the command adds: a blank line, page, reused runs, paper, cases that did not load.
+COMMAND_LINES = 5
 MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
 MIN_WORD_WIDTH = 9  # [columns] A column of words does not become narrower: "CONVERGED".
-MAX_NOTES = 20  # Notes of a kind in a complete report.
+MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
 
 
 def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
@@ -149,7 +148,7 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 
 
 def print_first_rows(console: Console, table: Table, height: int) -> None:
-    """Print a blank line and as many rows as `height` lines hold, then the number of the others."""
+    """Print a blank line, as many rows as fit into `height` lines, and the number of rows left out."""
     if not table.rows:
         return
     rows = table.rows if len(table.rows) <= height - 2 else table.rows[: max(1, height - 3)]
@@ -160,7 +159,7 @@ def print_first_rows(console: Console, table: Table, height: int) -> None:
 
 
 def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
-    """Yield notes, each with a style: at most `most` of each kind, with the number of all of them."""
+    """Yield (note, style): at most `most` notes of each kind; if there are more, a line has their number."""
     records = report.ranked_records
     false_claims = [
         f"{r.case}, {r.solver}: {r.status_conflict}"

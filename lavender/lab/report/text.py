@@ -13,7 +13,7 @@ TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
 
 
-#: Code that a time includes, by `Record.timing_mode`: as the title of an axis, and in a sentence.
+#: By `Record.timing_mode`: title of an axis for these times, and description of the code that they include.
 TIMED_CODE = {
     "call": ("time of a call [s]", "one call of lv.solve, with set-up, solve, judge and Python"),
     "steps": (
@@ -84,7 +84,7 @@ def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
 
 
 def format_significant_digits(x: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits and without an exponent: 0.0652, 16.0, 1020."""
+    """Return a number with `digits` significant digits and without an exponent: 0.0652, 16.0, 1020."""
     if x == 0.0:
         return "0"
     rounded = float(f"{x:.{digits - 1}e}")
@@ -92,7 +92,7 @@ def format_significant_digits(x: float, digits: int = 3) -> str:
 
 
 def format_ratio(x: float) -> str:
-    """Return a ratio in words: 1.3 times, 850 times; its power of ten from a million."""
+    """Return a ratio in words: "1.3 times", "850 times"; from a million on, as a power of ten."""
     if not math.isfinite(x):
         return NONE
     return f"{x:.2g} times" if x < 99.5 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
@@ -104,7 +104,10 @@ def format_count(n: int, noun: str, plural: str = "") -> str:
 
 
 def list_diagnostics(records: Records) -> list[tuple[str, str]]:
-    """Return (case, possible mistake in its data); a sequence has its first step and the number of further steps."""
+    """Return (case, possible mistake in its data) for all cases.
+
+    Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
+    """
     seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for name, info in records.cases.items():
         for diagnostic in info.diagnostics:
@@ -125,7 +128,7 @@ def _get_skip_reason(skip: Skip) -> str:
 
 
 def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
-    """Return each reason of some skips once, with the number of cases that it holds for if these are several."""
+    """Return each different reason of some skips; if it holds for several cases, with their number."""
     same: dict[str, list[Skip]] = {}
     for skip in skips:
         same.setdefault(_get_skip_reason(skip), []).append(skip)
@@ -156,12 +159,15 @@ def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
 
 
 def format_left_out_count(lost: int) -> str:
-    """Return the number of cases that a number leaves out, in parentheses; empty for none."""
+    """Return a remark in parentheses that `lost` cases are left out of a number; empty if none is left out."""
     return f" ({lost} left out)" if lost else ""
 
 
 def format_percent(part: int, whole: int, digits: int = 0) -> str:
-    """Return part of a whole, rounded down, with `digits` or more digits: only all is 100 %, only nothing is 0 %."""
+    """Return a percentage with at least `digits` decimals, rounded down.
+
+    More decimals are used if necessary, so that only part = whole gives 100 % and only part = 0 gives 0 %.
+    """
     while 0 < 100 * 10**digits * part < whole:
         digits += 1
     tenths = 100 * 10**digits * part // whole
@@ -169,10 +175,10 @@ def format_percent(part: int, whole: int, digits: int = 0) -> str:
 
 
 def format_solved_share(solved: int, cases: int) -> str:
-    """Return (7/8); empty if all are solved."""
+    """Return the number of solved cases of all cases as "(7/8)"; empty if all are solved."""
     return "" if solved == cases else f" ({solved}/{cases})"
 
 
 def format_run_name(solver: str, start: str) -> str:
-    """Return a solver with its start unless it is cold: newton (warm)."""
+    """Return a solver's name with its start in parentheses, as in "newton (warm)"; a cold start is not named."""
     return solver if start == "cold" else f"{solver} ({start})"

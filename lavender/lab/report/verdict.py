@@ -1,4 +1,4 @@
-"""Build the sentences of a report: a recommendation with a line of Python, then certainty, batches and budgets."""
+"""Build the sentences of a report: the recommended solver with its call, its certainty, batches, and budgets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from lavender.lab.report.text import format_count, format_left_out_count, format
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
 
-MAX_PLUG_INS = 2  # The sentence on plug-ins names so many; if there are more, only the best.
+MAX_PLUG_INS = 2  # The sentence on plug-ins names up to this many; if there are more, it names only the best.
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Statement:
     code : lines of Python, as they were timed
     in_c : command that exports the call to C, or the reason why it cannot be exported
     requested : whether the sentence is about a time or a number of sweeps that the user requested
-    one_line : whether a short report on a terminal has the sentence, too, cut to one line
+    one_line : whether a short report on a terminal also shows the sentence, cut to one line
     """
 
     text: str
@@ -62,7 +62,7 @@ class Statement:
 
     @property
     def call_line(self) -> str:
-        """The call without the loop around it; empty without code."""
+        """The line of `code` with the call, without the lines of a loop around it; empty if there is no code."""
         return next((line.strip() for line in self.code if "lv.solve" in line), "")
 
 
@@ -129,7 +129,7 @@ def _recommend_solver(
     sweeps: Sequence[int],
     engines: Sequence[EngineAnswers],
 ) -> Verdict:
-    """Recommend a solver for one subject by the interleaved calls, or by single runs without them."""
+    """Recommend a solver for one subject, by interleaved calls, or by single runs if no calls were interleaved."""
     tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     interleaved, single = (
         select_calls_with_most_cases(records, subject.timing_mode),
@@ -169,7 +169,7 @@ def _recommend_solver(
         )
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
-            continue  # The recommended call ends within this time.
+            continue  # The recommended call takes less than this time budget: a sentence on it adds nothing.
         rankings = (rank_calls_in_time(records, calls, t, n) for calls in (interleaved, single))
         quick = next(
             (r for r in rankings if r is not None and r.ranking[0][1].solves_share(SERVED_QUANTILE)), None
@@ -220,7 +220,10 @@ def _recommend_by_motion_error(records: Records) -> Verdict:
 
 
 def _find_tolerance_of_fastest_runs(records: Records, solver: str, tolerance: float) -> float:
-    """Return the smallest tolerance of the fastest runs to this speed, over the cases; nan if they had none."""
+    """Return the smallest `tol` of the runs that reach the motion error `tolerance` [m/s] fastest, over the cases.
+
+    The result is rounded down to one digit; it is nan if the solver has no such run.
+    """
     fastest: dict[str, Record] = {}
     for r in records:
         if r.solver != solver or r.mode != "tol" or r.relative > tolerance:
@@ -231,7 +234,8 @@ def _find_tolerance_of_fastest_runs(records: Records, solver: str, tolerance: fl
     if not tightest > 0.0:
         return math.nan
     power = math.floor(math.log10(tightest))
-    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # Rounded down, so that it suffices.
+    # Rounded down, so that it suffices for all.
+    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")
 
 
 # -- sentences -----------------------------------------------------------------------------------------------
@@ -265,11 +269,11 @@ def _describe_cases(records: Records, cases: Sequence[str]) -> str:
 
 
 def _describe_recommended_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
-    """Return the first sentence: the solver, its mean time, the time of a miss, and the slowest case."""
+    """Return the first sentence: the solver, its mean time, the time counted for a missed case, the slowest case."""
     has_misses = first.solved < first.cases
     idle = first.cases - len(
         {r.case for r in records if r.solver == first.solver}
-    )  # Records of several runs may lack some.
+    )  # Records that were merged from several runs may lack the recommended solver on some cases.
     solved = f"{first.solved} of " if has_misses else ""
     text = f"Use {first.solver}: it solves {solved}{cases} in {format_seconds(first.score)}"
     if first.cases > 1:
@@ -285,7 +289,7 @@ def _describe_recommended_choice(records: Records, first: Choice, reached: str, 
 def _add_engine_to_sentence(
     records: Records, head: str, first: Choice | None, engine: Choice | None, cases: str
 ) -> str:
-    """Add the engine's own solver to the first sentence: before it if it ranks first, else after it."""
+    """Add the engine's own solver to the sentence `head`: at its beginning if it ranks first, else at its end."""
     if engine is None:
         return head
     has_misses = engine.solved < engine.cases
@@ -367,7 +371,8 @@ def _describe_resampled_ranking(resampled: ResampledRanking) -> list[Statement]:
     if len(resampled.ranking) < 2:
         return []
     shares = [
-        f"{c.solver} ({format_seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # Rounded down: 100 % means all.
+        # Rounded down: 100 % means all.
+        f"{c.solver} ({format_seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"
         for (_, c), share in zip(resampled.ranking, resampled.shares, strict=True)
         if c.solver in resampled.named_calls
     ]
@@ -379,7 +384,7 @@ def _describe_resampled_ranking(resampled: ResampledRanking) -> list[Statement]:
 
 
 def _describe_shortest_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
-    """State that no call serves enough cases in a time, and the shortest time in which one does."""
+    """State that no call serves enough cases within `limit` [s], and the shortest time within which some call does."""
     shortest = min(map(compute_serving_time, calls), default=math.inf)
     text = f"No solver leaves at most half of the start's residual on nine cases of ten in {format_seconds(limit)}"
     if math.isfinite(shortest):

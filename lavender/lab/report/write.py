@@ -34,7 +34,7 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     Raises
     ------
     InputError
-        Neither records nor a report; the folder cannot be written.
+        `source` is neither records nor a report, or the folder cannot be written.
     """
     report = Report(source) if isinstance(source, Records) else source
     if not isinstance(report, Report):
@@ -46,7 +46,7 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     write_csv(report.all_records, folder / "records.csv")
     write_json(report.all_records, folder / "records.json")
     index = folder / "index.html"
-    # The file is replaced only when it is complete: on a full disk the earlier page stays.
+    # `write_text` replaces a file only when the new one is complete: on a full disk, the earlier page stays.
     write_text(index, render_page(report, drawn, saved=figures))
     write_text(folder / "summary.md", summarise_report(report))
     if figures:

@@ -13,15 +13,15 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-GRAVITY = 9.81  # [m/s^2] Along -z.
-STEP_SIZE = 0.01  # [s]
+GRAVITY = 9.81  # [m/s^2] Acceleration along -z.
+STEP_SIZE = 0.01  # [s] Time step of all problems of the suite.
 FALL_SPEED = GRAVITY * STEP_SIZE  # [m/s] Speed that gravity adds in one step.
 
 CONTACT_FRICTION_LAWS = ("none", "coulomb", "cone")
 
 
 def map_scalar(function: Callable[[float], float], x: Any) -> FloatArray:
-    """Apply a function of `math` to every number: the last bits of NumPy's functions depend on the processor."""
+    """Apply a function of `math` to every number; unlike NumPy's functions, it has equal bits on all processors."""
     return np.array([function(value) for value in x.ravel().tolist()]).reshape(x.shape)
 
 
@@ -52,7 +52,7 @@ class Bodies:
 
 
 class Contacts:
-    """Contact points: normal (c, 3) from body a to body b, `body` (c, 2), -1 for the ground."""
+    """Contact points: `body` (c, 2) holds bodies a and b, -1 for the ground; normals (c, 3) point from a to b."""
 
     def __init__(self, body: Any, point: Any, normal: Any) -> None:
         self.body: IntArray = np.asarray(body, np.int32).reshape(-1, 2)
@@ -102,7 +102,11 @@ def build_joint_problem(
 
 
 def place_corner_contacts(body: Any, centre: Any, half_x: Any) -> Contacts:
-    """Place four corner points on horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3) [m]; normals up."""
+    """Place contacts at the four corners of k horizontal rectangles, with normals up.
+
+    `body` (k, 2) holds the pair of bodies of each rectangle, `centre` (k, 3) [m] its centre, and `half_x` [m] half its
+    length along x; its length along y is 1 m.
+    """
     sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
     half = np.broadcast_to(np.asarray(half_x, float), (len(body),))
     point = np.repeat(np.asarray(centre, float), 4, axis=0)
@@ -112,7 +116,10 @@ def place_corner_contacts(body: Any, centre: Any, half_x: Any) -> Contacts:
 
 
 def place_tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Place unit bodies on each other: positions (n, 3), body pairs (n, 2) from the ground up, contacts (n, 3) [m]."""
+    """Place n bodies of height 1 m on each other.
+
+    Return positions (n, 3) [m], body pairs (n, 2) from the ground up, and contact points (n, 3) [m].
+    """
     k = np.arange(n)
     contact_point = np.stack([0.0 * k, 0.0 * k, k], 1)
     return contact_point + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), contact_point

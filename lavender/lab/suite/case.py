@@ -16,7 +16,7 @@ from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
 P = ParamSpec("P")
-MAX_SIZE = 10**7  # Largest integer parameter: larger ones are typing errors that would fill the memory.
+MAX_SIZE = 10**7  # Larger integer parameters are rejected: they are typing errors and would fill the memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,10 @@ class Reference:
     impulse : (m,) N s, or None
         The solution, rounded to float64; None if the problem has no solution.
     source : str
-        How it is known, e.g. "closed form".
+        Method by which the solution was obtained, e.g. "closed form".
     compare : {"impulse", "slack", "error", "nothing"}
-        Unique quantities, which tests compare: "impulse" (and slack), "slack" (A is singular), "error" (neither is
-        unique: only the judge's error), "nothing" (no solution).
+        Quantity that tests compare because it is unique: "impulse" (and the slack), "slack" (if A is singular),
+        "error" (if neither is unique, only the judge's residual), "nothing" (if there is no solution).
     certificate : (m,) or None
         Proof that there is no solution.
     """
@@ -52,13 +52,13 @@ class Case:
         A name such as "pyramid(k=10, mass_ratio=1e6)"; `case(name)` builds the case again.
     problem : Problem
     reason : str
-        The property that it tests, in one line.
+        The property that the case tests, in one line.
     family : str
-        Name of the function that builds it.
+        Name of the function that builds the case.
     parameters : mapping
-        Its parameters.
+        Parameters of that function.
     expect : str
-        Result that solvers are expected to have.
+        Description of the result that solvers should have.
     solve_reference : callable, optional
         Computes the reference.
     """
@@ -120,7 +120,7 @@ class Family:
     summary: str
 
     def build_case(self, **parameters: Any) -> Case:
-        """Build the case of these parameters; the others have their defaults."""
+        """Build the case of these parameters; parameters that are not given have their defaults."""
         known = [name for name in self.signature.parameters if name not in self.preset]
         for name in parameters:
             if name not in known:
@@ -189,7 +189,7 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
 
 
 def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
-    """Spell the canonical name of these parameters; it shows explicit values and values that are not the default."""
+    """Return the canonical name of a case; it has the parameters that are `explicit` or differ from their defaults."""
     best = name
     preset: Mapping[str, Any] = {}
     for alias in FAMILIES.values():
@@ -206,7 +206,7 @@ def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[
 
 
 def format_parameter_value(value: Any) -> str:
-    """Return the shortest text of a value in a case name that gives the same number."""
+    """Return the shortest text of a value that is read back as the same number, for a case name."""
     if not isinstance(value, float):
         return str(value)
     mantissa, _, exponent = f"{value:.16e}".partition("e")

@@ -1,11 +1,11 @@
-"""Solutions in more than float64 precision, for references: about 100 bits, on every machine.
+"""Compute reference solutions in about 100 bits of precision, with the same result on every machine.
 
 Numbers are unevaluated sums of two float64, hi + lo. Products are split exactly (Dekker 1971) and rows are summed
-without rounding (`math.fsum`), so a residual is correct to about 2^-100 of its terms, and a few refinement steps with a
-float64 factorisation give impulses that are correct to the last bit of float64 up to condition numbers near 1e15.
+without rounding (`math.fsum`), so a residual is correct to about 2^-100 of its terms, and a few refinement steps with
+a float64 factorisation give impulses that are correct to the last bit of float64 up to condition numbers near 1e15.
 
-A candidate from any source determines which rows are free; those rows are solved, and every condition is then checked.
-An impulse that passes is a solution, independent of its source.
+A candidate from any source determines which rows are free. w = 0 is solved on these rows, and every condition of a
+solution is then checked. An impulse that passes is a solution, whatever the source of the candidate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lavender.problem import Problem
 from lavender_ext.core.checks import MIN_MAGNITUDE
 
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Multiplier that splits the 53 bits of a float64 into two halves.
-MAX_SVD_ROWS = 2000  # Up to this many rows, singular rows are found by a singular value decomposition.
+MAX_SVD_ROWS = 2000  # Up to this many rows, dependent rows are solved by a singular value decomposition.
 MAX_REFINEMENT_STEPS = 40
 # A row is free if its impulse is farther from its bounds than this fraction of the largest impulse.
 FREE_ROW_MARGIN = 1e-6
@@ -61,7 +61,10 @@ def _multiply_in_extended_precision(a: sp.csr_array, x: Pair, *added: FloatArray
 
 
 class ExtendedOperator:
-    """w = A lambda - b of a problem in about 100 bits: A as given, or J M^-1 J^T + compliance without rounding."""
+    """Operator that computes w = A lambda - b in about 100 bits.
+
+    A is the matrix as given, or J M^-1 J^T + diag(compliance), which is never rounded to float64.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self.b = problem.b
@@ -86,7 +89,7 @@ class ExtendedOperator:
         )[0]
 
     def sum_term_magnitudes(self, impulse: FloatArray) -> FloatArray:
-        """Sum the absolute values of the terms of each row of w (m,) [m/s]: rounding is relative to this."""
+        """Sum the absolute values of the terms of each row of w (m,) [m/s], to which rounding errors are relative."""
         y = x = np.abs(impulse)
         for factor in self.factors:
             y = abs(factor) @ y
@@ -94,7 +97,7 @@ class ExtendedOperator:
 
 
 def solve_linear(problem: Problem) -> FloatArray:
-    """Solve A lambda = b (m,) [N s] to the last bit if A is regular; otherwise return a solution if there is one.
+    """Solve A lambda = b for the impulses (m,) [N s]: to the last bit if A is regular, else one of the solutions.
 
     Raises
     ------
@@ -130,7 +133,7 @@ def solve_boxed(problem: Problem, candidate: FloatArray) -> FloatArray:
         hi <= c.lower, np.maximum(-w, 0.0), np.where(hi >= c.upper, np.maximum(w, 0.0), np.abs(w))
     )
     excess = np.maximum(np.maximum(c.lower - hi, hi - c.upper), 0.0).max(initial=0.0)
-    # Rows that are zero in exact arithmetic are accurate to some units of 2^-53 of the rounded data.
+    # Violations up to some units of 2^-53 of the terms are allowed: the data of an exactly tight row are rounded, too.
     rounding_scale = operator.sum_term_magnitudes(hi)
     if (
         np.any(violation > 2.0**-49 * rounding_scale + 2.0**-90 * rounding_scale.max(initial=0.0))
@@ -142,10 +145,10 @@ def solve_boxed(problem: Problem, candidate: FloatArray) -> FloatArray:
 
 
 def solve_rest_impulse(problem: Problem) -> FloatArray:
-    """Compute impulses (m,) [N s] within the cones that keep every body at rest and prove them; w = 0 is the solution.
+    """Compute and prove impulses (m,) [N s] within the friction cones that keep every body at rest, with w = 0.
 
-    A linear program proposes them (J^T lambda = -M v*, as far inside |t1| + |t2| <= mu n as possible); they are refined
-    and checked like any candidate. Under every friction law, w = 0 with lambda in its cone is a solution.
+    A linear program proposes impulses with J^T lambda = -M v* as far inside |t1| + |t2| <= mu n as possible. They are
+    refined and checked like any candidate. Under every friction law, lambda in its cone with w = 0 is a solution.
 
     Raises
     ------
@@ -160,7 +163,8 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
     momentum = -weight * rows.v_free
     largest = np.abs(momentum).max(axis=1, initial=MIN_MAGNITUDE)
     operator = ExtendedOperator(problem)
-    # Try two scales of the balance: the largest weight of all (heavy on light), and each body's own (light on heavy).
+    # Try two scales of the momentum balance: the largest weight of all bodies, which suits heavy on light bodies, and
+    # each body's own weight, which suits light on heavy bodies.
     for scale in (np.full_like(largest, largest.max()), largest):
         candidate = _propose_rest_impulse(problem, momentum.ravel(), np.repeat(scale, 6))
         if candidate is None:
@@ -175,7 +179,10 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
 
 
 def _propose_rest_impulse(problem: Problem, momentum: FloatArray, scale: FloatArray) -> FloatArray | None:
-    """Solve J^T lambda = momentum (6 n,) [N s], rows divided by `scale`, as far inside the cones as possible."""
+    """Solve J^T lambda = momentum (6 n,) [N s] by a linear program, with lambda as far inside the cones as possible.
+
+    Each of the 6 n equations is divided by its entry of `scale`. Return None if the program has no solution.
+    """
     from scipy.optimize import linprog
 
     c = problem.cones
@@ -219,7 +226,10 @@ def _is_in_cones(problem: Problem, impulse: FloatArray) -> bool:
 
 
 def _solve_rows(problem: Problem, operator: ExtendedOperator, rows: np.ndarray, start: FloatArray) -> Pair:
-    """Solve w = 0 on `rows`, the other entries as in `start`; the smallest change if these rows are dependent."""
+    """Solve w = 0 on `rows` with the other impulses fixed at `start`.
+
+    If the rows are dependent, the solution nearest to `start` is computed.
+    """
     index = np.flatnonzero(rows)
     if len(index) == 0:
         return start.copy(), np.zeros_like(start)
@@ -247,7 +257,7 @@ def _refine_to_last_bit(
         change = float(np.abs(step).max())
         if not np.isfinite(change):
             return None
-        # Compute hi + lo + step and renormalise it.
+        # Add `step` to hi + lo, and renormalise so that hi is the rounded sum.
         x, y = hi[index], lo[index] + step
         hi[index] = total = x + y
         restored = total - x
@@ -262,7 +272,11 @@ def _refine_to_last_bit(
 
 
 def _iterate_solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
-    """Yield solvers: a factorisation, or inverses on ever smaller ranges of A, for dependent rows."""
+    """Yield functions that solve linear systems with `a`.
+
+    The first uses a factorisation. For dependent rows they use pseudo-inverses, each of which omits more of the small
+    singular values.
+    """
     if a.shape[0] <= MAX_SVD_ROWS:
         dense = a.toarray()
         d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), MIN_MAGNITUDE))

@@ -1,8 +1,9 @@
 """Families of problems with parameters: stacks, pyramids, piles, chains, and small problems to examine by hand.
 
 Each function builds a `Case`; equal parameters give equal bits. Names that end in F have friction: `stackF(n=64)` is
-`stack(n=64, friction="coulomb")`. `sliding` [m/s] adds a horizontal velocity to every body, each in its own direction;
-without it most frictional contacts stick, and Coulomb's law and its convex relaxation have the same solution.
+`stack(n=64, friction="coulomb")`. `sliding` [m/s] is a horizontal speed that is added to every body in a random
+direction. If it is 0, most frictional contacts stick, and Coulomb's law and its convex relaxation have the same
+solution.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def make_rest_reference(problem: Problem) -> Callable[[], Reference]:
 
 
 def make_boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Reference]:
-    """Return the function that computes a boxed LCP's reference: sweeps propose the active set, which is proved."""
+    """Return the function that computes a boxed LCP's reference: sweeps propose an active set, which is proved."""
 
     def solve_reference() -> Reference:
         candidate = solve(problem, "pgs", tol=1e-10, max_iter=50_000).impulse
@@ -211,7 +212,11 @@ def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int
 
 
 def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
-    """Build a pile site by site (x slowest): face neighbours, 30 % of the edge neighbours, walls; compute last."""
+    """Build a pile of pebbles on a lattice of n^3 sites.
+
+    Each pebble has contacts with its neighbours across faces, with 30 % of its neighbours across edges, and with
+    walls. Sites are visited with x slowest, which fixes the order of the random numbers.
+    """
     rng = np.random.default_rng(seed)
     count = n**3
     grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -222,7 +227,7 @@ def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     step = np.array([n * n, n, 1])
 
     def neighbours(offsets: tuple[tuple[int, int, int], ...]) -> list[list[int]]:
-        """Return the bodies at each site's offsets, -1 outside the box; (count, len(offsets))."""
+        """Return the bodies at the given offsets from each site (count, len(offsets)); -1 outside the lattice."""
         to = grid[:, None, :] + np.array(offsets)
         ok = np.all((to >= 0) & (to < n), axis=2)
         return np.where(ok, to @ step, -1).tolist()
@@ -426,7 +431,7 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
     if not condition >= 1.0:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
-    # Each eigenvalue has twelve digits, so that the last bits of a library's power function do not matter.
+    # Round each eigenvalue to twelve digits, so that the last bits of the C library's pow do not matter.
     a = np.zeros((n, n))  # Allocated before the eigenvalues are computed, because it may not fit into memory.
     np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
     # Rotate in random planes until every vector has a component along every other.
@@ -475,7 +480,7 @@ def boxed_friction(
 
 
 def _build_boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:
-    """Build rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
+    """Build a block of bounded rows n, t1, t2 for each contact; the tangents' bounds are mu times the static load."""
     arm_a, arm_b = contacts.compute_arms(bodies.position)
     n, t = contacts.normal, contacts.compute_tangents()
     axes = np.stack([n, t, np.cross(n, t)], 1)  # Shape (c, 3, 3).

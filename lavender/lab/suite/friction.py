@@ -26,8 +26,8 @@ from lavender.problem import Problem
 def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb") -> Draft:
     """A point mass sliding across the slope of a ramp of `angle` [degrees]: one contact, solved by hand.
 
-    Coulomb: lambda_n = m g h cos angle; it sticks if mu lambda_n >= m |v_t|, otherwise friction opposes v_t. The convex
-    relaxation lifts off: with v_t along t, w_n = mu w_t.
+    Coulomb: lambda_n = m g h cos angle; it sticks if mu lambda_n >= m |v_t|, otherwise friction opposes v_t. The
+    convex relaxation lifts off: with v_t along t, w_n = mu w_t.
     """
     if mu < 0.0:
         raise InputError(f"mu is {mu}; 0 or more is needed")
@@ -64,7 +64,7 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
 
     def closed_form() -> Reference:
         n, t = FALL_SPEED * math.cos(a), min(FALL_SPEED * math.sin(a), mu * FALL_SPEED * math.cos(a))
-        # Friction at the bottom face tips the cube forwards: the front pair carries t/2 more than half, of lever 1/2.
+        # Friction t at the bottom face tips the cube forwards with the lever 1/2: each front point carries n/4 + t/4.
         rear, front = 0.25 * n - 0.25 * t, 0.25 * n + 0.25 * t
         normal = np.array([rear, rear, front, front])
         along = problem.rows.tangent @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
@@ -208,7 +208,7 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
         contacts.extend((a, b, [x, y, z], normal) for y in (-0.4, 0.4))
 
     up, right = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
-    cards_below: dict[int, int] = {}  # card below each pair
+    cards_below: dict[int, int] = {}  # Pair of cards -> card on which it stands.
     spacing = 2.0 * (d + half)
     for level in range(levels):
         z = level * h

@@ -54,7 +54,7 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
     jerk_effect, pressure = np.array([dt**3 / 6, dt * dt / 2, dt]), np.array([1.0, 0.0, -height / GRAVITY])
     state = np.array([0.0, rng.normal(scale=0.2), 0.0])
     free, by_jerk = np.empty(n), np.zeros((n, n))
-    by_each_jerk = np.zeros((3, n))  # Effect of each jerk on the state.
+    by_each_jerk = np.zeros((3, n))  # Derivative of the state (c, c', c'') by each jerk.
     for k in range(n):
         state, by_each_jerk = (
             multiply_in_index_order(transition, state),

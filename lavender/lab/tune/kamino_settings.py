@@ -1,7 +1,8 @@
 """Settings of newton's SolverKamino (PADMM), which steps all stretches as worlds of one model, in float32.
 
-From the start of each stretch, a setting makes its own steps. The first of them starts without the impulses of the step
-before, because a state of newton does not contain them. No setting that is tried changes the problem.
+A stretch is a part of `horizon` steps of a simulated world (`lavender.lab.tune.measured`). Each setting steps from the
+start of each stretch by itself. Its first step has no warm start, because a state of newton does not contain impulses.
+No setting that is tried changes the constraint problem.
 """
 
 from __future__ import annotations
@@ -76,7 +77,10 @@ class KaminoStage(Stage):
     def split_worlds(
         cls, scene: str, worlds: int, steps: int, horizon: int, **start: Any
     ) -> tuple[KaminoStage, KaminoStage]:
-        """Run worlds with the present setting, and cut those with even and those with odd numbers into stretches."""
+        """Run worlds with the present setting and cut them into stretches.
+
+        Return the stage of the worlds with even numbers, and the stage of the worlds with odd numbers.
+        """
         build = load_build_function(scene, "kamino")
         running = start_scene(build, "kamino", worlds=worlds, **start)
         assert isinstance(running, NewtonScene)
@@ -188,5 +192,5 @@ class KaminoStage(Stage):
         return result
 
     def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
-        """Return a function that runs all stretches and returns the time of each step of one world."""
+        """Return a function that runs all stretches and returns the time of each step, per world [s]."""
         return lambda: self._run(setting)

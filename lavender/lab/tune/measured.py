@@ -1,11 +1,11 @@
 """Settings of an engine, their results, and the timing in which settings alternate.
 
-A `Stage` holds worlds of one engine and measures settings on them. Each world is cut into stretches of `horizon` steps
-of a run with the present setting. From the start of each stretch, a setting makes its own steps:
+A `Stage` holds worlds of one engine and measures settings on them. Each world is run with the present setting and cut
+into stretches of `horizon` steps. Each setting steps from the start of every stretch by itself. Measured are
 
-    time    of a step of one world [s]; of each step the minimum of several repeats, in which settings alternate
-    error   of the engine's answer to the problem of each step, by the judge [m/s]
-    motion  largest distance of a body, after `horizon` steps, from its position in the converged run [m]
+    time    [s] of each step, per world: the minimum of several repeats, in which settings alternate
+    error   [m/s] of the engine's answer to the problem of each step, computed by the judge
+    motion  [m] largest distance of a body, at the end of a stretch, from its position in a run with converged solves
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from lavender.base.arrays import FloatArray
 from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
 
-ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error.
-# A setting is timed no further if it takes longer than this multiple of the present setting.
+ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
+# After the first round, a setting is no longer timed if it takes more than this multiple of the present setting's
+# time.
 MAX_TIME_RATIO = 2.0
 #: Kinds of measurements: the error of a setting, and the times of its steps.
 MEASUREMENTS = ("judging", "timing")
@@ -35,9 +36,9 @@ MEASUREMENTS = ("judging", "timing")
 class Setting:
     """Options of an engine that differ from the present ones; a derived class writes them in the engine's syntax."""
 
-    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the problem.
-    comment: ClassVar[str] = "# {}"  # Comment behind the line.
-    merge_note: ClassVar[str] = ""  # Note on where to put the line.
+    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the constraint problem itself.
+    comment: ClassVar[str] = "# {}"  # Format of a comment in the syntax of `option_line`.
+    merge_note: ClassVar[str] = ""  # Note for the user on where to insert `option_line`.
 
     options: tuple[tuple[str, Any], ...] = ()
 
@@ -48,12 +49,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """The line, or "the model's own setting"."""
+        """`option_line`, or "the model's own setting" if it is empty."""
         return self.option_line or "the model's own setting"
 
     @property
     def changes_problem(self) -> bool:
-        """Whether the setting defines another problem than the present one."""
+        """Whether the setting changes the constraint problem, and not only how it is solved."""
         return any(name in self.problem_options for name, _ in self.options)
 
 
@@ -87,12 +88,12 @@ class Measured:
 
     @property
     def worst_error(self) -> float:
-        """Error that one step in a hundred exceeds [m/s]."""
+        """Error [m/s] that 1 % of the steps exceed."""
         return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
 
     @property
     def worst_motion(self) -> float:
-        """Distance that one stretch in a hundred exceeds [m]."""
+        """Distance [m] that 1 % of the stretches exceed."""
         return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
 
 
@@ -102,7 +103,7 @@ class Schedule:
     Parameters
     ----------
     watch : callable, optional
-        Called with an `Event` at the begin of each measurement.
+        Called with an `Event` at the beginning of each measurement.
     """
 
     def __init__(self, watch: Callable[[Event], None] | None) -> None:
@@ -114,11 +115,11 @@ class Schedule:
         self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
 
     def reserve_measurements(self, kind: str, count: int) -> None:
-        """Set the estimate of later measurements that are not announced yet."""
+        """Set the estimated number of measurements of `kind` that will be announced later."""
         self._reserved[kind] = count
 
     def announce_measurements(self, kind: str, count: int) -> None:
-        """Announce measurements; they replace reserved ones."""
+        """Announce `count` measurements of `kind`; they are subtracted from the reserved number."""
         self._expected[kind] += count
         self._reserved[kind] = max(0, self._reserved[kind] - count)
 
@@ -128,7 +129,7 @@ class Schedule:
 
     @property
     def remaining(self) -> float | None:
-        """Estimate of the remaining time [s]: the mean durations so far; None at the beginning."""
+        """Estimate of the remaining time [s], from the mean duration of each kind so far; None before the first."""
         total = 0.0
         every = [t for durations in self._durations.values() for t in durations]
         for kind in MEASUREMENTS:
@@ -165,7 +166,7 @@ class Stage(ABC):
 
     @abstractmethod
     def list_variants(self, setting: Setting) -> list[Setting]:
-        """List variants of a setting, which are tried if it is near the front of time and error."""
+        """List variants of a setting, which are tried if the setting is near the Pareto front of time and error."""
 
     @abstractmethod
     def judge_setting(self, setting: Setting) -> Measured:
@@ -176,7 +177,7 @@ class Stage(ABC):
         """Return a function that runs all stretches with a setting and returns the times of the steps [s]."""
 
     def time_settings(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
-        """Time the steps of several rounds in which all settings alternate; the first is the present one.
+        """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
 
         A setting with which a world diverges is not timed.
         """
@@ -185,7 +186,7 @@ class Stage(ABC):
         schedule.announce_measurements("timing", len(settings) * repeats)
         for round_index in range(repeats):
             for m, run in zip(settings, runs, strict=True):
-                # Medians: a step that is interrupted in the first round does not exclude a setting.
+                # Compare medians over the steps, so that an interrupted step does not exclude a setting.
                 if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
                     schedule.skip_measurement("timing")
                     continue

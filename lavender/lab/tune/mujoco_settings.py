@@ -1,8 +1,9 @@
 """Settings of MuJoCo, and stretches of simulated worlds on which they are measured.
 
-From the start of each stretch, a setting makes its own steps, warm-started from its own answers. A cone, impratio or
-noslip other than the model's defines another problem: its error is measured on its own problem, its motion shows how
-far it deviates, and no line recommends it.
+A stretch is a part of `horizon` steps of a simulated world (`lavender.lab.tune.measured`). Each setting steps from the
+start of each stretch by itself, warm-started from its own answers. A setting with another cone, impratio or number of
+noslip iterations than the model defines another constraint problem: its error is measured on that problem, its motion
+shows how far it deviates, and it is not recommended.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MERGE_NOTE = (
     "Add the line after the model's own <option>: MuJoCo merges both, and a later attribute replaces an earlier one. "
     "If the line replaces the model's own <option>, its integrator and time step are lost."
 )
-# Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
+# Prefixes of the names of MuJoCo's enumerators; the remaining part of a name is the MJCF keyword.
 ENUMS = {
     "solver": "mjSOL_",
     "cone": "mjCONE_",

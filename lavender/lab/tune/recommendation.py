@@ -1,4 +1,4 @@
-"""Choose settings from measurements: the front of time and error, lines to copy, and the page."""
+"""Choose settings from measurements: the Pareto front of time and error, lines to copy, and the page."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ class Tuning:
     measured : list of Measured
         Results on the worlds with even numbers.
     held : list of Measured
-        Results of the model's own setting and those chosen on the worlds with odd numbers; empty if Ctrl-C came before.
+        Results of the model's own setting and of the chosen settings on the worlds with odd numbers, which are held
+        back; empty if Ctrl-C ended the measurement before.
     threshold : float, m/s, m
-        Smaller errors and distances count as accurate enough.
+        Errors [m/s] and distances [m] up to this number count as accurate enough.
     stopped : bool
         The measurement was stopped by Ctrl-C.
     sizes : StepSizes, optional
@@ -69,14 +70,14 @@ class Tuning:
         return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
 
     def _is_accurate_enough(self, m: Measured) -> bool:
-        """Whether worst error and motion are at most the present setting's, or within the threshold."""
+        """Return whether error and motion of a setting are at most those of the present setting, or the threshold."""
         now, threshold = self.present_result, self.threshold
         pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
         return all(x <= max(own, threshold) for x, own in pairs)
 
     @cached_property
     def faster(self) -> Measured | None:
-        """Fastest setting that is at least as accurate as the present one, or within the threshold; None if none is."""
+        """Fastest setting that is accurate enough and faster than the present setting; None if there is none."""
         now = self.present_result
         good = [
             m
@@ -88,7 +89,10 @@ class Tuning:
 
     @cached_property
     def closer(self) -> Measured | None:
-        """Most accurate setting that is as fast as the present one; None if that is within the threshold."""
+        """Most accurate setting that is as fast as the present one.
+
+        None if no such setting is more accurate, or if the present error is within the threshold.
+        """
         now = self.present_result
         good = [
             m
@@ -110,7 +114,7 @@ class Tuning:
 
     @property
     def reason_without_line(self) -> str:
-        """Reason why no line is recommended; empty if enough of the steps have contact."""
+        """Reason why no setting is recommended: too few steps with contact; empty if enough steps have contact."""
         if self.sizes is None or self.sizes.has_enough_contact:
             return ""
         if not self.sizes.can_touch:
@@ -200,7 +204,7 @@ class Tuning:
 
     @property
     def figure(self) -> Figure:
-        """Error over time: every setting, the front, and the model's own setting."""
+        """Figure of error over time: every setting, the Pareto front, and the model's own setting."""
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
             notes = tuple(m.setting.option_line for m in settings)

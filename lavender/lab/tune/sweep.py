@@ -4,9 +4,9 @@
     result.faster, result.closer; result.summary_page.write("lavender-tune")
     tune("scene.py", engine="kamino")
 
-Settings are chosen on the worlds with even numbers; those with odd numbers are held back. `lavender.lab.tune.measured`
-describes what is measured. If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the present setting is
-measured and no line is recommended.
+Settings are chosen on the worlds with even numbers. The chosen settings are tested on the worlds with odd numbers,
+which are held back. `lavender.lab.tune.measured` describes the measurements. If less than the fraction
+`MIN_CONTACT_SHARE` of the steps has contact, only the present setting is measured and no setting is recommended.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ from lavender.lab.tune.recommendation import Tuning
 from lavender.lab.tune.warp_settings import WarpStage
 
 TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
-N_TRIAL_ROUNDS = 2  # Settings near the front are varied after this many rounds.
-# Settings of the front are varied if they take at most this multiple of the present setting's time.
+# After this many rounds of timing, variants of the settings near the Pareto front are tried.
+N_TRIAL_ROUNDS = 2
+# Variants of a setting on the Pareto front are tried if it takes at most this multiple of the present setting's time.
 MAX_VARIED_TIME_RATIO = 1.5
-EXPECTED_VARIED_SETTINGS = 4  # Expected number of settings with measured variants, for the remaining time.
+# Assumed number of settings whose variants are tried, to estimate the remaining time.
+EXPECTED_VARIED_SETTINGS = 4
 TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
 
 
@@ -64,8 +66,8 @@ def tune(
     engine : {"mujoco", "mujoco_warp", "kamino"}
         The last two step all worlds at once; the time of a step is divided by the number of worlds.
     worlds, steps, control, seed, spread
-        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`. Scenes of Kamino set their own
-        controls.
+        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`. Scenes of Kamino set their
+        own controls.
     states : path of an .npz, "keyframes", or arrays, optional
         States in which the worlds start: see `audit`, and for "kamino" `lavender.lab.engine_scenes`.
     horizon : int
@@ -73,14 +75,14 @@ def tune(
     repeats : int
         Repetitions of the timing, in which settings alternate.
     threshold : float, m/s, m
-        Smaller errors and distances count as accurate enough.
+        Errors [m/s] and distances [m] up to this number count as accurate enough.
     watch : callable, optional
         Called with the progress.
 
     Returns
     -------
     Tuning
-        After Ctrl-C, the result so far, with `stopped`.
+        After Ctrl-C, it holds the results so far, and its `stopped` is true.
 
     Raises
     ------
@@ -112,12 +114,12 @@ def tune(
         )  # fmt: skip
     runs = Runs(name, worlds, steps, control=control, seed=seed, spread=spread).with_start_states(states)
     mj, configured = runs.load_model()
-    # An unsupported model raises here, once.
+    # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
     stage_type = MujocoStage if engine == "mujoco" else WarpStage
 
     def make_stages() -> tuple[Stage, Stage]:
-        """Simulate the worlds with even numbers, and those with odd numbers."""
+        """Simulate all worlds; return the stages of the worlds with even numbers and of those with odd numbers."""
         even, odd = (
             stage_type.from_stretches_of_runs(mj, configured, runs, range(i, worlds, 2), horizon)
             for i in (0, 1)
@@ -141,12 +143,12 @@ def run_tuning(
     n_held_worlds: int,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
-    """Measure settings on one stage, and those chosen on a second one.
+    """Measure settings on one stage, and measure the chosen settings on a second stage.
 
     Parameters
     ----------
     make_stages : callable
-        Returns the stage on which settings are chosen and the one of the worlds held back.
+        Returns the stage on which settings are chosen, and the stage of the worlds held back.
     model : str
         Name in messages and tables.
     horizon, repeats, threshold, watch
@@ -171,7 +173,7 @@ def run_tuning(
         )  # fmt: skip
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
-        """Judge settings."""
+        """Return the judged results of settings on a stage."""
         results = []
         schedule.announce_measurements("judging", len(settings))
         for setting in settings:
@@ -184,7 +186,8 @@ def run_tuning(
         own, first_settings = stage.own_setting, stage.list_first_settings()
         n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
         n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
-        schedule.reserve_measurements("judging", n_first + 3 + n_variants)  # 3: the worlds held back
+        # Three settings on the worlds held back.
+        schedule.reserve_measurements("judging", n_first + 3 + n_variants)
         schedule.reserve_measurements(
             "timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats
         )

@@ -1,7 +1,8 @@
 """Settings of MuJoCo Warp, which steps all stretches as worlds of one batch, in float32.
 
-From the start of each stretch, a setting makes its own steps, warm-started from its own answers. The error is of the
-problem that MuJoCo Warp itself built; settings that change the problem are compared on their own problems.
+A stretch is a part of `horizon` steps of a simulated world (`lavender.lab.tune.measured`). Each setting steps from the
+start of each stretch by itself, warm-started from its own answers. The error is measured on the constraint problem
+that MuJoCo Warp builds with the setting; if a setting changes the problem, this is the changed problem.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lavender.lab.simulated_worlds import START_FIELDS, Runs, WarpWorlds, make_f
 from lavender.lab.tune.measured import Measured, Setting, Stage, make_unmeasured
 from lavender.lab.tune.mujoco_settings import CONVERGED_OPTIONS, MujocoSetting, get_option_value
 
-# The engine raises smaller tolerances to about the rounding of float32.
+# Relative tolerances to try. MuJoCo Warp raises smaller tolerances to about the round-off of float32.
 WARP_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 WARP_ITERATIONS = {"Newton": (1, 2, 3, 5, 10, 20), "CG": (3, 6, 12, 25, 50)}
 WARP_LINE_SEARCHES = (3, 5, 10, 20)
@@ -77,7 +78,7 @@ class WarpStage(Stage):
             if k % horizon == 0:
                 starts.append(running.read_state(names))
             running.advance(controls[:, k])
-        # Stretches of all worlds, ordered by their first step.
+        # Merge the stretches of all worlds: first the first stretch of each world, then the second of each, and so on.
         merged = {name: np.concatenate([start[name] for start in starts]) for name in names}
         count = runs.steps // horizon
         by_stretch = controls.reshape(len(chosen), count, horizon, model.nu).swapaxes(0, 1)
@@ -137,7 +138,7 @@ class WarpStage(Stage):
         return result
 
     def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
-        """Return a function that runs all stretches and returns the time of each step of one world."""
+        """Return a function that runs all stretches and returns the time of each step, per world [s]."""
 
         def timed(ctrl: Any) -> float:
             begin = perf_counter()

@@ -2,12 +2,12 @@
 
 The kernels do not check indices that they read from arrays. Every array therefore belongs to one of four groups:
 
-    given      by the scene: equal to the simulation's own, bit for bit
-    carried    from one substep to the next: finite, in range, in order
-    judged     the problem of the last substep, which `Simulation.residual` reads: complete and in range
-    scratch    written before it is read
+    given      defined by the scene; must equal the simulation's own array, bit for bit
+    carried    carried from one substep to the next; must be finite, in range and sorted
+    judged     the problem of the last substep, which `Simulation.residual` reads; must be complete and in range
+    scratch    written before it is read in every substep; is not checked
 
-The list of pairs is not restored; it is built again.
+The list of pairs of bodies that may touch is not restored; the next substep builds it again.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ QUATERNION_TOLERANCE = 1e-9
 
 
 def check_state_sizes(own: State, size: np.ndarray) -> None:
-    """Raise InputError if sizes other than the capacities differ from the simulation's."""
+    """Raise InputError if entries of `size`, other than capacities of arrays, differ from the simulation's own."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
@@ -50,7 +50,7 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     sweeps : (int, int)
         Smallest and largest sweep budget.
     is_lost : bool
-        The state claims not to be finite. Its numbers are then not checked, because no step follows.
+        Whether the snapshot is marked as not finite. Its numbers are then not checked, because no step can follow.
     """
     a, b = own.a, new.a
     for name in GIVEN:

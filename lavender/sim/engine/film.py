@@ -22,8 +22,8 @@ from lavender.sim.scene import Scene
 
 MAGIC = b"LAVENDER-FILM\n"
 VERSION = 1
-LEAD = 9  # Numbers of a frame before the poses: time and the solver values.
-MAX_FILM_BYTES = 2**28  # If the frames exceed this size, every second one is dropped.
+LEAD = 9  # Number of entries of a frame before the poses: the time and eight solver values.
+MAX_FILM_BYTES = 2**28  # [bytes] If the frames exceed this size, every second frame is dropped.
 MAX_FILM_HEADER_BYTES = 2**26
 
 
@@ -75,7 +75,8 @@ class Film:
             with np.errstate(over="ignore"):
                 row[0], row[1:LEAD] = time, observation["solver"]
                 poses[:, :3], poses[:, 3:] = observation["positions"], observation["quaternions"]
-            self._count += bool(np.isfinite(row).all())  # States that are not finite are left out.
+            # A frame that is not finite is overwritten by the next.
+            self._count += bool(np.isfinite(row).all())
 
     def frames(self, first: int = 0) -> np.ndarray:
         """Return a copy of the frames from number `first` on, (f, 9 + 7 n) float32."""

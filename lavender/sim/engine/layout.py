@@ -1,4 +1,7 @@
-"""Indices of the entries of the engine's small arrays, by name, as in `lavender_ext/engine/arrays.pxd`."""
+"""Names and indices of the entries of the engine's arrays `size`, `head`, `setting` and `joint`.
+
+They are those of `lavender_ext/engine/arrays.pxd`.
+"""
 
 from lavender_ext.engine import arrays
 

@@ -93,7 +93,7 @@ def save_picture(
     turn, tilt = check_float("turn [rad]", turn), check_float("tilt [rad]", tilt)
     views = [FilmView(one, turn, tilt, name) for name, one in films.items()]
     bounds = np.array([view.bounds for view in views])
-    for view in views:  # All films have the same scale.
+    for view in views:  # Draw all films to one scale.
         view.bounds = tuple(np.where([1, 0, 1, 0], bounds.min(axis=0), bounds.max(axis=0)))
     if suffix in (".gif", ".mp4"):
         _write_animation(views, path, size, rate)
@@ -217,7 +217,7 @@ def _write_animation(views: list[FilmView], path: Path, size: float, rate: float
     if suffix == ".gif":
         rate = 100.0 / max(
             2, round(100.0 / rate)
-        )  # A frame of a GIF lasts a whole number of hundredths of a second.
+        )  # GIF stores the duration of a frame in hundredths of a second.
     # Frames are evenly spaced in simulated time: a frame of a film with fewer steps is shown for longer.
     times = np.arange(first, last + 0.5 / rate, 1.0 / rate)
     chosen = np.stack([np.searchsorted(s.time, times - 1e-9).clip(0, len(s.time) - 1) for s in views], axis=1)

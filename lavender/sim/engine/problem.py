@@ -1,4 +1,4 @@
-"""Build the constraint problem of a substep from the engine's arrays; compute residuals and motion errors of a step."""
+"""Build the constraint problem of a substep from the engine's arrays; compute its residual and motion error."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 
 
 def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
-    """Return the velocity problem of a substep after `kernel.prepare()`; arrays are copied.
+    """Return the velocity problem of a substep whose rows `kernel.prepare()` has built; arrays are copied.
 
     Parameters
     ----------
     state : State
     bodies, joints : sequence of str
-        Names, for the names of blocks.
+        Names of bodies and joints, from which the names of blocks are made.
     name : str
         Name of the problem.
     """
@@ -102,7 +102,7 @@ def _choose_first_tangents(normal: FloatArray) -> FloatArray:
     for i, n in enumerate(normal):
         t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
         size = compute_norm(t)
-        if size > 0.0:  # A zero normal (a body is too far away for a direction) is an error of Rows.
+        if size > 0.0:  # For a zero normal, `Rows` raises the error.
             out[i] = t / size
     return out
 
@@ -123,8 +123,8 @@ def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
 def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
     """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies.
 
-    With Coulomb friction, several solutions may exist: the errors are taken against the nearer of two, the solution of
-    `auto` from its default start and the solution that it finds when started at these impulses.
+    With Coulomb friction, several solutions may exist. `auto` then solves twice, from its default start and from these
+    impulses, and the errors are distances from the nearer of the two solutions.
     """
     error, distance = motion.measure_distance(problem, impulse, motion.get_reference(problem)), 0.0
     if problem.law == "coulomb":
@@ -156,7 +156,8 @@ def _compute_energy_fractions(problem: Problem, result: Residual) -> dict[str, f
     with np.errstate(invalid="ignore"):
         size = np.sqrt(problem.d) * np.abs(result.error)
     top = float(size.max(initial=0.0))
-    # Division by the largest entry prevents overflow and underflow of squares. Infinite errors have no fractions.
+    # Divide by the largest entry before squaring, to prevent overflow and underflow. Fractions of infinite errors are
+    # 0.
     energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
     total = float(energy.sum())
     names = RESIDUAL_PARTS if c.has_rolling else RESIDUAL_PARTS[:4]

@@ -44,7 +44,7 @@ class Trace:
     order : str
         Order in which a sweep visits the contacts.
     method : str
-        Solver, unless it is the engine's own, and order, unless the solver has none.
+        Name of the solver (empty for the engine's own sweeps) and of the sweep order (left out if it has none).
     stopped : bool
         Ctrl-C ended the run; the trace contains the steps before.
     """
@@ -118,7 +118,7 @@ def run(
     record : path, optional
         Folder for the problem of every step.
     replace : bool
-        Remove the problems of another recording from the folder. Without it, such a folder is an error.
+        Whether to remove the problems of another recording from the folder; if false, such a folder raises an error.
     watch : callable, optional
         Called as watch(step, observation, info) after every step.
 
@@ -171,7 +171,7 @@ def run(
 
 
 def format_step(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
-    """Format a step as one line: time, contacts, matches, residual before and after the solve, depth."""
+    """Format a step as one line: time, contacts, contacts found in the cache, residual before and after, depth."""
     s = observation["solver"]
     depth = observation["contacts"]["depth"].max(initial=0.0)
     text = (

@@ -48,8 +48,8 @@ class Simulation(Stepping):
         Compute the judge's residual of all rows of the last substep as `info["residual"]`. It costs about as much as a
         step.
     report_motion : bool, default False
-        Compute the motion error of the last substep, the error of the bodies' velocities, as `info["motion"]`. It costs
-        a solve to the round-off floor, and two solves with Coulomb friction.
+        Compute the motion error of the last substep, the error of the bodies' velocities, as `info["motion"]`. It
+        costs a solve to the round-off floor, and two solves with Coulomb friction.
 
     Raises
     ------
@@ -73,10 +73,10 @@ class Simulation(Stepping):
         """Return the velocity problem of the next substep, with its warm start as `guess`; the state is unchanged.
 
         With the stepper `impulses`, `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n =
-        `solver_iterations` returns the impulses of that substep bit for bit. Pass the scene's `order`, unless it is
-        `alternating`: the contacts of such a problem are already in the order of the sweep. The observation of a step
-        contains the impulses of its last substep. Other steppers solve no velocity problem or another one, and no
-        solver of this problem returns their impulses.
+        `solver_iterations` returns the impulses of that substep bit for bit. Pass the scene's `order` to it, unless
+        the order is `alternating`: the contacts of the problem are then already in the order of the sweep. The
+        observation of a step contains the impulses of its last substep. Other steppers do not solve this velocity
+        problem, so no solver returns their impulses.
         """
         state = self.state.copy()
         if self._restored:
@@ -97,8 +97,8 @@ class Simulation(Stepping):
         Returns
         -------
         dict
-            relative [-], energy [sqrt J], velocity [m/s], floor [-], worst (name of a row), and share: the fractions of
-            the squared energy error on joints, normals, disks and torsion (their sum is 1, or 0 without error).
+            relative [-], energy [sqrt J], velocity [m/s], floor [-], worst (name of a row), and share: the fractions
+            of the squared energy error on joints, normals, disks and torsion (their sum is 1, or 0 without error).
 
         Raises
         ------
@@ -111,15 +111,15 @@ class Simulation(Stepping):
     def motion(self) -> dict[str, Any]:
         """Return the motion error of the last substep: the distance to its solution, see `lavender.motion_error`.
 
-        With Coulomb friction, several motions may be solutions. The distance is to the nearer of two: the solution of
-        `auto`, and the solution that continues from the impulses of the step.
+        With Coulomb friction, several motions may be solutions. `auto` then solves twice, from its default start and
+        from the impulses of the step, and the error is the distance from the nearer of the two solutions.
 
         Returns
         -------
         dict
             relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s], bound [sqrt J] and
-            bound_speed [m/s]; a value that cannot be computed is None. open [m/s]: the distance between those two
-            solutions, 0 without friction.
+            bound_speed [m/s]; a value that cannot be computed is None. open [m/s] is the distance between the two
+            solutions of `auto`, 0 without friction.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class Simulation(Stepping):
         InputError
             The folder cannot be written or holds problems that this simulation did not write, or `form` is unknown.
         CapabilityError
-            FCLIB cannot hold the rows of the next step. That step is not done; files of the steps before it stay.
+            FCLIB cannot hold the rows of the next step. That step is not done; the files of earlier steps are kept.
         """
         check_name("form", form, ("npz", "fclib"))
         steps = check_int("steps", steps, 1)
@@ -180,9 +180,9 @@ class Simulation(Stepping):
     # -- pictures -------------------------------------------------------------------------------
 
     def film(self, steps: int) -> Film:
-        """Step `steps` times and return a film of the poses, the present ones included.
+        """Step `steps` times and return a film of the poses, which starts with the present poses.
 
-        It stops if the state is no longer finite.
+        Stepping ends early if the state is no longer finite.
 
         Parameters
         ----------
@@ -349,7 +349,7 @@ class Simulation(Stepping):
         Raises
         ------
         InputError
-            It is not a snapshot, belongs to another scene, or contains a number that no step can produce. The
+            `snapshot` is not a snapshot, belongs to another scene, or contains a number that no step can produce. The
             simulation is unchanged.
         """
         if not isinstance(snapshot, Snapshot):

@@ -1,4 +1,4 @@
-"""The engine's buffers: built from a scene, enlarged if they are too small, with named arrays."""
+"""The engine's buffers with named arrays, which are built from a scene and enlarged if they are too small."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Copy = Callable[[], np.ndarray]
 
 assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 
-# Up to this many shapes, all pairs are tested; above it, the grid is faster and is used instead.
+# Up to this many shapes, collision detection tests all pairs; with more shapes a grid is faster and is used instead.
 BRUTE_FORCE_MAX_SHAPES = 32
-BETA = 0.2  # Fraction of a position error that a substep removes [-].
-MAX_PUSH = 0.2  # Largest position error that a substep corrects [m].
-MAX_BUFFER_BYTES = 2**32  # Largest size of the three buffers together.
+BETA = 0.2  # [-] Fraction of a position error that a substep removes.
+MAX_PUSH = 0.2  # [m] A substep corrects at most this much of a position error.
+MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are rejected.
 # Arrays that the scene defines or that carry values from one substep to the next; all others are scratch of a substep.
 KEPT = (
     "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
@@ -50,7 +50,7 @@ KEPT = (
 
 
 class ObservationViews(NamedTuple):
-    """Functions that copy the arrays of an observation, for one number of contacts and of contact rows.
+    """Functions that copy the arrays of an observation, for given numbers of contacts and of contact rows.
 
     Parameters
     ----------
@@ -73,7 +73,10 @@ class ObservationViews(NamedTuple):
 
 
 class State:
-    """Three buffers of the engine; `a` holds the arrays of `lavender_ext/engine/arrays.pyx` by name."""
+    """Buffers of the engine: one of floats, one of integers, one of keys.
+
+    `a` holds the arrays in the buffers by name, as `lavender_ext/engine/arrays.pyx` defines them.
+    """
 
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
@@ -94,7 +97,7 @@ class State:
 
     @cached_property
     def warm_start_phase(self) -> Substep:
-        """The first phase of `newton` on these buffers."""
+        """The compiled first phase of the solver `newton`, bound to these buffers."""
         return Substep(self.size, self.real, self.index, self.keys, False)
 
     def get_observation_views(self, contacts: int, rows: int) -> ObservationViews:
@@ -168,7 +171,7 @@ class State:
         """
         p, bodies, joints = scene.parameters, scene.bodies, scene.joints
         n = len(bodies)
-        # An inertia that is a multiple of the identity to the bit does not change under rotation: R I R^T = I.
+        # `even` bodies have an inertia I that is exactly a multiple of the identity, which rotation does not change.
         even = (np.array_equal(b.inertia, np.eye(3) * b.inertia[0, 0]) for b in bodies)
         uneven = [not b.is_static and not same for b, same in zip(bodies, even, strict=True)]
         frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
@@ -243,7 +246,7 @@ def _put_parameters(state: State, p: Parameters) -> None:
 
 
 def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool]) -> None:
-    """Write poses, velocities, masses and shapes; `uneven` marks bodies with an inertia that changes under rotation."""
+    """Write poses, velocities, masses and shapes; the inertia of bodies in `uneven` changes under rotation."""
     dynamic = 0
     for i, b in enumerate(bodies):
         a["x"][i], a["q"][i] = b.position, b.quaternion

@@ -36,7 +36,7 @@ NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # Default tolerance of lavender.solve.
 INSIDE_STEP = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
 SIMULATION_CLOSED = "this simulation is closed"
-SUBSTEPS_PER_CALL = 256  # Compiled substeps between two checks for Ctrl-C.
+SUBSTEPS_PER_CALL = 256  # A compiled call does up to this many substeps; Ctrl-C is checked between calls.
 INCOMPLETE_STEP = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # The counter of substeps in `head` restarts from 0 after this number.
 P = ParamSpec("P")
@@ -65,7 +65,10 @@ class _PendingClaim:
 def run_exclusively(
     method: Callable[Concatenate[S, P], R],
 ) -> Callable[Concatenate[S, P], R]:
-    """Decorate a method to run exclusively: other threads wait; inside a step or after `close` it raises an error."""
+    """Decorate a method so that only one thread at a time runs it.
+
+    A call from inside a step, or after `close`, raises LavenderError.
+    """
 
     @wraps(method)
     def call(self: S, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -99,7 +102,7 @@ class Stepping:
         self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
         self.report_residual = check_flag("report_residual", report_residual)
         self.report_motion = check_flag("report_motion", report_motion)
-        self._lock, self._refusal = RLock(), ""  # Reason why calls are rejected, or empty.
+        self._lock, self._refusal = RLock(), ""  # `_refusal` is the reason why calls are rejected, or empty.
         self.films: list[Film] = []  # Every step adds a frame to these films.
         self._viewers: dict[int, Any] = {}  # Open pages by the id of their film.
         self._load_scene(scene)
@@ -123,7 +126,8 @@ class Stepping:
         self._failed = 0
         self._end_reason = ""  # Reason why no step can follow, or empty.
         self._recorded: Path | None = None  # Folder to which `record` wrote last.
-        self._restored = False  # The state is from a snapshot, and its list of pairs is not valid.
+        # True if the state comes from a snapshot, so that its list of pairs is not valid.
+        self._restored = False
         self._state_before_step: State | None = (
             None  # Copy of the state, if a step can be stopped between substeps.
         )
@@ -169,8 +173,8 @@ class Stepping:
         Raises
         ------
         InputError
-            `n` is not an integer from 4 to 64 for sequential_impulses (1 to 64 with steppers other than "impulses"), or
-            of 1 or more for other solvers.
+            `n` is not an integer from 4 to 64 for sequential_impulses (1 to 64 with steppers other than "impulses"),
+            or of 1 or more for other solvers.
         """
         self.state.head[HEAD["iterations"]] = check_int("solver_iterations", n, *self._sweeps)
 
@@ -183,8 +187,8 @@ class Stepping:
     def set_velocity(self, body: int | str, velocity: Any = None, angular_velocity: Any = None) -> None:
         """Set the velocity with which a body enters the next step, for example to apply an impact.
 
-        The results of the last step (observation, residual, solution, contact cache) do not change. A snapshot contains
-        the new velocity.
+        The results of the last step (observation, residual, solution, contact cache) do not change. A snapshot
+        contains the new velocity.
 
         Parameters
         ----------
@@ -279,8 +283,8 @@ class Stepping:
         SolveFailed
             With `on_failure="raise"`, before the state has changed.
         KeyboardInterrupt
-            Ctrl-C while a registered solver runs. The state is the one before the step, or the one after it if the step
-            was complete; never one between substeps.
+            Ctrl-C while a registered solver runs. The state is the one before the step, or the one after it if the
+            step was complete; never one between substeps.
         LavenderError
             The simulation has terminated (reset it or restore a snapshot), or is closed.
         """
@@ -310,8 +314,8 @@ class Stepping:
         """Do all substeps of a step; restore the state before the step if one of them raises."""
         substeps, first = self._parameters.substeps, self.state
         first_substep, failed = first.head.item(HEAD["step"]), self._failed
-        # A registered solver may raise or be interrupted in any substep; the state before the step is then restored.
-        # Until the first substep has ended, nothing has changed that the next step starts from.
+        # A registered solver may raise or be interrupted in any substep; the state before the step is then restored
+        # from a copy. A single substep needs no copy: it changes the state only after its solve.
         needs_copy = substeps > 1 and not self._own_sweeps
         if self._restored:
             invalidate_pair_list(first)
@@ -330,7 +334,7 @@ class Stepping:
         except BaseException as error:
             done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
             if done == substeps or self._find_lost_body():
-                self._steps += 1  # The step was complete.
+                self._steps += 1  # All substeps were done before the interruption: count the step.
                 raise
             if done and self._state_before_step is not None and needs_copy:
                 first.copy_from(self._state_before_step)
@@ -340,7 +344,7 @@ class Stepping:
                 self._end_reason = INCOMPLETE_STEP
             self._failed = failed
             if not isinstance(error, SolveFailed):
-                self._last = None  # Its arrays may have been overwritten.
+                self._last = None  # The arrays of the last solution may have been overwritten.
             raise
         self._steps += 1
 
@@ -462,7 +466,7 @@ class Stepping:
             out[has, row] = a["impulse"][first[has] + row]
         if (
             per == 6
-        ):  # Rolling rows are the last two, whether the contact has a torsion row before them or not.
+        ):  # The rolling rows are the last two rows of a contact, with or without a torsion row before them.
             no_torsion = end - first == 5
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
         return out
@@ -519,9 +523,9 @@ def get_sweep_order(p: Parameters) -> str | None:
 
 
 def invalidate_pair_list(state: State) -> None:
-    """Mark the list of pairs as invalid: the next substep builds it again.
+    """Mark the list of pairs of bodies that may touch as invalid, so that the next substep builds it again.
 
-    A restored list with a missing pair cannot be distinguished from a correct one.
+    The list of a snapshot is not used, because a missing pair in it could not be detected.
     """
     for name in ("pairs_valid", "need_pairs", "need_contacts"):
         state.head[HEAD[name]] = 0

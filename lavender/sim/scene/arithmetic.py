@@ -16,7 +16,7 @@ from lavender.base.errors import InputError
 
 #: `compute_sine_and_cosine` computes in integer multiples of 2^-FIXED_POINT_BITS.
 FIXED_POINT_BITS = 256
-#: Largest accepted angle [rad]: the reduction to one quarter turn uses 64 of the bits of PI for it.
+#: [rad] Angles of this size or larger are rejected: reducing one to a quarter turn uses 64 of the bits of PI.
 MAX_ANGLE = 2.0**64
 
 #: pi 2^FIXED_POINT_BITS.
@@ -34,7 +34,8 @@ def compute_sine_and_cosine(angle: float) -> tuple[float, float]:
     angle = float(angle)
     if not abs(angle) < MAX_ANGLE:
         raise InputError(f"an angle is {angle:g} rad; less than {MAX_ANGLE:g} is needed")
-    if abs(angle) < 2.0**-27:  # angle^3 / 6 and angle^2 / 2 are less than half of the last bit.
+    # Rounded to nearest, sin x is x and cos x is 1: the next terms are below half a bit.
+    if abs(angle) < 2.0**-27:
         return angle, 1.0
     numerator, denominator = angle.as_integer_ratio()
     x = (numerator << FIXED_POINT_BITS) // denominator
@@ -97,7 +98,7 @@ def invert_definite_matrix(x: FloatArray) -> FloatArray | None:
 def convert_frame_to_quaternion(r: FloatArray) -> FloatArray:
     """Return the unit quaternion (4,) w x y z with w >= 0 of a rotation matrix (3, 3).
 
-    It is the row of 4 q q^T with the largest diagonal entry, which loses no digits (Shepperd 1978).
+    It is computed from the row of 4 q q^T with the largest diagonal entry, which avoids cancellation (Shepperd 1978).
     """
     (a, b, c), (d, e, f), (g, h, i) = r.tolist()
     rows = (

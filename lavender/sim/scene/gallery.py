@@ -64,7 +64,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
     lean = check_float("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
     s, c = compute_sine_and_cosine(lean)
-    half_width = tall * s + thick * c  # Half the width of the base of a pair.
+    half_width = tall * s + thick * c  # [m] Half the width of the base of a pair of leaning cards.
     pitch = 2.0 * half_width + thick
     height = tall * c + thick * s
     scene.add_plane()
@@ -98,7 +98,8 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
     check_int("n", n, 1)
     size = check_float("size", size, above=0.0)
     check_name("kind of pile", kind, ("spheres", "boxes", "mixed"))
-    side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # The bin is a quarter higher than wide.
+    # Bodies per edge; the bin's height is 5/4 its width.
+    side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)
     pitch = 1.15 * size if kind == "spheres" else 1.5 * size
     half = 0.5 * side * pitch
     rng = np.random.default_rng(scene.parameters.seed)

@@ -12,7 +12,8 @@ from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import compute_norm, compute_sine_and_cosine, rotate_vector_back
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
-# Relative excess of the largest moment over the sum of the others that is accepted as rounding, as for a flat plate.
+# The largest principal moment of inertia may exceed the sum of the other two by this fraction, which is the rounding
+# of a flat plate's moments.
 PLATE_MOMENT_TOLERANCE = 1e-6
 _put = object.__setattr__  # Sets a normalised field of a frozen dataclass.
 
@@ -98,9 +99,9 @@ class Body:
     angular_velocity : (3,) rad/s
         In world axes.
     friction, restitution : float, -, optional
-        None: the scene's.
+        None: the value of the scene.
     patch_radius : float, m, optional
-        None: the scene's.
+        None: the value of the scene.
     """
 
     name: str
@@ -223,12 +224,12 @@ def normalise(x: FloatArray, min_length: float = 0.0) -> FloatArray | None:
 
 
 def choose_inertia(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
-    """Return the inertia (3, 3) [kg m^2]: the given one, checked, or the inertia of the solid shape with `mass` [kg].
+    """Return the checked `inertia` as a tensor (3, 3) [kg m^2]; if it is None, the inertia of the solid shape.
 
     Raises
     ------
     InputError
-        The inertia is not valid, or it or the mass is too small or too large.
+        The inertia is not valid, or the inertia or the mass is too small or too large.
     """
     if inertia is None:
         with np.errstate(all="ignore"):
@@ -246,7 +247,7 @@ def choose_inertia(label: str, inertia: Any, shape: Any, mass: float) -> FloatAr
 
 
 def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
-    """Return the tensor (3, 3) [kg m^2] of principal moments (3,) or a tensor; raise InputError if no body has it."""
+    """Convert principal moments (3,) or a tensor to a tensor (3, 3) [kg m^2]; reject inertias that no body has."""
     shape = get_shape(f"inertia of {label}", inertia)
     if shape not in ((3,), (3, 3)):
         raise InputError(f"inertia of {label} is {inertia!r}; 3 moments or a (3, 3) tensor is needed")

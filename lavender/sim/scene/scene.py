@@ -145,7 +145,8 @@ class Parameters:
         gravity: Any = self.gravity
         if get_shape("gravity", gravity) == ():
             size = check_float("gravity", gravity)
-            if size < 0.0:  # The z component was probably meant; bodies would fall upwards.
+            # A negative number probably is the z component of gravity; bodies would fall upwards.
+            if size < 0.0:
                 raise InputError(
                     f"gravity is {size:g}; a number points downwards and is at least 0: give {-size:g}, or a vector, "
                     f"(0, 0, {size:g}) m/s^2"
@@ -237,7 +238,8 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
     Parameters
     ----------
     **defaults
-        Defaults of the scene for the parameters that every scene has, if they differ from the defaults of `Parameters`.
+        Defaults of the scene for the parameters that every scene has, if they differ from the defaults of
+        `Parameters`.
 
     Returns
     -------
@@ -289,16 +291,16 @@ class Scene:
     Parameters
     ----------
     name : str, optional
-        A scene of the gallery, or one registered by `named_scene`. None: an empty scene.
+        Name of a scene of the gallery, or of a scene that `named_scene` registered. None: an empty scene.
     **parameters
         The fields of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
 
     Raises
     ------
     UnknownName
-        No such scene or parameter; the message suggests the nearest name.
+        The scene or parameter does not exist; the message suggests the nearest name.
     InputError
-        A value that is not valid.
+        A value is not valid.
 
     Examples
     --------
@@ -329,7 +331,8 @@ class Scene:
         self.joints: list[Joint] = []
         if name is not None:
             SCENES[name](self, **self.own)
-        self._built = self.n_bodies, self.n_joints  # Built by the gallery; later ones are added by hand.
+        # Numbers that the gallery built; further ones are added by hand.
+        self._built = self.n_bodies, self.n_joints
 
     @property
     def n_bodies(self) -> int:
@@ -350,7 +353,7 @@ class Scene:
         Raises
         ------
         UnknownName
-            No such parameter; a scene that was built by hand only has the parameters of `Parameters`.
+            A parameter does not exist. A scene that was built by hand has only the parameters of `Parameters`.
         InputError
             The gallery would build another number of bodies, and joints were added by body numbers.
         """
@@ -407,7 +410,7 @@ class Scene:
         name : str, optional
             Default: shape and number, as "box 3".
         friction, restitution, patch_radius : float, optional
-            Default: the scene's.
+            Default: the value of the scene.
         shape : Plane, Sphere or Box, optional
             None: the body has no contacts.
 
@@ -622,7 +625,7 @@ class Scene:
             free += (
                 "stepper",
                 "stepper_options",
-            )  # Snapshots from before there were other steppers still fit.
+            )  # The default stepper is left out of the hash, so that snapshots of versions without steppers fit.
         head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
         parts: list[Any] = [head]
         for b in self.bodies:
@@ -646,7 +649,7 @@ def _check_optional_number(label: str, value: Any, **allowed: float) -> float | 
 def _check_common_point(
     label: str, anchor: Any, a: Any, b: Any, length: Any
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the common world point of a ball or hinge twice, and length 0."""
+    """Return (anchor, anchor, 0.0) for the common world point (3,) [m] of a ball or hinge joint."""
     if anchor is None or a is not None or b is not None or length is not None:
         raise InputError(f"{label} takes anchor=, one world point, and no length")
     point = check_numbers(f"anchor of {label} [m]", anchor, 3)

@@ -1,8 +1,8 @@
 """Table of the steppers by name, with their capabilities and options.
 
-A stepper computes the part of a substep between collision and integration. Bodies, shapes, joints, motors, collision,
-matching of contacts, snapshots, films, orders and budgets belong to the engine. The kernels are in
-`lavender_ext/engine/`.
+A stepper computes the part of a substep between collision detection and integration. Bodies, shapes, joints, motors,
+collision detection, matching of contacts, snapshots, films, orders and budgets are common to all steppers. The kernels
+are in `lavender_ext/engine/`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Option:
     Parameters
     ----------
     slot : str
-        Name of its entry in the engine's array `setting`, or in `head` for an integer.
+        Name of the option's entry in the engine's array `setting`, or in `head` for an integer option.
     default, low, high : float
         Default value and range.
     text : str
@@ -59,19 +59,19 @@ class StepperSpec:
     position_iterations : int
         Default; 0 if the stepper has no position projection.
     solvers : bool
-        A registered solver can replace the stepper's sweeps.
+        Whether a registered solver can replace the stepper's sweeps.
     spin : bool
-        It supports torsional friction of a patch.
+        Whether the stepper supports torsional friction of a contact patch.
     rolling : bool
-        It supports rolling friction.
+        Whether the stepper supports rolling friction.
     boxes : bool
-        It supports separate friction bounds of each tangent, Scene(friction_shape="box").
+        Whether the stepper supports separate friction bounds of each tangent, Scene(friction_shape="box").
     restitution : bool
-        It supports restitution.
+        Whether the stepper supports restitution.
     residuals : bool
-        `observation["solver"]` holds residuals; else they are NaN.
+        Whether `observation["solver"]` holds residuals; if false, they are NaN.
     exact_problem : bool
-        `constraint_problem()` solved by sequential_impulses gives the impulses of the step bit for bit.
+        Whether `constraint_problem()` solved by sequential_impulses gives the impulses of the step bit for bit.
     options : mapping of str to Option
     """
 
@@ -153,8 +153,8 @@ IMPULSES = StepperSpec(
 #:     after the update of positions: sweeps without the spring; restitution last
 #:
 #: (1) is the implicit damped spring of frequency f and damping ratio zeta on the effective mass 1/A_ii, derived in
-#: `lavender_ext/engine/soft_step.pxd`. Contacts with static bodies and joints have twice the frequency. The period of a
-#: spring is at least four substeps. One sweep in each of many substeps is more accurate than many sweeps in one.
+#: `lavender_ext/engine/soft_step.pxd`. Contacts with static bodies and joints have twice the frequency. The period of
+#: a spring is at least four substeps. One sweep in each of many substeps is more accurate than many sweeps in one.
 SOFT_STEP = StepperSpec(
     name="soft_step",
     number=1,
@@ -177,8 +177,8 @@ SOFT_STEP = StepperSpec(
 #:     dlambda = (-C - alpha' lambda)/(w + alpha'),  alpha' = alpha/h^2,  w = sum of 1/m + (r x n).I^-1 (r x n)
 #:     v = (x - x0)/h;  friction reduces sliding by up to mu lambda_n; the normal velocity becomes -e v_n(before)
 #:
-#: Nothing is warm-started, so that one sweep in each of many substeps is more accurate than many sweeps in one. A stack
-#: creeps if the sweeps of friction are too few to reach its ends. See `lavender_ext/engine/xpbd.pxd`.
+#: Nothing is warm-started, so that one sweep in each of many substeps is more accurate than many sweeps in one. A
+#: stack creeps if the sweeps of friction are too few to reach its ends. See `lavender_ext/engine/xpbd.pxd`.
 XPBD = StepperSpec(
     name="xpbd",
     number=2,

@@ -33,7 +33,7 @@ def _print_message(text: str) -> None:
 
 
 def _serve_page(port: int, no_browser: bool) -> None:
-    """Serve the page from a temporary folder until Ctrl-C."""
+    """Write the page to a temporary folder and serve it until Ctrl-C."""
     import webbrowser
     from tempfile import TemporaryDirectory
 

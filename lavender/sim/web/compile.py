@@ -87,7 +87,7 @@ EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_nam
 #: Name of the custom section with the hash of the sources, the last section of the file.
 SOURCES_SECTION = "lavender.sources"
 DATA_SECTION_ID = 11  # Number of the section of static data.
-#: Exported symbols that are not functions: the beginning of free memory, and the limits that show that no data remains.
+#: Exported symbols that are not functions: the beginning of free memory, and the ends of the section of static data.
 LINKER_SYMBOLS = ("__heap_base", "__data_end", "__global_base")
 
 
@@ -187,7 +187,7 @@ def build(
         data = _compile_to_wasm(source, names, ["--import-memory"] if imports_memory else [])
     _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
     data += make_custom_section(SOURCES_SECTION, hash_sources(root, modules).encode())
-    out = out.resolve()  # A link stays; its target is replaced.
+    out = out.resolve()  # If `out` is a symbolic link, replace its target and keep the link.
     if out.exists() and not out.is_file():
         raise BuildFailed(
             f"cannot write {out}: it is not a file, and is not replaced; give the name of a file"
@@ -260,10 +260,10 @@ def _run_command(command: list[str], folder: Path) -> None:
 
 def _check_module(module: bytes, max_bytes: int) -> None:
     """Raise BuildFailed if the module has static data or is too large; the linker reports its own errors."""
-    position = 8  # The magic word and the version are followed by number, size and content of each section.
+    position = 8  # Skip the magic word and the version; number, size and content of each section follow.
     while position < len(module):
         kind, size, shift, position = module[position], 0, 0, position + 1
-        while True:  # LEB128
+        while True:  # Read the section's size, a LEB128 integer.
             byte, position = module[position], position + 1
             size |= (byte & 0x7F) << shift
             shift += 7
@@ -280,7 +280,7 @@ def _check_module(module: bytes, max_bytes: int) -> None:
 
 
 def make_custom_section(name: str, content: bytes) -> bytes:
-    """Return a custom section to append to a module; it is limited to 127 bytes, a length of one byte in LEB128."""
+    """Return a custom section to append to a module. Its size must be below 128 bytes, one byte in LEB128."""
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:
         raise ValueError("a custom section longer than 127 bytes")

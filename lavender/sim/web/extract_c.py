@@ -3,12 +3,12 @@
     translate_modules_to_c(root, modules, work)            return the C of modules of lavender_ext
     extract_c(translations, front, roots)     return one C file with the declarations that `front` and `roots` use
 
-Cython writes the core of a module (`cdef ... noexcept nogil`) and its Python part into one file, and a declaration that
-several modules cimport into each of their files. Every file is parsed into its declarations (structs, enums, typedefs,
-functions, groups under `#if`). Starting from the roots, each name is resolved to the declaration that defines it, and
-the names which that declaration uses are resolved in turn. Bodies of functions, nine tenths of all tokens, are only
-parsed if the function is needed. A function that another module imports by pointer is replaced by the function itself.
-If a needed declaration uses Python, the error message names its user.
+Cython writes the core of a module (`cdef ... noexcept nogil`) and its Python part into one file, and a declaration
+that several modules cimport into each of their files. Every file is parsed into its declarations (structs, enums,
+typedefs, functions, groups under `#if`). Starting from the roots, each name is resolved to the declaration that
+defines it, and the names which that declaration uses are resolved in turn. Bodies of functions, nine tenths of all
+tokens, are only parsed if the function is needed. A function that another module imports by pointer is replaced by the
+function itself. If a needed declaration uses Python, the error message names its user.
 
 Names lose the prefix of Cython (`__pyx_f_12lavender_ext_4core_5block_clip` becomes `core_block_clip`), core functions
 `lav_x` become `k_x`, and all declarations of the kernels are `static`: if a build omits parts of `front`
@@ -85,14 +85,14 @@ TOKEN = re.compile(
       |(?P<mark>[^\s\w]))""",
     re.VERBOSE | re.DOTALL,
 )
-#: Braces, and everything that may contain a brace that does not open or close a block.
+#: Matches braces, and texts that may contain a brace that is not one: preprocessor lines, comments and literals.
 BRACE = re.compile(
     r"""\n[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*|/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[{}]""",
     re.DOTALL,
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
 DIGITS = re.compile(r"\d+")
-#: Words without a declaration in the kernels: those of the prologue, and keywords of C.
+#: Words that need no declaration from the kernels: keywords of C, and words that the prologue defines.
 PREDEFINED = frozenset(
     WORD.findall(
         """CYTHON_INLINE CYTHON_UNUSED __PYX_EXTERN_C likely unlikely NULL DL_IMPORT auto break case char const continue
@@ -127,9 +127,9 @@ class Item:
         "macro", "type", "prototype", "variable", "function" or "group".
     part : list of Token
     defines : set of str
-        Names that it defines.
+        Names that the declaration defines.
     origin : str
-        Module of its file.
+        Module in whose file the declaration is.
     kept_names : frozenset of str
         Core functions that keep their names.
     """
@@ -216,7 +216,7 @@ def _find_end_of_block(text: str, at: int) -> int:
 
 def parse_declarations(text: str) -> list[Item]:
     """Return the declarations of a C file; those between `#if` and `#endif` form one group."""
-    # Cython's files have all declarations in the last branch of this condition.
+    # In the C that Cython writes, all declarations are in the #else branch of `#ifndef Py_PYTHON_H`.
     guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")
     return list(
         _iterate_declarations(list(tokenize_c(guarded[2].rpartition("\n#endif")[0] or text, bodies=True)))
@@ -333,7 +333,7 @@ def _parse_declaration(part: list[Token]) -> Item:
 
 
 class _Table:
-    """Declarations of all files by the names that they define; a definition precedes a prototype or a pointer."""
+    """Declarations of all files, by the names that they define. A definition replaces a prototype or a pointer."""
 
     RANK: ClassVar = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
 
@@ -428,7 +428,7 @@ def _make_static(item: Item, kept_names: frozenset[str]) -> str:
 
 
 def _make_output_name(name: str, kept_names: frozenset[str]) -> str:
-    """Return a name without Cython's prefix; only names of variables end in an underscore."""
+    """Return a name as it is written to the output: without Cython's prefix, variables with a final underscore."""
     if not name.startswith("__pyx_"):
         if name == "Py_ssize_t":
             return "ptrdiff_t"
@@ -439,7 +439,7 @@ def _make_output_name(name: str, kept_names: frozenset[str]) -> str:
         while number := DIGITS.match(name, at):
             end = number.end() + int(number[0])
             if end == number.end() or name[end : end + 1] != "_":
-                break  # A number that Cython added, as in __pyx_t_1.
+                break  # The name is a word and a number that Cython added, as in __pyx_t_1.
             parts.append(name[number.end() : end])
             at = end + 1
         if parts:
@@ -515,7 +515,7 @@ def translate_modules_to_c(
     options = [f"-X{name}={value}" for name, value in directives.items()]
     how = cache / "how.json" if cache else None
     if not (how and how.exists() and directives in json.loads(how.read_text(encoding="utf-8"))):
-        cache = None  # The build has all run-time checks, or is not complete.
+        cache = None  # Do not use the translations of a build that is incomplete or has run-time checks.
 
     def translate_module(module: str | Path) -> tuple[str, str]:
         source = get_module_path(root, module)

@@ -23,7 +23,7 @@ from lavender.sim.web.scenes import collect_page_data
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
-SHIPPED = HERE  # The folder of the modules in the package.
+SHIPPED = HERE  # Folder of the WebAssembly modules that the package contains.
 
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:

@@ -13,8 +13,8 @@ from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, compute_array_offsets
 
 #: Scenes of the page, the whole gallery: name, title, description, and the quantity in the caption of each side:
-#: "displacement" (largest distance of a body from its initial position, sideways or downwards), "gap" (largest distance
-#: between the ends of a joint), "apart" (largest distance of a body of B from the same body of A).
+#: "displacement" (largest distance of a body from its initial position, sideways or downwards), "gap" (largest
+#: distance between the ends of a joint), "apart" (largest distance of a body of B from the same body of A).
 PAGE: tuple[tuple[str, str, str, str], ...] = (
     (
         "stack",
@@ -96,7 +96,7 @@ class Number(NamedTuple):
     field : str
         One of `SOLVER_FIELDS`.
     first, last : int
-        Range of steps; 0 and 0 select the very first solve, which is one substep.
+        Range of steps. If both are 0, the value is that of the first substep of the first step.
     over : str
         "AB" for the ratio A/B, "BA" for B/A, or "" for no ratio.
     """
@@ -264,8 +264,8 @@ def describe_layout() -> dict[str, Any]:
     Returns
     -------
     dict
-        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders: name
-        -> number; steppers: name -> entries that it sets.
+        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders:
+        name -> number; steppers: name -> entries that it sets.
     """
     return {
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},

@@ -56,7 +56,7 @@ class Viewer:
         return f"http://127.0.0.1:{self._server.server_address[1]}/view.html"
 
     def wait(self) -> None:
-        """End the film and wait until Ctrl-C; the film can still be viewed."""
+        """End the film, so that no frames are added, and serve it until Ctrl-C."""
         self.film.ended = True
         try:
             self._thread.join()
@@ -91,7 +91,7 @@ class _FilmHandler(Handler):
     def do_GET(self) -> None:
         """Answer with `film.json` (the header), `frames?from=K&stride=S` (frames from number K on) or a page file."""
         host = self.headers.get("Host", "").rsplit(":", 1)[0]
-        if host not in ("127.0.0.1", "localhost"):  # A foreign page may map its own name to this machine.
+        if host not in ("127.0.0.1", "localhost"):  # Other names may be mapped here by foreign sites.
             self.send_error(HTTPStatus.FORBIDDEN)
             return
         address = urlsplit(self.path)
@@ -113,7 +113,8 @@ class _FilmHandler(Handler):
             return
         film = self._film
         ended = film.ended
-        if stride != film.stride:  # Every second frame has been dropped: start again.
+        # Every second frame was dropped since the last request: send all frames again.
+        if stride != film.stride:
             first = 0
         frames = film.frames(first)[:MAX_FRAMES_PER_ANSWER]
         is_complete = ended and first + len(frames) >= len(film)

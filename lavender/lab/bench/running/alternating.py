@@ -1,6 +1,7 @@
 """Time the calls that a report would print alternately: each repetition makes every call on every case once.
 
-Disturbances of the machine then affect all calls equally, and differences between repetitions are the noise of a rerun.
+Disturbances of the machine then affect all calls equally, and differences between repetitions are the noise of a
+rerun.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from lavender.lab.bench.running.timing import (
 from lavender.lab.bench.store import Records, Store
 
 DEFAULT_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
-# [s] Time of all cases together; more than DEFAULT_REPETITIONS are made only within it.
+# [s] Repetitions beyond DEFAULT_REPETITIONS are made only until the repetitions of all cases have taken this time.
 EXTRA_REPETITION_TIME = 3.0
 # All repetitions together may take this multiple of the plan's time limit; MIN_REPETITIONS are always made.
 TIME_LIMIT_MULTIPLE = 20.0
@@ -98,7 +99,7 @@ def time_alternately(
 
 
 class _Alternation:
-    """Repeats all calls on the cases of a part; `interleave_group` identifies calls and cases timed together."""
+    """Repeats all calls on some of the cases, interleaved; `interleave_group` identifies what was timed together."""
 
     def __init__(self, runner: Runner, call_specs: Sequence[CallSpec], interleave_group: str) -> None:
         self.runner, self.call_specs, self.interleave_group = runner, call_specs, interleave_group
@@ -109,7 +110,11 @@ class _Alternation:
                 runner.report_progress(record.case, record.solver, record, True)
 
     def repeat_calls_on(self, part: Cases, limit: float, extra: float) -> None:
-        """Repeat all calls on some cases or one sequence: at most `limit` [s], above the default number `extra` [s]."""
+        """Repeat all calls on the cases, or on the sequence, in `part`.
+
+        `MIN_REPETITIONS` are always made. Repetitions up to `DEFAULT_REPETITIONS` stop after `limit` [s], and further
+        repetitions after the smaller of `limit` and `extra` [s].
+        """
         is_sequence = bool(part[0][0].sequence)
         call_specs = [
             a
@@ -144,7 +149,8 @@ class _Alternation:
         """Whether the solver of a call can be timed on a case."""
         spec = self.runner.specs[call.solver]
         if is_third_party_solver(spec) and (call.timing_mode == "batch" or call.mode == "time"):
-            return False  # An isolated process adds its start to the time, or has no time limit.
+            # These calls cannot be timed in the separate process in which third-party solvers run.
+            return False
         return spec.refuses(item.problem) is None
 
     def make_task(self, call: CallSpec, info: CaseInfo) -> Task:
@@ -163,7 +169,7 @@ class _Alternation:
             records.setdefault(record.key, []).append(record)
 
     def time_case(self, call: CallSpec, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
-        """Time a call on a case, starting from the step `before`; return its record and its impulses."""
+        """Time a call on a case, started from the result `before` of the previous step; return (record, result)."""
         task = self.make_task(call, info)
         if task.key in self.known and call.start != "carried":
             return None, None
@@ -183,7 +189,7 @@ class _Alternation:
             self.add_record(records, record)
 
     def time_batch(self, call: CallSpec, cases: Cases, records: RecordsByKey) -> None:
-        """Time one call of `solve_many`; each problem's record has an equal part of the time."""
+        """Time one call of `solve_many`; the record of each problem gets an equal part of the call's time."""
         tasks = [self.make_task(call, info) for _, info in cases]
         if all(task.key in self.known for task in tasks):
             return

@@ -16,7 +16,8 @@ from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
-# A motion error is reached by solves to ever tighter residuals: first and last residual, largest number of solves.
+# To reach a motion error [m/s], a solver runs with `tol` from FIRST_TOL down to LAST_TOL, MAX_SPEED_TRIES times at
+# most.
 FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
@@ -138,9 +139,10 @@ class Plan:
     ) -> None:
         """Measure one solver on one case; each record decides the next measurement.
 
-        First come runs to a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, the
-        loosest first. A solver that can be resumed, or that ran out of time, gets no tighter tolerance than one that it
-        missed: its iterates would be the same. Then follow budgets, then sweep orders at the middle budget.
+        Runs to a tolerance come first. An exact solver runs once, at the tightest tolerance; other solvers run at each
+        tolerance, the loosest first. After a missed tolerance, a resumable solver does not run at tighter tolerances,
+        since its iterates would be the same, nor does a solver that ran out of time. Then follow runs with fixed
+        budgets, then runs in other sweep orders at the middle budget.
         """
 
         def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
@@ -174,7 +176,7 @@ class Plan:
             for word in self.orders:
                 name, _, seed = word.partition(":")
                 if name in ("bottom_up", "top_down") and problem.rows is None:
-                    continue  # Without bodies there is no direction up.
+                    continue  # Both orders sort blocks by the height of bodies, which are not known.
                 measure_one(
                     "budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {})
                 )
@@ -189,7 +191,7 @@ class Plan:
                     speed = math.inf if last.motion_speed is None else last.motion_speed
                     if speed <= tolerance:
                         break
-                    # No tighter tolerance can be reached: the residual was missed, or no motion error is known.
+                    # Stop if the residual was missed, if the motion error is unknown, or at the tightest `tol`.
                     if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
                         return
                     tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * tolerance / speed))
@@ -223,7 +225,7 @@ class CampaignPlan(Plan):
 
 
 def list_passes(plan: Plan, spec: SolverSpec) -> list[CallSpec]:
-    """Return the passes over a sequence: each budget and tolerance, from a cold start and with carried impulses."""
+    """Return the calls that run over a whole sequence: each budget and tolerance, cold and with carried impulses."""
     max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
     tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
     targets = [("tol", tolerance, max_iterations) for tolerance in tolerances]

@@ -1,7 +1,8 @@
 """Measure every solver on every case, in this process or with workers; each record is stored as soon as it is made.
 
-A run with times measures in this process, one solve after the other. A campaign (`CampaignPlan`) measures no times: its
-pairs of case and solver may be distributed over workers, and its records have the same bits with any number of them.
+A run with times measures in this process, one solve after the other. A campaign (`CampaignPlan`) measures no times:
+its pairs of case and solver may be distributed over workers, and its records have the same bits with any number of
+them.
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
-MOTION_SEARCH_RUNS = 6  # Runs of the search for several motions, made once for each Coulomb problem.
-# After a step that took less than this fraction of the time limit, the next step is solved without a guard.
+MOTION_SEARCH_RUNS = 6  # Number of solves that search for several motions, once for each Coulomb problem.
+# If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
 UNGUARDED_TIME_RATIO = 0.05
-# Steps of longer sequences are solved once: the sum of their times varies less.
+# Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies
+# less.
 MAX_REPEATED_STEPS = 20
 MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
 
@@ -80,7 +82,8 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
 def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
     """Return the record with `motion_error`, `motion_speed` and `bound` of its impulses (m,) [N s].
 
-    No clock runs. The reference, and under Coulomb's law the motions that are found, are cached in `problem`.
+    It is called outside timed code. The reference solution, and under Coulomb's law the motions that are found, are
+    cached in `problem`.
     """
     if impulse is None:
         return record
@@ -118,7 +121,7 @@ def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> 
 
 
 def remove_times(record: Record, time_limit: float) -> Record:
-    """Return the record of a campaign: equal on all machines, with the time limit [s] of the plan."""
+    """Return the record without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
     nan = math.nan
     return replace(
         record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
@@ -201,8 +204,8 @@ def run(
     Raises
     ------
     InputError
-        joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a plan
-        that measures times, or workers were lost repeatedly.
+        joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a
+        plan that measures times, or workers were lost repeatedly.
     """
     require_packages("a measurement", "joblib", "threadpoolctl")
     check_workers(workers)
@@ -242,7 +245,7 @@ def open_runner(
         open_store(store) as kept,
         Worker(memory) as worker,
         limit_to_one_thread(),
-    ):  # Describing a case uses BLAS, too.
+    ):  # The limit covers the description of cases, which uses BLAS.
         yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
@@ -267,7 +270,7 @@ class Runner:
         self.total = 0
         stored = Records() if store is None or not reuse else store.records
         self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
-        # Descriptions of a campaign are reused: many cases take longer to describe than to load.
+        # A campaign reuses stored descriptions of cases: many take longer to describe than to load.
         self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
 
     def add_entry(self, entry: Entry) -> None:
@@ -328,7 +331,7 @@ class Runner:
             known.setdefault((record.case, record.solver), []).append(record)
         pairs: list[Pair] = []
         for item, name in product(items, self.names):
-            # The worker reads a name or path again: a cluster shares the files or the suite.
+            # Send a name or path, which the worker reads itself: machines of a cluster share files and suite.
             source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
             records = tuple(known.get((item.name, name), ()))
             info = self.described.get(item.name)
@@ -449,7 +452,8 @@ class Runner:
             self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
         if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
-            # An earlier run was stopped in this pass: solve its steps again, unrecorded, for the last step's impulses.
+            # If an earlier run was stopped in this pass, repeat its steps without records for the last step's
+            # impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
                 before = self.measure_step(item.problem, again, spec, before)[1]
@@ -488,7 +492,10 @@ class Runner:
         return record, None if impulse is None else (problem, impulse)
 
     def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
-        """Return the solver to run for `name`, or its method with bounds if it refuses a case, or None, with a note."""
+        """Return the solver to run for `name`.
+
+        If it refuses a case, return its bounded variant, or record a note and return None.
+        """
         spec = self.specs[name]
         for problem in (item.problem if isinstance(item, Item) else item for item in items):
             reason = spec.refuses(problem)
@@ -499,7 +506,7 @@ class Runner:
         # A pair of a campaign has only records of its own solver.
         other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
-            other = None  # It is run under its own name.
+            other = None  # The bounded variant is measured under its own name already.
         self.add_entry(
             Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason)
         )
@@ -529,7 +536,7 @@ class Runner:
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
         if self.plan.campaign and not is_third_party_solver(spec):
-            # The clock ends only processes of other packages' solvers.
+            # In a campaign, a time limit may only end processes of third-party solvers.
             task = replace(task, time_limit=math.inf)
         if self.worker is not None and is_third_party_solver(spec):
             record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
@@ -549,7 +556,7 @@ def _get_elapsed_time(record: Record) -> float:
 
 
 def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
-    """Group consecutive items of the same sequence. Items without a sequence form groups of one, named ""."""
+    """Group consecutive items of the same sequence; each item without a sequence is a group with the name ""."""
     out: list[tuple[str, list[Item]]] = []
     for item in items:
         if item.sequence and out and out[-1][0] == item.sequence:
@@ -589,13 +596,14 @@ class Order:
 
     plan: Plan
     run: Run
-    memory: int | None  # [bytes] Memory of each backend's process; None: a share of its machine's memory.
+    # [bytes] Memory limit of each third-party solver's process; None: a share of the machine's.
+    memory: int | None
     local: tuple[SolverSpec, ...] = ()  # Solvers that are registered only in the parent.
 
 
 @cache
 def _get_isolated_worker(memory: int) -> Worker:
-    """Return the process for third-party solvers, one in each worker, which all pairs use."""
+    """Return the process for third-party solvers; each worker has one, which all of its pairs use."""
     return Worker(memory)
 
 
@@ -613,7 +621,7 @@ def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
             registry.registered.update(before)
 
 
-# The case of the last pair: pairs of a case are consecutive.
+# Source, item and description of the case of the last pair. Pairs of one case are consecutive, so it is loaded once.
 _last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
 
 

@@ -1,10 +1,10 @@
-"""Time a solve; no other module does.
+"""Time solves. No other module does.
 
-The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays of
-its problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded
-solve under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
-only `prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and
-OpenMP use one thread, and the garbage collector is off.
+The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays
+of its problem are newly written, as by a simulator, and other work has used the processor's caches since. A guarded
+solve, which is the same solve under the time limit, runs before the timed repetitions; if it does not end, its own
+time is recorded. If `Task.timing_mode` is empty, only `prepare` and `solve` are timed, without the judge, on a problem
+that has no derived arrays yet. BLAS and OpenMP use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -70,8 +70,9 @@ class CallSpec:
 class Task:
     """One measurement: a `CallSpec` on a case.
 
-    `guarded`: a solve under the time limit comes first. `lead` [s] is the time that the call takes before the solve, to
-    carry impulses. For the other fields see `Record`.
+    If `guarded` is true, a solve under the time limit precedes the timed repetitions. `lead` [s] is the time that was
+    spent before the call to map the impulses of the previous step; it is added to the call's time. For the other
+    fields see `Record`.
     """
 
     run: str
@@ -108,7 +109,7 @@ class Task:
         return Record(**{**shared, "options": dict(self.options)}, order=order, seed=seed, **results)
 
 
-#: Fields that a task and its record have in common; `repeats` of a record is the number that were made.
+#: Fields that are copied from a task to its record. `repeats` is not: a record holds the number of repeats made.
 _SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)} - {"repeats"}
 
 
@@ -141,7 +142,7 @@ def _get_thread_pools(solver: str) -> Any:
 
 @contextmanager
 def limit_to_one_thread(solver: str = "") -> Iterator[None]:
-    """Limit BLAS and OpenMP to one thread, also the libraries that `solver` brings once it is imported."""
+    """Limit BLAS and OpenMP to one thread, including the libraries that are loaded when `solver` is imported."""
     with _get_thread_pools(solver).limit(limits=1):
         yield
 
@@ -167,7 +168,7 @@ class Outcome:
     ----------
     impulse : (m,) N s
     certificate : (m,) or None
-        With INFEASIBLE.
+        Certificate of infeasibility, if the status is INFEASIBLE.
     status : str
         Name of a Status.
     iterations : int
@@ -236,8 +237,8 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
         with _stabilise_timing(task.solver):
             start_time = perf_counter()
             if task.timing_mode and task.guarded:
-                # A plug-in may not test convergence: run it with its own iteration limit first, as a larger one might
-                # never be reached.
+                # A plug-in may not test convergence and would then use all iterations: run it with its default limit
+                # first.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
                 guard = raise_if_interrupted(
                     _prepare_and_solve(problem, task if tests else replace(task, max_iter=0), impulse)
@@ -254,7 +255,8 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
                     with measure_backend_time(task.solver) as time_in_backend:
                         runs.append(_time_call(problem, task, impulse, guard))
                     backend_times += [sum(time_in_backend)] if time_in_backend else []
-                # When alternating, a quick call is made twice, as a simulator repeats the same call.
+                # A quick call that alternates with others is made twice: the first fills the caches, as in a
+                # simulator.
                 if task.interleave_group:
                     remaining, runs = (
                         remaining if perf_counter() - start_time < MAX_WARM_UP_TIME else 1,
@@ -318,7 +320,7 @@ _LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-level cache hol
 
 
 def measure_calibration_time() -> float:
-    """Return the time [s] of a loop of fixed work, which measures the machine's current speed and uses the caches."""
+    """Return the time [s] of a loop of fixed work, which measures the machine's current speed and fills the caches."""
     start_time = perf_counter()
     total = 0.0
     for i in range(500):
@@ -331,7 +333,7 @@ def measure_calibration_time() -> float:
 def copy_problem_into_new_arrays(problem: Problem, start: str) -> Problem:
     """Copy the problem into newly written arrays, with nothing derived from them, as a simulator leaves it.
 
-    With `start` "cold", its guess is removed, as in the printed call.
+    With `start` "cold", the copy has no guess, as in the printed call.
     """
     rows = None if problem.rows is None else replace(problem.rows, copy=True)
     return replace(problem, rows=rows, guess=None if start == "cold" else problem.guess, copy=True)
@@ -385,7 +387,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     """Prepare and solve a task under its time limit."""
     fresh = replace(problem, copy=False)  # Nothing is derived yet: forming A is part of the set-up.
     arguments = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
-    # The run isolates third-party solvers itself.
+    # The runner has placed third-party solvers in a separate process already.
     prepared = prepare(fresh, task.solver, **{**arguments, **task.options})
     get_reference(fresh)  # The judge's reference energies are computed before the clocks start.
     if task.start == "cold":
@@ -401,7 +403,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
 
 
 def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
-    """Return the record of repeats that ended in the solution `s`."""
+    """Return the record of a measurement whose last repeat returned the solution `s`."""
     setups, solves = outcome.setups, outcome.solves
     times = outcome.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual

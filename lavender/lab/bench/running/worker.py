@@ -41,7 +41,7 @@ GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limi
 
 
 class TaskFailed(LavenderError):
-    """A task returned no solution; `status` is the status of its record, the text says why."""
+    """A task returned no solution. `status` is the status of its record; the message gives the reason."""
 
     def __init__(self, status: str, text: str) -> None:
         super().__init__(f"{status}: {text}")
@@ -65,7 +65,7 @@ class Worker:
     def measure_task(
         self, problem: Problem, task: Task, impulse: Any = None
     ) -> tuple[Record, FloatArray | None]:
-        """Equivalent to `lavender.lab.bench.running.timing.measure_task`, in the worker."""
+        """Make one measurement in the worker; equivalent to `lavender.lab.bench.running.timing.measure_task`."""
         try:
             return judge_outcome(problem, task, self._run_task(problem, task, impulse))
         except TaskFailed as failure:
@@ -94,8 +94,8 @@ class Worker:
             except ProcessEnded as error:
                 cause = f"the worker process ended: {error}"
                 raise TaskFailed(f"{CRASHED} (did not start)", cause) from None
-        # The repeats end when their sum reaches the limit, so no more than two take all of it; some backends read the
-        # clock only every few seconds.
+        # Guarded solve and repeats each take at most the limit, and the last repeat may start just before it: three
+        # limits. Some backends read the clock only every few seconds: add GRACE_TIME.
         limit = 3.0 * task.time_limit + GRACE_TIME
         start_time = time.monotonic()
         new_problem = None if self._problem_hash == task.sha else problem
@@ -139,7 +139,7 @@ def solve_isolated(
     time_limit: float | None = None,
     **options: Any,
 ) -> Solution:
-    """Solve as `lv.solve` does; the worker runs a solver that another process can find by its entry point.
+    """Solve as `lv.solve` does. A solver that another process can import by its entry point runs in the worker.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def solve_isolated(
     """
     spec = registry.get(name)
     if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
-        import_numerics(*spec.requires)  # Otherwise this would be a part of the time of the first solve.
+        import_numerics(*spec.requires)  # Import here, so that the first solve's time does not include it.
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
     Prepared(
         problem, spec, options, begin=False
@@ -168,7 +168,7 @@ def solve_isolated(
     return worker.solve(problem, task)
 
 
-_problem: Problem | None = None  # Used in the worker process: the problem of the last task.
+_problem: Problem | None = None  # Problem of the last task; used only in the worker process.
 
 
 def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.Answer:
@@ -198,7 +198,7 @@ def parse_outcome(
     elapsed : float, s
         Time that the call took, measured here.
     lead : float, s
-        Time that each of `Outcome.times` contains and that passed here before the call.
+        `Task.lead`: time that is included in each of `Outcome.times` but passed in this process before the call.
 
     Raises
     ------

@@ -34,7 +34,7 @@ def check_workers(workers: Any) -> None:
 def map_unordered(
     function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], workers: int, backend: str
 ) -> Iterator[Any]:
-    """Yield the result of `function` for each tuple of arguments as soon as it is known.
+    """Call `function` with each tuple of `arguments` on workers, and yield each result as soon as it is available.
 
     `backend` is a name that `connect_backend` returned. The iteration ends early, without an exception, if workers
     were lost.
@@ -102,10 +102,10 @@ def _end_this_process_with_parent(parent: int) -> None:
 
 @contextlib.contextmanager
 def _ignore_sigint() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which a terminal sends to all of them: this process ends them."""
+    """Ignore SIGINT in processes started in this context. A terminal sends it to all; only this process handles it."""
     from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-    # Each tracker is started only once and would unblock the signal in this process.
+    # Start both resource trackers first: starting one unblocks SIGINT in this process.
     resource_tracker.ensure_running()
     loky_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

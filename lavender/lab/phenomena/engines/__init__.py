@@ -64,7 +64,8 @@ class Stepping:
     def measure_last_step(self) -> tuple[int, float, float]:
         """Return the number of contacts, the largest penetration or joint gap [m], and the relative residual.
 
-        They belong to the last step. The residual is the judge's; it is nan if the engine's problem is not known.
+        The values belong to the last step. The judge computes the residual; it is nan if the engine does not provide
+        its constraint problem.
         """
         raise NotImplementedError
 
@@ -82,13 +83,13 @@ class EngineVariant:
     module : str
         File of this folder.
     package : str
-        Module that it needs; empty for none.
+        Python module or npm package that the engine needs; empty if none.
     options : mapping
         Options of `Engine`.
     text : str
         Description of the settings.
     scene : mapping
-        Scene parameters that it prescribes, for lavender's own steppers.
+        Scene parameters that the variant sets, such as the stepper of LavenderSim.
     cannot : mapping of str to str
         Unsupported feature of a scene -> reason.
     """
@@ -102,7 +103,7 @@ class EngineVariant:
     cannot: Mapping[str, str] = field(default_factory=dict)
 
     def explain_missing(self) -> str:
-        """Return the reason why it cannot run here; empty if it can."""
+        """Return the reason why the variant cannot run here; empty if it can."""
         hint = get_missing_installation_command(self.package)
         return f"not installed: {hint}" if hint else ""
 
@@ -225,7 +226,10 @@ def make_engine(variant: EngineVariant, scene: Scene) -> Stepping:
 
 
 def record_track(engine: Stepping, seconds: float, interval: float) -> Track:
-    """Step an engine for `seconds` and record a state every `interval` [s], in whole steps, up to one not finite."""
+    """Step an engine for `seconds` [s] and record its state every `interval` [s], rounded to whole steps.
+
+    The recording ends after the first state that is not finite.
+    """
     steps_per_sample = max(1, round(interval / engine.dt))
     samples = max(2, int(np.ceil(seconds / (steps_per_sample * engine.dt) - 1e-9)))
     states, cpu_time, n_steps = [engine.get_state()], 0.0, 0

@@ -29,8 +29,8 @@ class Engine(Stepping):
     sweeps, substeps : int
     dt : float, s
     bodies : bool
-        True: bodies in maximal coordinates if there are no joints, joints as constraints between bodies, and all sweeps
-        are made. False: Bullet's defaults, and joints of a tree.
+        True: joints are constraints between bodies, bodies of scenes without joints are in maximal coordinates, and no
+        sweep is skipped. False: joints connect the links of one multibody, with Bullet's defaults.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Engine(Stepping):
         return int(created)
 
     def _add_single_body(self, i: int) -> None:
-        """Create a body without a joint of a tree."""
+        """Create a body that is not a link of the multibody."""
         body = self.scene.bodies[i]
         created = pybullet.createMultiBody(
             body.mass, self._create_shape(body), basePosition=body.position.tolist(),
@@ -94,7 +94,7 @@ class Engine(Stepping):
 
     def _add_constraint(self, joint: Joint) -> None:
         """Create a joint as a constraint between two bodies."""
-        # The world is body -1 and must be the second; anchors are in the frames of their bodies.
+        # Bullet requires that the world, body -1, is the second body. Each anchor is in the frame of its body.
         world_first = joint.a < 0
         first, second = (joint.b, joint.a) if world_first else (joint.a, joint.b)
         anchors = (joint.anchor_b, joint.anchor_a) if world_first else (joint.anchor_a, joint.anchor_b)
@@ -113,7 +113,7 @@ class Engine(Stepping):
         for i in order:
             joint = self.up[i]
             parent = None if joint.a < 0 else self.scene.bodies[joint.a]
-            # From the parent's centre.
+            # Position of the link's frame relative to the parent's centre of mass.
             anchor_in_parent = np.zeros(3) if joint.a < 0 else self.up[joint.a].anchor_b
             _, q = compute_relative_pose(parent, self.scene.bodies[i])
             if abs(abs(q[0]) - 1.0) > 1e-12 and joint.a >= 0:

@@ -46,7 +46,7 @@ DISSIPATION = 10.0  # [s/m] Hunt-Crossley dissipation of hydroelastic contacts.
 
 
 class Engine(Stepping):
-    """`Simulator.AdvanceTo` with steps of 1 ms."""
+    """Engine that steps a scene with Drake's `Simulator.AdvanceTo` in steps of 1 ms."""
 
     def __init__(self, scene: Scene, approximation: str, hydroelastic: bool) -> None:
         self.scene, self.hydroelastic, self.dt = scene, hydroelastic, 1e-3

@@ -28,7 +28,7 @@ def _make_engine_axes(up: FloatArray) -> FloatArray:
 
 
 class Engine(Stepping):
-    """`CodeSceneEnv.step`, 1/60 s by default; the engine divides it into substeps of 1/240 s."""
+    """Engine that calls `CodeSceneEnv.step`, by default with 1/60 s, which it divides into substeps of 1/240 s."""
 
     def __init__(self, scene: Scene, sweeps: int, dt: float = 1.0 / 60.0) -> None:
         self.scene, self.dt = scene, dt

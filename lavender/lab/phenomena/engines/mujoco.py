@@ -27,7 +27,7 @@ def _format_numbers(x: Any) -> str:
 
 
 def _make_equality_constraint(joint: Joint) -> str:
-    """Build the equality constraint of a joint: the first body must not be the world, the anchor is in its frame."""
+    """Build the MJCF equality constraint of a joint; its first body is not the world, and its frame has the anchor."""
     first, second, anchor = (
         (joint.b, joint.a, joint.anchor_b) if joint.a < 0 else (joint.a, joint.b, joint.anchor_a)
     )
@@ -138,7 +138,7 @@ class Engine(Stepping):
         return int(d.ncon), depth, residual(self.read_last_problem(), impulse(self.model, d)).relative
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.get_state`; velocities are computed for the time of the poses."""
+        """See `Stepping.get_state`; velocities are evaluated at the same time as the poses."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_comVel(self.model, self.data)

@@ -20,7 +20,7 @@ SUBSTEPS = 4
 
 
 class Engine(Stepping):
-    """`collide` and `step`, SUBSTEPS times in 1/60 s."""
+    """Engine that calls Newton's `collide` and `step` SUBSTEPS times in 1/60 s."""
 
     def __init__(self, scene: Scene, solver: str, **options: float) -> None:
         self.scene, self.up, self.dt = scene, map_bodies_to_parent_joints(scene, "newton"), 1.0 / 60.0

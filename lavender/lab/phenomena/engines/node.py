@@ -1,4 +1,4 @@
-"""Engines that npm installs: the Node program `served.mjs` steps them, each by its own file in this folder."""
+"""Engines from npm packages. The Node program `served.mjs` steps them; each engine has a file in this folder."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class JsonLines:
         """Return the answer to a message; EOFError if the program ended, ValueError if the answer is not JSON."""
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
-        with contextlib.suppress(OSError):  # The program ended without an answer.
+        # Writing fails if the program has ended; reading its answer then raises.
+        with contextlib.suppress(OSError):
             requests.write(json.dumps(message) + "\n")
             requests.flush()
         line = answers.readline()
@@ -133,5 +134,6 @@ def _describe_body(body: Body, engine: str) -> dict[str, Any]:
         "quaternion": quaternion,
         "velocity": body.velocity.tolist(),
         "spin": body.angular_velocity.tolist(),
-        "still": [*position, *quaternion, *[0.0] * 6],  # The state of a body that does not move.
+        # State of the body at its initial pose with zero velocity.
+        "still": [*position, *quaternion, *[0.0] * 6],
     }

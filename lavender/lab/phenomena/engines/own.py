@@ -11,7 +11,7 @@ from lavender.sim.scene import Scene
 
 
 class Engine(Stepping):
-    """`Simulation.step` and its observation."""
+    """Engine that steps a scene with `Simulation.step`."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.sim = scene, Simulation(scene)

@@ -33,7 +33,8 @@ def map_bodies_to_parent_joints(scene: Scene, engine: str) -> dict[int, Joint]:
 def get_collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
     """Return the collision shape of a body.
 
-    Raises CapabilityError if it has none, or if a static body has another shape than a plane, unless `static`.
+    Raise CapabilityError if the body has no shape. If `static` is false, raise it also for a static body whose shape
+    is not a plane.
     """
     shape = body.shape
     if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
