@@ -1,7 +1,8 @@
 """Arrays of many problems (worlds), as trainers and engines store them, without an object for each world.
 
-`lavender.solve_many(batch)` solves them, `lavender.residual_many(batch, impulses)` judges impulses; `batch[i]` is a
-`Problem`. Arrays of float32 or float64 are read in place; data of a world are derived when it is solved.
+`lavender.solve_many(batch)` solves the problems, `lavender.residual_many(batch, impulses)` judges impulses, and
+`batch[i]` is a `Problem`. Arrays of float32 or float64 are read in place. Arrays derived from a world's data, such as
+A, are computed when the world is solved.
 """
 
 from __future__ import annotations
@@ -44,23 +45,24 @@ BODY_PAIRS = ("joint_body", "contact_body")
 class Batch(Sequence[Problem]):
     """n problems in generalised coordinates, w = J v+ - target + compliance lambda, stored in a few arrays.
 
-    There are three layouts: stacked (all worlds of one size), padded (with `count`) and ragged (with `row_ptr`, arrays
-    of all rows). Arrays of float32 and float64 in which each world is stored row by row are read in place; they must
-    not change while results are read. Other arrays are copied. If J, M and v_free are float32, `precision` is
-    "float32".
+    There are three layouts: stacked (all worlds have the same number of rows), padded (with `count`: rows beyond a
+    world's count are ignored) and ragged (with `row_ptr`: the rows of all worlds are concatenated). Arrays of float32
+    and float64 in which each world is stored row by row are read in place; they must not change while results are
+    read. Other arrays are copied. If J, M and v_free are float32, `precision` is "float32".
 
     Parameters
     ----------
     J : (n, m, nv), ragged (rows of all worlds, nv), or with `velocity_ptr` one array of all entries
         Rows in the order of the cones.
     M : (n, nv, nv), (nv, nv) for all worlds, or one array of all entries
-        Or lower triangles in compressed rows with one pattern, as in MuJoCo: (values (n, entries), indices, indptr),
-        columns ascending in each row and the diagonal last.
+        It may also be given as lower triangles in compressed rows with one pattern, as in MuJoCo: (values (n,
+        entries), indices, indptr), with columns ascending in each row and the diagonal last.
     v_free : (n, nv), or one array (with `velocity_ptr`), m/s, rad/s
     target : scalar, (m,), (n, m), or ragged one array of all rows, m/s
     cones : Cones, or a sequence of n of them
         Blocks of each world, or of the concatenated rows of all worlds, without padding rows.
-    compliance : as target, 1/kg, optional
+    compliance : 1/kg, optional
+        Shapes as for `target`.
     mu : (n, k) or ragged one array of all blocks, optional
         Coefficients of friction of each world, which replace `cones.mu`.
     friction : {"coulomb", "cone"}
@@ -69,7 +71,8 @@ class Batch(Sequence[Problem]):
     row_ptr : (n + 1,) int, optional
         First row of each world, followed by the number of rows.
     velocity_ptr : (n + 1,) int, optional
-        First velocity of each world, followed by their number, if worlds have different numbers; with `row_ptr`.
+        First velocity of each world, followed by the number of all velocities. Needed, together with `row_ptr`, if
+        worlds have different numbers of velocities.
 
     Raises
     ------
@@ -144,7 +147,7 @@ class Batch(Sequence[Problem]):
             raise InputError(f"J has shape {jac.shape}; (n, m, nv) is needed, or with row_ptr (rows, nv)")
         self._n, self.friction = n, friction
         self.precision = get_common_precision(*(np.asarray(x) for x in (jac, mass, free)))
-        # (n, columns of PLACE): offsets and sizes of each world.
+        # Offsets and sizes of each world: a row for each world, the columns by the names in PLACE.
         self.at = at = np.zeros((n, len(PLACE)), np.int64)
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
@@ -208,8 +211,8 @@ class Batch(Sequence[Problem]):
         Parameters
         ----------
         fields : mapping
-            `inv_mass` (n, bodies), `v_free` (n, bodies, 6), `normal` (n, c, 3), ... An array with the dimensions of one
-            world, such as `contact_body` (c, 2), is used for all worlds. At least one array is stacked.
+            `inv_mass` (n, bodies), `v_free` (n, bodies, 6), `normal` (n, c, 3), ... An array with the dimensions of
+            one world, such as `contact_body` (c, 2), is used for all worlds. At least one array is stacked.
         **bounds
             `target`, `mu`, ..., each (m,) for all worlds or (n, m); and keywords such as friction.
 
@@ -389,7 +392,7 @@ class Batch(Sequence[Problem]):
             dense[row, col] = dense[col, row] = array[first : first + len(col)]
             return dense
         if self._arrays[1] is None:
-            nv = m  # The first array is A.
+            nv = m  # In a batch of matrices, the first array is A (m, m) instead of J (m, nv).
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
             size = array.itemsize
@@ -456,7 +459,7 @@ class Batch(Sequence[Problem]):
             return None
         if "mu" in stacked and (mu.shape[1] != rows.n_contacts or ((mu > 0.0) != (mu[0] > 0.0)).any()):
             return None
-        # Arrays of the first world. They are used for all worlds unless a stacked array is given.
+        # Arrays of the first world, which are used for all worlds unless they are stacked.
         of_first: dict[str, Any] = {name: getattr(rows, name) for name in (*BODY_FIELDS, *BODY_PAIRS)}
         goal = 0.0 if "target" in stacked else more.get("target", 0.0)
         of_first["target"] = np.array(np.broadcast_to(goal, first.m), float)
@@ -545,7 +548,7 @@ def check_row_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray
 
 
 def _make_flat_memory_view(x: np.ndarray) -> np.ndarray:
-    """Return a flat view of all memory that an array spans; its strides must be multiples of an item from 0 up."""
+    """Return a flat view of the memory that an array spans; strides must be multiples, 0 or more, of the item size."""
     if not x.size:
         return np.zeros(0, x.dtype)
     length = 1 + sum((n - 1) * s // x.itemsize for n, s in zip(x.shape, x.strides, strict=True))
@@ -580,9 +583,9 @@ def _flatten_matrices(
 
 
 def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Return vectors of n worlds as a flat array, and their offsets; a scalar or a single vector is for all worlds.
+    """Return vectors of n worlds as a flat array, and their offsets; a scalar or a single vector serves all worlds.
 
-    `size`: size of every vector; None if the vectors are concatenated and have the sizes `sizes` (n,).
+    `size` is the size of every vector, or None if the vectors are concatenated and have the sizes `sizes` (n,).
     """
     x = as_float_array(name, value)
     if x.ndim == 0:
@@ -598,7 +601,7 @@ def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any
 
 
 def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Return the concatenated numbers of all worlds, and their offsets."""
+    """Return the concatenated numbers of all worlds as a flat array, and the offset of each world in it."""
     total = int(np.sum(sizes))
     if x.size != total:
         raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")

@@ -1,7 +1,8 @@
-"""Residuals of many worlds in one call, bit-identical to single calls of `residual`, in arrays.
+"""Residuals of many worlds in one call, as arrays, bit-identical to single calls of `residual`.
 
-One compiled loop processes the worlds of a `Batch`, or problems in generalised coordinates; threads share the worlds by
-an atomic counter. Every other problem is handled by a single call. `lavender/batch/solve.py` solves with the same loop.
+One compiled loop processes the worlds of a `Batch`, or problems in generalised coordinates. Each thread takes the next
+world from an atomic counter. Every other problem is judged by a call of `residual`. `lavender/batch/solve.py` solves
+with this loop, too.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
 
 class WorldResults:
-    """n worlds and their judged numbers.
+    """Judged residuals of n worlds: base class of `Residuals` and `Solutions`.
 
     All arrays are read-only, or copies in the library of `like`.
 
@@ -62,7 +63,8 @@ class WorldResults:
         self._convert = find_converter(like)
         self.problems: Sequence[Problem] = problems
         self.faults: dict[int, LavenderError] = {}
-        self._invalid_starts: dict[int, LavenderError] = {}  # These worlds start from the zero impulse.
+        # Worlds with an invalid start begin at the zero impulse.
+        self._invalid_starts: dict[int, LavenderError] = {}
         if isinstance(problems, Batch):
             at = problems.at
             self._sizes, self._first = at[:, PLACE["rows"]], at[:, PLACE["row"]]
@@ -123,7 +125,7 @@ class WorldResults:
         return mark_read_only(self._worlds.numbers[NUMBER[which], :-1])
 
     def _judge_late_worlds(self) -> None:
-        """Judge worlds that were not judged during the call; a derived class may have some."""
+        """Judge worlds that were not judged during the call; a derived class overrides this if it has such worlds."""
 
     def _get_rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
@@ -197,7 +199,8 @@ class WorldResults:
 
         run_on_threads(work, min(threads, len(self)))
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
-            try_single(i, bytearray(1))  # This single call raises an error with a message.
+            # Repeat the invalid world by a single call, which raises the complete error.
+            try_single(i, bytearray(1))
         if self.faults and errors == "raise":
             raise self.faults[min(self.faults)]
         self.faults.update(self._invalid_starts)
@@ -232,7 +235,8 @@ class Residuals(WorldResults):
         self.precision, self.threshold = precision, threshold
         if not isinstance(problems, Batch):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
-        self._nothing_to_do: dict[int, bool] = {}  # Values of the worlds that single calls processed.
+        # `Residual.nothing_to_do` of the worlds that single calls processed.
+        self._nothing_to_do: dict[int, bool] = {}
 
     @cached_property
     def verdict(self) -> np.ndarray:
@@ -349,7 +353,7 @@ def residual_many(
     residuals._process_worlds(
         lambda hand: int(hand.judge(TOL, is_single_precision)), judge_single, threads, errors
     )
-    for i, precision in enumerate(precisions):  # The compiled loop judges the problems of a list for float64.
+    for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.
         if precision == "float32" and not is_single_precision and i not in residuals.faults:
             judge_single(i)
     return residuals

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Solutions", "solve_many"]
 
-# Worlds that are not started before the deadline are late: their start is judged.
+# Worlds that are not started before the deadline are called late. Their start is their answer.
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
@@ -94,9 +94,9 @@ class Solutions(WorldResults, Sequence[Solution]):
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
-        self._late_worlds: list[int] = []  # Worlds with a start that is not judged yet.
+        self._late_worlds: list[int] = []  # Late worlds with a start that is not judged yet.
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
-        # The loop overwrites the starts of a batch.
+        # Keep a copy of the starts of a batch, because the loop overwrites them.
         self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -188,7 +188,7 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     def _judge_late_worlds(self) -> None:
         """Judge the starts of late worlds."""
-        # Another thread may compute this at the same time; its numbers are the same.
+        # Another thread may judge the same worlds at the same time; it stores equal numbers.
         for i in self._late_worlds:
             try:
                 self.store_solution(i, self._get_result(i))
@@ -217,7 +217,8 @@ class Solutions(WorldResults, Sequence[Solution]):
             rows, columns = (
                 self.problems.at[:, PLACE[name]].astype(float) for name in ("rows", "velocities")
             )
-            entries = np.where(columns > 0.0, columns, rows)  # Entries of a row of J, or of A.
+            # Number of entries in a row of J, or of A for a matrix.
+            entries = np.where(columns > 0.0, columns, rows)
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
             return float(RATES["judged late world"] * len(rows) + RATES["judge entry"] * products)
         return sum(
@@ -278,14 +279,14 @@ class Solutions(WorldResults, Sequence[Solution]):
         )
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
-        """Compute the fields of a solution that are not needed before its first use."""
+        """Compute the fields of a solution that are computed only at its first access."""
         problem = self.problems[i]
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if is_start else self._get_counts(problem, i)
         fields = compute_postponed_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
-        # Equal data have bit-identical residuals.
+        # If the data have not changed since the solve, both residuals are bit-identical.
         if status is Status.CONVERGED and judgement.relative != solved_relative:
             fields["claim_check"] = CONTRADICTED
             fields["status_conflict"] = (
@@ -329,16 +330,17 @@ def solve_many(
     impulses : sequence of (m,) N s, optional
         For problems: warm start of each, or None. Default: as for `solve`.
     threads : int
-        Number of worlds that are solved at the same time. Each thread starts the next world that no thread has started.
+        Number of worlds that are solved at the same time. Each thread starts the next world that no thread has
+        started.
     tol, max_iter, **options
         As for `solve`.
     velocity_tol : float, optional, m/s
         Velocity error to reach on every row, in place of `tol`. All worlds are solved to the relative residual that
         guarantees it in the world with the largest velocity error of the zero impulse.
     time_limit : float, optional, s
-        Limit of the wall-clock time of the whole call. Worlds are solved in order, each with all of the remaining time.
-        Worlds that are not started in time keep their start and have the status TIME_LIMIT. In a batch, their data may
-        not be checked before their numbers are read.
+        Limit of the wall-clock time of the whole call. Worlds are solved in order, each with all of the remaining
+        time. Worlds that are not started in time keep their start and have the status TIME_LIMIT. In a batch, their
+        data may not be checked before their numbers are read.
     errors : {"raise", "status"}
         For worlds with invalid data or an invalid start (NaN, an M that is not definite, a negative mu): raise the
         error of the first one, or give them the status INVALID_PROBLEM and store the errors in `Solutions.faults`.
@@ -392,8 +394,8 @@ def solve_many(
         )
 
     def solve_single(i: int) -> None:
-        # The problem of the first late world of a batch is built, so that a solver that does not accept it raises an
-        # error. The problems of other late worlds are not built.
+        # Build the problem of the first late world only, so that a solver that does not accept the batch's problems
+        # raises an error.
         is_further_world = (
             isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
         )
@@ -434,7 +436,7 @@ def _compute_tolerance_for_velocity_error(worlds: Any, velocity_tol: float) -> f
     """Return the relative residual that guarantees a velocity error [m/s] in every valid world."""
     velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if isinstance(worlds, Batch):
-        # The references do not depend on the judged impulse.
+        # The velocity error of the zero impulse does not depend on the impulse that is judged.
         references = residual_many(worlds, np.zeros(worlds.shape), errors="status").velocity_at_zero
     else:
         references = np.array([residual(p, p.start()).velocity_at_zero for p in worlds if p.m], float)

@@ -7,7 +7,7 @@ import sys
 
 from lavender.base import early_sigint as _early_sigint
 
-_early_sigint.exit_on_sigint()  # `main` restores the handler.
+_early_sigint.exit_on_sigint()  # Ctrl-C during imports exits quietly; `main` restores Python's handler.
 
 from lavender.base.errors import InputError, require_packages  # noqa: E402
 
@@ -15,7 +15,8 @@ try:
     require_packages("the command line", "click", "rich", "threadpoolctl")
 except InputError as error:
     sys.stderr.write(f"lavender: {error}\n")
-    raise SystemExit(2) from None  # EXIT_BAD_INPUT, which is defined in a module that needs click
+    # The value of EXIT_BAD_INPUT, whose module cannot be imported without click.
+    raise SystemExit(2) from None
 
 from lavender.cli.entry import cli, main  # noqa: E402
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET  # noqa: E402

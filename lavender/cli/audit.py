@@ -21,7 +21,7 @@ from lavender.cli.options import (
 )
 from lavender.io.stored import lock_output
 
-DEFAULT_CLAIM_WORLDS = 8  # Worlds of engines whose claims are compared: they step all worlds at once.
+DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, which step all worlds at once.
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""Define the group of all commands, and the entry point, which turns exceptions into exit codes."""
+"""Define the group of all commands and the entry point `main`, which converts exceptions to exit codes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COMMANDS = {
 
 
 class Commands(click.Group):
-    """Group of commands, each of which is imported when it is used."""
+    """Group of all commands. The module of a command is imported when the command is used."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Reject an empty argument, which would mean the current folder, then parse as click does."""
@@ -69,7 +69,7 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command; an unknown name raises UnknownName."""
         if cmd_name not in COMMANDS:
-            if not ctx.resilient_parsing:  # True while a shell completes words.
+            if not ctx.resilient_parsing:  # While a shell completes words, unknown names raise no error.
                 raise UnknownName("command", cmd_name, COMMANDS)
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
@@ -117,7 +117,10 @@ DEFAULT_SIGNAL_HANDLERS: dict[int, Any] = {
 
 @contextlib.contextmanager
 def _record_signals() -> Iterator[list[int]]:
-    """Note the signals that arrive; C libraries replace the exception of a signal by an error of their own."""
+    """Yield a list to which the numbers of received signals are appended.
+
+    The list is needed because C libraries may replace the exception of a signal by an error of their own.
+    """
     received: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -127,7 +130,7 @@ def _record_signals() -> Iterator[list[int]]:
         signal.default_int_handler(number, frame)
 
     for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
-        with contextlib.suppress(ValueError):  # Raised outside the main thread.
+        with contextlib.suppress(ValueError):  # Handlers can only be set in the main thread.
             if signal.getsignal(number) is handler:
                 signal.signal(number, note)
     try:
@@ -141,7 +144,8 @@ def _record_signals() -> Iterator[list[int]]:
 def _run_command(args: Sequence[str] | None) -> int:
     """Run a command, print the error that ended it, and return the exit code."""
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # Closed by the caller: the next file would get its descriptor.
+        # The caller closed the stream: without this, the next file gets its descriptor.
+        if getattr(sys, name) is None:
             null_device = os.open(os.devnull, os.O_WRONLY)
             setattr(sys, name, open(null_device, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - never closed
     for stream in (sys.stdout, sys.stderr):
@@ -164,7 +168,7 @@ def _run_command(args: Sequence[str] | None) -> int:
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit):
-        # The reader has closed the pipe (`lavender solvers | head`); click and rich raise SystemExit then.
+        # The reader has closed the pipe (`lavender solvers | head`), for which click and rich raise SystemExit.
         discard_output()
         code = 0
     except MemoryError as error:

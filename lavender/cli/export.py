@@ -38,7 +38,7 @@ def export(
 
     if records is None:
         reject_unused_options(context, ["solver"], "without --records")
-    context.with_resource(lock_output(folder, folder=True))  # Locked before the test vectors are solved.
+    context.with_resource(lock_output(folder, folder=True))  # Lock the folder before the long computation.
     more = vectors.make_export_files(records, solver, MAX_TEST_PROBLEMS) if records is not None else {}
     written = library.write(folder, more=more, replace=replace)
     print_escaped(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

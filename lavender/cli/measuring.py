@@ -35,7 +35,7 @@ MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time
 
 @dataclass(frozen=True)
 class Measured:
-    """Records of a command, measured now or read from its output folder.
+    """Records of a measuring command, measured by this call or reused from its output folder.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Measured:
 
     @property
     def reuse_note(self) -> str:
-        """Sentence on reused records; empty if all were measured now."""
+        """Sentence on the number of reused records; empty if this call measured all records."""
         if not self.reused:
             return ""
         return f"{self.reused} of {len(self.records)} runs of {self.since} reused; --no-reuse measures again"
@@ -83,7 +83,7 @@ def check_named_problems_load(items: Sequence[Item]) -> None:
 
 
 def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
-    """Make a plan of the options of `plan_options`; options that are None keep the default of the plan.
+    """Make a plan of class `kind` from the values of `PLAN_OPTIONS`; options that are None keep the plan's default.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
 
 
 def is_campaign(context: click.Context) -> bool:
-    """Return whether workers measure error and robustness without times."""
+    """Return whether the options ask for a campaign: workers that measure errors and robustness but no times."""
     return is_option_set(context, "workers") or is_option_set(context, "backend")
 
 
@@ -116,7 +116,7 @@ def measure_files(
 
     limit_to_one_thread()
     options = context.params
-    bench.select_solver_names(options["solvers"])  # An unknown name is an error before a problem is loaded.
+    bench.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
     campaign, names = is_campaign(context), list(files)
     more: dict[str, Any] = {}
     plan: Plan
@@ -174,7 +174,7 @@ def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: S
         if options["sequence_time_limit"] is not None
         else {}
     )
-    # Without files, the short limit measures the whole suite in a minute.
+    # Without files, the built-in suite runs; with the shorter time limit it takes about a minute.
     limits["time_limit"] = (
         (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
     )
@@ -197,7 +197,7 @@ def show_page(page: SummaryPage, folder: Path) -> None:
 
 @contextlib.contextmanager
 def show_progress() -> Iterator[Callable[[Event], None]]:
-    """Yield a callback that shows progress: a bar on a terminal, otherwise a line of stderr now and then."""
+    """Yield a callback that shows progress: a bar on a terminal, otherwise a line on stderr every few seconds."""
     to = make_console(stderr=True)
     if not to.is_terminal:
         yield _print_progress_lines()
@@ -212,7 +212,7 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
         TextColumn("{task.fields[what]}", markup=False),
         console=to,
         transient=True,
-        refresh_per_second=4,  # Drawing takes processor time from the measurement.
+        refresh_per_second=4,  # Drawing more often would take processor time from the measurement.
     ) as bar:
         task = bar.add_task("", total=None, what="", remaining="")
         began = time.monotonic()
@@ -243,7 +243,7 @@ def _print_progress_lines() -> Callable[[Event], None]:
 
 
 def format_remaining_time(event: Event, elapsed: float) -> str:
-    """Return a phrase such as "about 40 s remain" after `elapsed` seconds; empty if nothing is known yet."""
+    """Return a phrase such as "about 40 s remain", or an empty text if `elapsed` [s] is too short for an estimate."""
     remaining = event.remaining
     if remaining is None:
         if not (event.total and event.done and elapsed >= MIN_ELAPSED):

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from lavender.lab.bench import Item
 
-    _ParamType = click.ParamType[Any]  # Generic for type checkers since click 8.2, but not in click 8.1.
+    # Type checkers need the generic form of click 8.2, which 8.1 does not have.
+    _ParamType = click.ParamType[Any]
 else:
     _ParamType = click.ParamType
 
@@ -32,7 +33,7 @@ MIN_TERMINAL_WIDTH = 60  # [columns] Tables are formatted for at least this widt
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-Option = tuple[tuple[str, ...], dict[str, Any]]  # Names of an option, and its arguments of `click.option`.
+Option = tuple[tuple[str, ...], dict[str, Any]]  # Positional (names) and keyword arguments of `click.option`.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -52,7 +53,7 @@ RENAMED_OPTIONS = {
 
 
 def suggest_new_option(error: click.NoSuchOption) -> None:
-    """Let the message of an unknown option suggest its present name, if the command has an option of that name."""
+    """Make the error about a renamed option suggest its present name, if the command has the renamed option."""
     new_name = RENAMED_OPTIONS.get(error.option_name)
     command = error.ctx.command if error.ctx is not None else None
     if command is not None and any(new_name in option.opts for option in command.params):
@@ -81,7 +82,8 @@ def _is_solver_name(word: str) -> bool:
     if Path(word).exists():
         return False
     names = {family.partition("(")[0] for family in suite.families()}
-    # A word that is neither a case nor a path is a misspelt solver name; it is rejected as such later.
+    # A word that is neither a case nor a path counts as a misspelt solver name, for which a later check raises an
+    # error.
     return word in registry.specs() or not (word in names or set(word) & set("(*?[/\\."))
 
 
@@ -154,13 +156,16 @@ class SeedRange(_ParamType):
 
 
 def limit_to_one_thread() -> None:
-    """Limit libraries that are loaded later to one thread; loaded ones are limited during timing."""
+    """Limit numerical libraries that are loaded later to one thread.
+
+    `lavender.lab.bench.running.timing` limits libraries that are loaded already, while it measures.
+    """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
 
 
 def make_console(stderr: bool = False) -> Console:
-    """Return a console that never cuts names; in a file or pipe, lines are as long as the tables need."""
+    """Return a console that does not cut off names; in a file or pipe, lines are as long as the tables need."""
     from rich.console import Console
 
     has_width = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
@@ -216,7 +221,7 @@ def add_worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[...
 
 
 def reject_unused_recording_options(context: click.Context, recorded: bool) -> None:
-    """Raise InputError for options of a recording that would be ignored."""
+    """Raise InputError if options of a recording are set although no MuJoCo model is recorded (`recorded` is false)."""
     if not recorded:
         reject_unused_options(context, RECORDING_NAMES, "without a MODEL.xml")
     elif context.params["control"] != "random":
@@ -283,7 +288,8 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
                      "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
                      "arrays of MjData, such as `lavender audit` writes. keyframes: the keyframes of the model."}),
 )  # fmt: skip
-RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")  # Parameter names.
+# Parameters of RECORDING_OPTIONS.
+RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
 #: Options of the commands that measure, as fields of `lavender.lab.bench.Plan`.
@@ -349,13 +355,16 @@ def print_escaped(text: str, err: bool = False, style: str = "") -> None:
 
 
 def exit_after_interrupt() -> NoReturn:
-    """Exit a command after Ctrl-C, once the completed part is written."""
+    """Exit with the code of Ctrl-C. Commands call this after they have written the completed part."""
     print_escaped("Stopped: the results contain only the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
 class ErrorReporter:
-    """Context manager of each problem of a command: it prints the errors of a problem and sets the exit code."""
+    """Handles the errors of the problems of a command: it prints them and determines the exit code.
+
+    An instance is called with each problem and returns a context manager for the work on it.
+    """
 
     def __init__(self, report: Callable[[str], Any] | None = None) -> None:
         self.report = report or partial(print_escaped, err=True)
@@ -363,7 +372,7 @@ class ErrorReporter:
 
     @contextlib.contextmanager
     def __call__(self, item: Item) -> Iterator[None]:
-        """Run the block for one problem and release its memory at the end."""
+        """Print errors that the block raises for one problem, and release the problem's memory at the end."""
         try:
             yield
         except LavenderError as error:
@@ -374,7 +383,7 @@ class ErrorReporter:
             item.release_problem()
 
     def exit(self, unmet: Any = False) -> None:
-        """Exit with 2 if a named problem could not be read, with 1 after another error or if `unmet`."""
+        """Exit with 2 if a named problem could not be read, else with 1 after another error or if `unmet` is true."""
         if code := self.code or (EXIT_UNMET if unmet else 0):
             raise click.exceptions.Exit(code)
 

@@ -130,7 +130,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
         measured = measure_files(context, files, path, sweeps)
     engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.select_latest_run())
     shown = Report(measured.records, old, options["time_budgets"], sweeps, engines)
-    # The files are written first: a closed pipe can end the command while it prints.
+    # Write the files before printing, as a closed pipe can end the command while it prints.
     index = write(shown, out, figures=not options["no_figures"])
     paper = None
     if options["paper"]:
@@ -178,7 +178,8 @@ def _reject_unused_options(
     else:
         reject_unused_options(context, ["seeds"], "without --workers")
     reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))
-    if not any(f.endswith(".jsonl") for f in files):  # Records may hold solvers that are not installed.
+    # Records may contain solvers that are not installed here.
+    if not any(f.endswith(".jsonl") for f in files):
         reject_options_without_effect(context, solvers)
 
 
@@ -221,7 +222,8 @@ def _record_model(
         }
     )
     if not reuse or not settings_file.is_file() or settings_file.read_text(encoding="utf-8") != settings:
-        settings_file.unlink(missing_ok=True)  # An interrupted recording is not reused.
+        # Without the settings file, a recording that is interrupted now will not be reused.
+        settings_file.unlink(missing_ok=True)
         print_escaped(str(record_file(path, folder, **recording, replace=True)))
         write_text(settings_file, settings)
     return str(folder)
@@ -247,7 +249,7 @@ def _list_modification_times(path: Path, controls: str, states: str | None) -> l
         return times
     with contextlib.suppress(
         ValueError, RuntimeError, FatalError
-    ):  # An invalid model is reported when it is read.
+    ):  # Ignore an invalid model here; reading it raises the error.
         others = (*sorted(mju_getXMLDependencies(str(path))), controls, states or "")
         times += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
     return times

@@ -134,7 +134,7 @@ def run(
         def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
                 show(format_step(step, observation, info))
-            if viewer is not None:  # Not faster than real time.
+            if viewer is not None:  # A viewer shows the simulation in real time: wait for the clock.
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
         result = run_simulation(simulation, steps, record=record, replace=replace, watch=show_step)
@@ -189,5 +189,6 @@ def _collect_parameters(
             )
         solver_options["velocity_tol"] = velocity_tol
     if not own_sweeps and "order" in values:
-        solver_options["order"] = values.pop("order")  # A solver without sweep orders rejects it.
+        # Pass the order as an option of the solver; a solver without sweep orders rejects it.
+        solver_options["order"] = values.pop("order")
     return values | ({"solver_options": solver_options} if solver_options else {})

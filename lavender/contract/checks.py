@@ -50,14 +50,15 @@ __all__ = [
 #: Backends of other packages that must solve every example. Any other backend may fail if its result reports it.
 REQUIRED_BACKENDS = frozenset({"osqp", "clarabel", "piqp", "daqp", "clarabel_cone"})
 OWN_TOLERANCE = 1e-8  # [-] Relative residual that a solver must reach on well-posed problems.
-BACKEND_TOLERANCE = 1e-6  # [-] The same for code of another project (`SolverSpec.external`).
+BACKEND_TOLERANCE = 1e-6  # [-] Value of OWN_TOLERANCE for code of another project (`SolverSpec.external`).
 MAX_CONDITION = 1e3  # [-] An impulse error of tol moves the slack of the examples by at most this multiple.
 MIN_BUDGET = 20_000  # Iterations that a resumable solver may use on a well-posed problem.
-HISTORY_COUNTS = [*range(17), 18, 20, 22, 24, 27, 30, 33, 37, 40]  # Iterations that a history of 40 records.
-CHECKED_DRAWS = 30  # Random small problems that are compared with all their solutions.
-MAX_DRAWN_ROWS = 6  # Rows of these problems; finding all solutions takes a time that grows as 3^rows.
+HISTORY_COUNTS = [*range(17), 18, 20, 22, 24, 27, 30, 33, 37, 40]  # Iterations recorded in a solve of 40.
+CHECKED_DRAWS = 30  # Number of random small problems for which claims are compared with all solutions.
+# Largest number of rows of the random problems; finding all solutions takes a time ~ 3^rows.
+MAX_DRAWN_ROWS = 6
 THREADS = 4
-#: The residual that decides about a claim of CONVERGED is the judge's, whatever the solver's own test measures.
+#: Remedy in messages about false claims: the judge's residual decides, whatever the solver's own test measures.
 STOP_TEST_REMEDY = (
     ". Claim CONVERGED only if lv.residual(problem, impulse).relative <= tol, or if the solver's own test implies "
     "this"
@@ -65,7 +66,7 @@ STOP_TEST_REMEDY = (
 
 
 class ContractError(AssertionError):
-    """A solver does not meet a requirement; the text is a sentence that says how."""
+    """A solver does not meet a requirement; the message is a sentence with the problem and the wrong result."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,13 @@ class Check:
     ----------
     name : str
     requirement : str
-        The sentence that a solver must make true.
+        The requirement as a sentence.
     applies_to : str
-        Solvers that have to meet it.
+        Description of the solvers to which the requirement applies.
     applies : callable
-        Returns whether a `SolverSpec` has to meet it.
+        Returns whether the requirement applies to a `SolverSpec`.
     run : callable
-        Raises ContractError if a `SolverSpec` does not meet it.
+        Raises ContractError if a `SolverSpec` does not meet the requirement.
     """
 
     name: str
@@ -254,7 +255,7 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
                     solution.claim_check == "confirmed",
                     f"{text}. The judge must confirm the claim; it found: {solution.claim_check}{STOP_TEST_REMEDY}",
                 )
-            # Other backends may fail. If their claim is wrong, the result reports it.
+            # Other backends may fail, unless they claim convergence and the result does not report the conflict.
             _raise_unless(
                 solution.success or bool(solution.status_conflict) or solution.status is not Status.CONVERGED,
                 f"{text}. The claim CONVERGED is wrong and not reported as such",
@@ -293,9 +294,9 @@ def require_forms_agree(spec: SolverSpec) -> None:
     tol, must_solve = _choose_tolerance(spec), not spec.external or spec.name in REQUIRED_BACKENDS
     for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
         if kind.startswith("round") or spec.refuses(forms[0]):
-            continue  # Round cones have one form.
+            continue  # Problems with round cones can be written in one form only.
         if kind == "boxes" and law not in spec.laws:
-            continue  # Boxes are passed on as bounded rows of a matrix.
+            continue  # Friction boxes are always converted to bounded rows of a matrix.
         for form in ("impulse",) if kind == "ellipses" else ("impulse", "velocity"):
             solution = solve(forms[0], spec.name, tol=tol, form=form)
             text = f"for {_describe_problem(forms[0], kind)} with form={form!r} the result is: {solution}"
@@ -385,7 +386,7 @@ def require_budgets_are_kept(spec: SolverSpec) -> None:
                 few.claim_check == "confirmed",
                 f"for {phrase} max_iter={n} gave a claim that the judge does not confirm: {few}",
             )
-            # A resumable solver may raise the residual for some iterations.
+            # The residual of a resumable solver may increase in the first iterations.
             _raise_unless(
                 few.residual.relative <= 1.0 or spec.resumable,
                 f"for {phrase} max_iter={n} returned a result that is worse than the start: {few}",
@@ -439,7 +440,7 @@ def _run_in_parts(
 def require_time_limit_returns_the_iterate(spec: SolverSpec) -> None:
     """Require that a time limit ends a long solve with TIME_LIMIT and at least one iteration."""
     problem = _make_first_well_posed_problem(spec)
-    solve(problem, spec.name, max_iter=1)  # Its imports do not count.
+    solve(problem, spec.name, max_iter=1)  # Solve once before, so that imports do not count.
     solution = solve(problem, spec.name, tol=0.0, max_iter=2**31 - 1, time_limit=0.05)
     _raise_unless(
         solution.status is Status.TIME_LIMIT and solution.iterations > 0,
@@ -482,7 +483,7 @@ def require_callback_may_stop(spec: SolverSpec) -> None:
 
     def callback(n: int, impulse: FloatArray, _: Any) -> bool:
         counts.append(n)
-        impulse[:] = np.nan  # The solver must not see this.
+        impulse[:] = np.nan  # The callback gets a copy, so this must not change the solve.
         return n >= 3
 
     solution = solve(problem, spec.name, callback=callback, tol=0.0, max_iter=50)
@@ -634,7 +635,7 @@ def require_update_equals_prepare(spec: SolverSpec) -> None:
 @_register_check("all solvers except code of another project", lambda spec: not spec.external)
 def require_units_do_not_matter(spec: SolverSpec) -> None:
     """Require that impulses scale with the units of mass and velocity."""
-    mass, velocity = 2.0**10, 2.0**-20  # Powers of two: the scaled data have no rounding errors.
+    mass, velocity = 2.0**10, 2.0**-20  # Units are scaled by powers of two, which are exact in float64.
     for problem in make_well_posed_problems(spec):
         if problem.operator != "matrix":
             continue
@@ -739,7 +740,10 @@ def require_claims_are_true(spec: SolverSpec) -> None:
 
 
 def check_on_random_problems(compare: Callable[[int, int], None]) -> None:
-    """Call `compare(seed, m)` for random small problems. Hypothesis, if installed, reduces a failure to a small one."""
+    """Call `compare(seed, m)` for random small problems of m rows.
+
+    If Hypothesis is installed, it reduces a failure to a small example.
+    """
     try:
         import hypothesis
         from hypothesis import strategies

@@ -10,7 +10,7 @@ from lavender.base.arrays import FloatArray
 
 
 def random_bounds(rng: np.random.Generator, m: int) -> tuple[FloatArray, FloatArray]:
-    """Draw lower and upper bounds (m,): a mix of rows with a lower, both, an upper, no and two equal bounds."""
+    """Draw lower and upper bounds (m,) of rows: only lower, both, only upper, none, or equal bounds."""
     kind = rng.integers(0, 5, m)
     return np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5]), np.choose(
         kind, [np.inf, 1.0, 0.5, np.inf, 0.5]
@@ -29,7 +29,7 @@ def enumerate_lcp(
         for lo, hi in zip(lower, upper, strict=True)
     ]
     solutions = []
-    equal = lower == upper  # These rows accept any slack.
+    equal = lower == upper  # Any slack is admissible on rows with equal bounds.
     for bound in map(np.array, itertools.product(*choices)):
         free = bound == 0
         x = np.where(bound < 0, lower, np.where(bound > 0, upper, 0.0))

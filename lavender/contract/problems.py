@@ -51,7 +51,7 @@ def rotation_matrix(q: FloatArray) -> FloatArray:
 
 
 def random_unit_vector(rng: np.random.Generator, n: int = 3) -> FloatArray:
-    """Draw a direction of n dimensions."""
+    """Draw a unit vector (n,) with a uniformly distributed direction."""
     x = rng.normal(size=n)
     return x / np.linalg.norm(x)
 
@@ -75,7 +75,8 @@ def random_bodies_and_contacts(
     joint_body = np.array([draw_pair() for _ in range(joints)], np.int32).reshape(-1, 2)
     jac = rng.normal(size=(ptr[-1], 12))
     if joints:
-        jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0  # The other half of the rows are angular.
+        # Make the first row of every other joint angular, by removing its linear part.
+        jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0
     jac[np.repeat(joint_body[:, 0], sizes) < 0, :6] = 0.0
     normal = np.array([random_unit_vector(rng) for _ in range(contacts)]).reshape(-1, 3)
     tangent = np.array([np.cross(n, random_unit_vector(rng)) for n in normal]).reshape(-1, 3)
@@ -96,7 +97,10 @@ def random_bodies_and_contacts(
 
 
 def make_touching_bodies(contact_body: Any, **fields: Any) -> Rows:
-    """Build bodies at rest of 1 kg and 1 kg m^2 that touch at their centres along z; `fields` replaces fields of it."""
+    """Build bodies at rest of 1 kg and 1 kg m^2 that touch at their centres along z.
+
+    `fields` replaces fields of the resulting `Rows`.
+    """
     body = np.reshape(contact_body, (-1, 2)).astype(np.int32)
     c, n = len(body), len(fields.get("inv_mass", range(body.max(initial=-1) + 1)))
     defaults = {
@@ -115,9 +119,10 @@ def random_contact_problem(
     rolling: bool = False,
     **sizes: int,
 ) -> Problem:
-    """Draw a problem of bodies with free and bounded joint rows and contacts; without `tangents`, 0, 1 and 2 are mixed.
+    """Draw a problem of bodies with free and bounded joint rows, and contacts.
 
-    `sizes` are the numbers of `random_bodies_and_contacts`.
+    `tangents` is the number of tangents of each contact; None mixes 0, 1 and 2. `sizes` are the numbers of bodies,
+    joints and contacts, as for `random_bodies_and_contacts`.
     """
     rng = np.random.default_rng(seed)
     rows = random_bodies_and_contacts(rng, **sizes)
@@ -180,13 +185,13 @@ def random_ellipse_friction_contacts(seed: int, friction: str = "coulomb", **siz
     return replace(base, cones=replace(c, kind=np.where(c.kind == CONTACT_BOX, CONTACT_ELLIPSE, c.kind)))
 
 
-#: Name of each form of A, and the function that brings a problem of bodies into this form.
+#: Name of each form of A -> function that converts a problem of bodies to this form.
 FORMS: dict[str, Callable[[Problem], Problem]] = {
     "rows": lambda problem: problem,
     "matrix": as_matrix,
     "J and M": as_generalized,
 }
-#: Every kind of contact of bodies, and the function (seed, friction, **sizes) that draws such a problem.
+#: Kind of contact -> function (seed, friction, **sizes) that draws a problem of bodies with such contacts.
 CONTACTS: dict[str, Callable[..., Problem]] = {
     "disks": partial(random_contact_problem, tangents=2, spin=False),
     "spin": random_contact_problem,
@@ -213,7 +218,8 @@ def random_lcp(seed: int, m: int = 12, rank: int | None = None, boxed: bool = Tr
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, rank or m + 2))
     high: Any = np.where(rng.random(m) < 0.5, rng.uniform(0.1, 1.0, m), np.inf) if boxed else np.inf
-    # b is in the range of A, minus a separating velocity: the problem has a solution although A may be singular.
+    # Choose b as a vector in the range of A minus a non-negative vector: the problem then has a solution even if A is
+    # singular.
     a = g @ g.T
     return Problem.lcp(a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}")
 
@@ -222,12 +228,12 @@ def random_lcp(seed: int, m: int = 12, rank: int | None = None, boxed: bool = Tr
 
 
 def random_tree_parents(rng: np.random.Generator, n: int) -> list[int]:
-    """Draw the parent of each of n velocities, -1 at a root; a parent precedes its children. About three trees."""
+    """Draw the parents of n velocities that form about three trees; a root has -1, a parent precedes its children."""
     return [-1 if i == 0 or rng.random() < 3.0 / n else int(rng.integers(0, i)) for i in range(n)]
 
 
 def random_tree_mass(rng: np.random.Generator, parent: Sequence[int]) -> FloatArray:
-    """Draw a mass matrix (n, n) of a tree, of condition about 1e2: a velocity couples to its ancestors only."""
+    """Draw a mass matrix (n, n) with a condition number near 1e2 that couples each velocity only to its ancestors."""
     n = len(parent)
     lower = np.eye(n)
     for i in range(n):
@@ -239,7 +245,7 @@ def random_tree_mass(rng: np.random.Generator, parent: Sequence[int]) -> FloatAr
 
 
 def list_ancestors(parent: Sequence[int], i: int) -> list[int]:
-    """Return a velocity of a tree and all velocities from its parent to the root."""
+    """Return the indices of velocity i and of all its ancestors, from i to the root."""
     chain = []
     while i >= 0:
         chain.append(i)
@@ -271,7 +277,7 @@ def random_generalized_problem(
         jac[first:last, sorted(set(on))] = rng.normal(size=(last - first, len(set(on))))
     m = cones.n_rows
     soft = rng.uniform(0.01, 0.3, m) if compliance else np.zeros(m)
-    # Some velocities satisfy every constraint with a margin, so that the problem without compliance has a solution.
+    # Choose targets that some velocity exceeds by a margin, so that the problem without compliance has a solution.
     margin = np.zeros(m)
     margin[2:][cones.lower[2:] == 0.0] = 0.5
     return Problem.from_jacobian(

@@ -30,7 +30,7 @@ class Outcome:
     ----------
     check : Check
     failure : str
-        A sentence that says how the requirement is not met; empty if it is met.
+        Sentence that describes how the solver fails the requirement; empty if the requirement is met.
     """
 
     check: Check
@@ -51,7 +51,7 @@ def check_solver(name: str, timeout: float = CHECK_TIMEOUT) -> Iterator[Outcome]
     Parameters
     ----------
     name : str
-        Name of a solver. One with an entry point runs in another process.
+        Name of a solver. A plug-in with an entry point runs in another process.
     timeout : float, s
         Limit of each check in another process.
 
@@ -74,7 +74,7 @@ def check_solver(name: str, timeout: float = CHECK_TIMEOUT) -> Iterator[Outcome]
 
 
 def _run_in_process(process: ProcessBackend, name: str, check: Check, timeout: float) -> str:
-    """Run a check in another process, and return its failure."""
+    """Run a check in another process, and return the sentence of its failure; empty if the requirement is met."""
     try:
         process.start()
         answer, _ = process.call_function(name, check.name, timeout=timeout, max_bytes=0)

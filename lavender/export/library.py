@@ -18,9 +18,10 @@ TEXTS = (".h", ".c", ".txt", ".in")
 
 
 def source() -> str:
-    """Return lavender.c: the file in the package if it belongs to the present kernels, else a new one.
+    """Return the text of lavender.c.
 
-    A new file is stored in the package if possible.
+    It is read from the file in the package if that was built from the present kernels. Otherwise it is built, and
+    stored in the package if possible.
 
     Raises
     ------
@@ -55,11 +56,11 @@ def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: 
     Parameters
     ----------
     out : Path
-        Folder; it is created if it does not exist. Files with other names in it stay.
+        Folder, which is created if it does not exist. Files with other names in it are kept.
     more : mapping, optional
-        Additional files by name, without a line in SHA256SUMS.
+        Contents of additional files by name; they are not listed in SHA256SUMS.
     replace : bool
-        Replace existing files with other contents.
+        Whether to replace existing files whose contents differ.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: 
     InputError
         A file exists with other contents and `replace` is false, or the folder cannot be written.
     LavenderError
-        As `source`.
+        `source` raises it.
     """
     check_writable(out, folder=True)
     folder = HERE / "c"

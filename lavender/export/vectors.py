@@ -1,9 +1,9 @@
-"""Test vectors: problems of a report, the recommended solver with its settings, and the bits of the results.
+"""Test vectors of the C library: problems of a report, settings of the recommended solver, bits of the results.
 
-`check.c`, which a build runs, reads `vectors.bin`. The file consists of a magic word of 8 bytes, the number of vectors,
-and the vectors. A vector contains its steps, the problem in the order of `lav_problem` (-1 for a null pointer), and the
-expected result. Integers have 8 bytes; an array is its size in bytes and its data, padded to 8 bytes. All numbers are
-little-endian.
+The program `check.c`, which a build of the library runs, reads `vectors.bin`. The file consists of a magic word of 8
+bytes, the number of vectors, and the vectors. A vector contains its steps (`Step`), the problem in the order of
+`lav_problem` (-1 for a null pointer), and the expected result. Integers have 8 bytes; an array is its size in bytes
+and its data, padded to 8 bytes. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ITERATION_COUNTS = (
     "sweeps",
     "factorisations",
     "solves",
-)  # Kinds of work that the library counts as iterations.
+)  # Counters of `work` that the library counts as iterations.
 
 
 CHOSEN_TEMPLATE = """/* Settings measured by the report: {solver}, to a relative residual of {tol:g}, as steps.
@@ -72,7 +72,7 @@ static const lav_step lav_chosen[{count}] = {{
 
 @dataclass(frozen=True)
 class Step:
-    """One method of the library with its options and its work; it starts from the result of the step before."""
+    """One call of a method of the library, with options and budget; it starts from the previous step's result."""
 
     solver: str
     iterations: int
@@ -100,9 +100,9 @@ class Step:
 
 
 def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
-    """Return the steps of a solve: the step itself, or one step per solver of the stages of `auto`.
+    """Return the steps of a solve: `step` itself or, for `auto`, one step for each solver that ran.
 
-    The iterations of a stage's solver are twice its total work.
+    The iteration budget of such a step is twice the work of that solver in the solve.
     """
     if step.solver != "auto":
         return [step]
@@ -110,7 +110,7 @@ def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
     for stage in solution.stages:
         name, _, _ = stage.solver.partition(" on ")
         solver = CANDIDATES.get(name, (name, {}))[0]
-        pivots = solver in ("direct", "lemke")  # They end without an iteration limit.
+        pivots = solver in ("direct", "lemke")  # Pivoting methods need no iteration limit.
         iterations = 0 if pivots else max((stage.work.get(kind, 0) for kind in ITERATION_COUNTS), default=0)
         work[name] = work.get(name, 0) + (2 * iterations or registry.specs()[solver].max_iter)
     steps = []
@@ -121,7 +121,7 @@ def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
 
 
 def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict[str, str | bytes]:
-    """Return the files `vectors.bin`, `check.c` and `chosen.h` (the settings in C) by name, for the library's folder.
+    """Return {name: content} of the files `vectors.bin`, `check.c` and `chosen.h`, which has the settings in C.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict
     """
     records = statistics.drop_cases_solved_at_zero(
         read_records(path).select_latest_run()
-    )  # The records by which the report recommends.
+    )  # Select the records on which the report bases its recommendation.
     measured = _select_records(records, solver)
     packed: list[bytes] = []
     failures: list[str] = []
@@ -174,7 +174,7 @@ def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict
 
 
 def _select_records(records: Records, solver: str | None) -> list[Record]:
-    """Return the runs of the solver to export, at the tolerance of the recommendation or else at its smallest one."""
+    """Return the runs of the solver to export, at the recommendation's tolerance, else at the smallest tolerance."""
     solved = [r for r in records if r.success and r.mode == "tol" and r.timing_mode in ("call", "steps")]
     names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
     if solver is None:
@@ -271,7 +271,8 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[F
     NotSupported
         The driver does not support the problem.
     """
-    lv.residual(problem, problem.start())  # The judge computes d, nu and J M^-1 J^T of the problem.
+    # Make the judge compute d, nu and J M^-1 J^T, which the driver reads.
+    lv.residual(problem, problem.start())
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
     driver, outcome = Driver(problem.metric), OUTCOMES["more"]
     if not driver.fits:

@@ -28,12 +28,12 @@ METHODS = {
     for name, spec in registry.specs().items()
     if spec.builtin and not spec.external and not spec.delegates
 }
-#: Solvers with other bits in the library: the package uses another factorisation, or the solver is a sequence of
-#: others.
+#: Solvers with results in the library that differ in bits from the package: the package uses another factorisation, or
+#: the solver is a sequence of solvers.
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
-#: Forms (1 a matrix, 2 bodies, 3 J and M) of the methods that do not support all of them.
+#: Forms of A (1 a matrix, 2 bodies, 3 J and M) that a method supports, for methods that do not support all three.
 FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
 FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
 MAGIC = b"LAVIMG1\0"  # Magic word of the images that `lav_engine_open` reads and `lav_engine_image` writes.

@@ -1,4 +1,7 @@
-"""Solvers of other packages, as convex programs. A table of specs; no backend is imported until it runs."""
+"""Solvers of other packages ("backends"), to which problems are passed as convex programs.
+
+`backends` has a table of their specs. A backend is imported when it first runs.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Convert a problem to a convex program, in one of three forms.
 
-All are written as
+All forms are written as
 
     min 1/2 x.P x + q.x    subject to   A x + s = b,  s in {0}^z x R+^k x second-order cones,   lb <= x <= ub
 
@@ -20,19 +20,20 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
     only an upper bound     -w >= 0                        r = u
     disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|;  a second disk likewise, t >= a_r |w_r|
 
-with z = r + T zeta, lambda = sigma S z, and the rows A = -T^T K~ (without the columns of t). Its number of unknowns is
-the number of velocities, and J J^T is never formed.
+with z = r + T zeta, lambda = sigma S z, and the rows A = -T^T K~ (without the columns of t). The unknowns are the
+velocities y, one p for each soft row, and t; J J^T is never formed.
 
 Program form, of a quadratic program with a singular P (`Problem.from_qp`; `problem/program.py` (5)): the program with
-lb and ub for the bounds. S is one number for all variables and another for all rows, the geometric mean of r^-1/2, with
-r_i the largest entry of row i of (5); sigma is the root mean square of r^-1/2 times the violation of the rows of (5) at
-zero.
+lb and ub for the bounds. S is one number for all variables and another for all rows, the geometric mean of r^-1/2,
+with r_i the largest entry of row i of (5); sigma is the root mean square of r^-1/2 times the violation of the rows of
+(5) at zero.
 
-sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes the first two forms free of units, with unknowns near 1 also at
-large mass ratios; a residual of x times sigma is a residual of the judge. Rows with a known impulse are removed:
-lower = upper, friction with mu = 0, rows of A that are zero. Rows and contacts that b pushes to a bound by more than
-MAX_SCALED_RHS times the size of the unknowns (for example at placeholder bounds) are also removed, because the
-tolerance of a backend is relative to its largest number. `QPSolver` checks them at the solution.
+sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)), with the residual E0, V0 of the zero impulse, makes the first two
+forms free of units, with unknowns near 1 also at large mass ratios; a residual of x times sigma is a residual of the
+judge. Rows with a known impulse are removed: lower = upper, friction with mu = 0, rows of A that are zero. Rows and
+contacts that b pushes to a bound by more than MAX_SCALED_RHS times the size of the unknowns (for example at
+placeholder bounds) are also removed, because the tolerance of a backend is relative to its largest number. `QPSolver`
+checks at the solution that the removed rows are at their bounds.
 """
 
 from __future__ import annotations
@@ -54,10 +55,10 @@ from lavender.problem import Problem
 PROGRAM_FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
-# A row with a larger scaled |b| is assumed to stay at its bound: backends lose as many digits as the largest b has,
-# and active rows have b near 1. If the assumption fails, the backend is called once more with all rows.
+# [-] A row with a larger scaled |b| is assumed to stay at its bound and is removed. Active rows have a scaled b near
+# 1, and a b of 10^k costs a backend k digits. If the assumption fails, the backend is called once more with all rows.
 MAX_SCALED_RHS = 1e2
-# [-] As MAX_SCALED_RHS, for the program form. It is larger, because |x| often exceeds the active bounds.
+# [-] Value of MAX_SCALED_RHS in the program form. It is larger, because |x| often exceeds the active bounds.
 MAX_SCALED_PROGRAM_RHS = 1e6
 # At and above this mass ratio, the velocity form is more accurate at all sizes.
 VELOCITY_FORM_MASS_RATIO = 1e3
@@ -65,14 +66,18 @@ VELOCITY_FORM_MASS_RATIO = 1e3
 
 @dataclass(frozen=True)
 class _Disk:
-    """Friction component |(x_t / a_t over all tangents)| <= x_n: two tangents with equal a_t, or a round cone.
+    """Friction component in scaled unknowns: the norm of x_t / a_t over its tangents t is at most x_n.
+
+    It is a disk of two tangents with equal a_t, or a round cone.
 
     Parameters
     ----------
     normal : int
+        Row of x_n.
     tangents : tuple of int
+        Rows of x_t.
     ratios : tuple of float
-        a_t.
+        a_t of each tangent.
     """
 
     normal: int
@@ -110,7 +115,7 @@ class _FrictionRows:
 
 @dataclass(frozen=True)
 class _ScaledProblem:
-    """Unknown rows, known impulses and scaling, which both forms use.
+    """Unknown rows, known impulses and scaling of a problem, which all forms use.
 
     Parameters
     ----------
@@ -118,7 +123,7 @@ class _ScaledProblem:
     unknown_rows : (k,) int
         Rows of the problem with impulses that are unknowns of the program.
     fixed : (m,), N s
-        Impulses of the other rows; 0 for unknown rows.
+        Known impulses of the other rows; 0 for unknown rows.
     assumed : (n,) int
         Rows that are assumed to stay at their bound.
     root : (k,), kg^1/2
@@ -135,15 +140,15 @@ class _ScaledProblem:
 
     @classmethod
     def from_problem(cls, problem: Problem, unit_diagonal: bool, fix_far_rows: bool) -> _ScaledProblem:
-        """Scale a problem; `fix_far_rows` also fixes rows that are far from leaving their bound."""
+        """Scale a problem; with `fix_far_rows`, fix rows at a bound that b pushes far into it (MAX_SCALED_RHS)."""
         c = problem.cones
         known = (c.lower == c.upper) & np.isfinite(c.lower)
         fixed = np.where(known, c.lower, 0.0)
         size = np.diff(c.ptr)
         has_own_bound = np.repeat(~c.is_contact | (size == 1), size)
         for i in np.asarray(problem.metric.empty, int):
-            # The row of A is zero: the sign of b determines the bound. Without a finite bound no solution exists,
-            # which the validation of the input reports.
+            # The row of A is zero, so w = -b, and the sign of b determines the bound. If that bound is infinite, no
+            # solution exists, which the validation of the input reports.
             if has_own_bound[i]:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
                 known[i] = True
@@ -269,7 +274,10 @@ class QP(_ScaledProblem):
         return self.form == "velocity" and self.n == self.velocity_map.shape[1]
 
     def recover_impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
-        """Compute lambda (m,) [N s] from a solution, clipped to constant bounds; only the program form uses xi."""
+        """Compute lambda (m,) [N s], clipped to constant bounds, from a solution x and its multipliers zeta and xi.
+
+        Only the program form uses xi.
+        """
         lam = self.fixed.copy()
         z = x if self.form == "impulse" else self.shift + self.multiplier_map @ zeta
         lam[self.unknown_rows] = self.sigma * self.root * z
@@ -329,7 +337,7 @@ class QP(_ScaledProblem):
                 xi = np.where(at_low, np.minimum(-gradient, 0.0), 0.0) + np.where(
                     at_high, np.maximum(-gradient, 0.0), 0.0
                 )
-            # Equality form of a linear system: P x - b = 0 with P (x + zeta) = 0.
+            # In the equality form, P x = b and P (x + zeta) = 0: the multipliers are zeta = -x.
             return z, -z if len(self.b) else np.zeros(0), xi
         ny = self.velocity_map.shape[1]
         zeta = self.multiplier_map.T @ (z - self.shift)
@@ -347,8 +355,8 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
     ----------
     problem : Problem
     form : {"impulse", "velocity", "auto"}
-        "auto" chooses the velocity form if the problem has rows and m > 6 n, the mass ratio is at least
-        VELOCITY_FORM_MASS_RATIO, or `definite` is set.
+        "auto" chooses the velocity form for a problem with bodies or J and M if m exceeds six times the number of
+        bodies, if the mass ratio is at least VELOCITY_FORM_MASS_RATIO, or if `definite` is set.
     definite : bool
         Whether the backend needs a positive definite P.
 
@@ -357,7 +365,7 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
     InputError
         The form is unknown.
     CapabilityError
-        "velocity" for a problem without rows.
+        `form` is "velocity", and the problem is a matrix.
     """
     form = check_choice("form", form, PROGRAM_FORMS)
     rows = problem.rows
@@ -379,7 +387,9 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
 
 
 def compute_backend_tolerance(problem: Problem, tol: float) -> float:
-    """Compute the largest residual eps of one unknown [-] that keeps the judge's relative residual within `tol`.
+    """Compute the tolerance eps [-] of a backend, for which the judge's relative residual is at most `tol`.
+
+    If the residual of each unknown is at most eps,
 
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
@@ -405,11 +415,11 @@ def build_impulse_form(
     ----------
     problem : Problem
     unit_diagonal : bool
-        Scale by D^-1/2; otherwise by one number, so that P is A in other units.
+        Whether to scale by D^-1/2. If false, all rows are scaled by one number, so that P is a multiple of A.
     equality : bool
         Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
     fix_far_rows : bool
-        Remove rows that are far from leaving their bound.
+        Whether to remove rows that b pushes far into a bound (MAX_SCALED_RHS).
     """
     scaled = _ScaledProblem.from_problem(problem, unit_diagonal, fix_far_rows)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
@@ -426,7 +436,8 @@ def build_impulse_form(
     if equality:
         matrix, rhs, n_zero, q = p, -q, k, np.zeros(k)
     elif rows.all_rows:
-        # pairs: s = a x_n - x_t >= 0 and s = a x_n + x_t >= 0; disks: s = (a x_n, x_t) in a second-order cone
+        # A pair gives s = a x_n - x_t >= 0 and s = a x_n + x_t >= 0, a disk gives s = (a x_n, x_t) in a second-order
+        # cone.
         builder = _RowBuilder()
         for n, t, ratio in rows.pairs:
             builder.add_row([(n, -ratio), (t, 1.0)])
@@ -464,7 +475,7 @@ def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
     scaled = _ScaledProblem.from_problem(problem, True, fix_far_rows)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     k = len(unknown)
-    # K~ = [K, theta^1/2]
+    # Form K~ = [K, theta^1/2].
     jac = sp.csr_matrix(form.jacobian)
     theta = form.theta[unknown]
     soft = np.flatnonzero(theta > 0.0)
@@ -472,7 +483,7 @@ def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
     velocity_map = sp.csr_matrix(sp.hstack([jac[unknown], root_theta]))
     ny = velocity_map.shape[1]
     g = form.rhs[unknown] / sigma
-    # Kinds of bounded rows.
+    # Classify bounded rows as free, with a lower bound, with both bounds, or with an upper bound.
     low, high = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
     rows = scaled.map_friction_rows()
     is_bounded_row = np.ones(k, bool)
@@ -484,7 +495,7 @@ def build_velocity_form(problem: Problem, *, fix_far_rows: bool = False) -> QP:
     upper = np.flatnonzero(is_bounded_row & ~has_low & has_high)
     shift = np.zeros(k)
     shift[lower], shift[upper] = low[lower], high[upper]
-    # Rows A = -T^T K~, and entries of t.
+    # Form the rows A = -T^T K~, and append the columns of t.
     columns_of_t, t_entries, n, n_normals = _build_velocity_rows(rows, free, lower, both, upper, ny)
     multiplier_map = sp.csr_matrix(columns_of_t.build_matrix(k).T)
     velocities = sp.hstack(
@@ -532,8 +543,9 @@ class ProgramQP(QP):
     general : (r,) int
         Rows of the problem that are rows of A.
     signs : (r,)
-        Multiplier over zeta: -1 for equations, 1 for G.
-    bounds : tuple of (sign of xi, rows of the problem, their unknowns)
+        Factor from zeta to the multiplier of `problem/program.py`: -1 for equations, 1 for rows of G.
+    bounds : tuple of (sign, rows, indices)
+        Bounds of variables: sign of xi, rows of the problem, and indices of the bounded variables.
     """
 
     n_x: int
@@ -551,7 +563,7 @@ class ProgramQP(QP):
     def _recover_row_multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
         """Return lambda / sigma (m,) from the multipliers zeta of general rows and xi of bounds of the program.
 
-        Rows that are variables of the program have 0, as have bounds with a multiplier of the wrong sign.
+        The entries of variables, and of bounds with a multiplier of the wrong sign, are 0.
         """
         lam, scale = np.zeros(self.problem.m), np.zeros(self.problem.m)
         scale[self.unknown_rows] = self.root
@@ -562,10 +574,14 @@ class ProgramQP(QP):
         return lam
 
     def recover_certificate(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
-        """Compute a certificate (m,) of infeasibility: contradicting rows, or a direction of unlimited decrease."""
+        """Compute a certificate (m,) of infeasibility from zeta or x.
+
+        zeta gives multipliers of contradicting rows; x gives a direction in which the objective decreases without
+        limit.
+        """
         candidates = []
         if zeta is not None and len(zeta) == len(self.b):
-            # Backends return the multipliers of rows only; the multipliers of bounds balance them.
+            # Backends return multipliers of rows only. Those of bounds follow from A^T zeta + xi = 0.
             candidates.append(self._recover_row_multipliers(zeta, -(self.A.T @ zeta)))
         if x is not None and len(x) == self.n:
             y = np.zeros(self.problem.m)
@@ -599,8 +615,8 @@ def build_program_form(problem: Problem, *, fix_far_rows: bool = False) -> Progr
     scaled, qp = _ScaledProblem.from_problem(problem, True, fix_far_rows), problem.qp
     unknown, n = scaled.unknown_rows, len(qp.q)
     n_x = int(np.searchsorted(unknown, n))
-    # One unit for all variables and one for all rows, because backends balance rows and columns themselves. With rows
-    # and columns balanced twice, piqp 0.7 reported that a feasible public program is infeasible.
+    # Scale all variables by one number and all rows by one number, because backends equilibrate rows and columns
+    # themselves. With a second equilibration here, piqp 0.7 reported that a feasible public program is infeasible.
     row_size = abs(problem.csr[unknown]).max(axis=1).toarray().ravel()
     root = 1.0 / np.sqrt(row_size)
     # Violation of the rows at x = 0.
@@ -619,7 +635,7 @@ def build_program_form(problem: Problem, *, fix_far_rows: bool = False) -> Progr
     index_of[unknown[:n_x]] = np.arange(n_x)
     is_unknown = np.zeros(problem.m, bool)
     is_unknown[unknown] = True
-    # Rows of `problem/program.py` (2), by kind.
+    # Classify the rows of `problem/program.py` (2): equations, G, fixed variables, lower and upper bounds.
     empty = np.zeros(0, np.intp)
     fixed, lower, upper = (empty if at is None else at for at in (qp.fixed, qp.lower, qp.upper))
     n_a, n_g = qp.free - len(fixed), len(qp.target) - qp.free - len(lower) - len(upper)
@@ -683,7 +699,7 @@ def _build_velocity_rows(
         Number of normals that are bounded by a sum of t only.
     """
     columns, t_entries = _RowBuilder(), _RowBuilder()
-    # Bounded rows; a row with both bounds has an unknown t.
+    # Write bounded rows. A row with both bounds has an unknown t.
     t_of_row = {int(i): ny + j for j, i in enumerate(both)}
     n = ny + len(both)
     for i in free:
@@ -695,7 +711,7 @@ def _build_velocity_rows(
     for i in upper:
         columns.add_row([(int(i), -1.0)])
         t_entries.add_row([])
-    # Friction rows with a separate bound: t >= |w_t|.
+    # Write friction rows with a separate bound as t >= |w_t|.
     t_of_normal: dict[int, list[tuple[int, float]]] = {}
     for normal, tangent, ratio in rows.pairs:
         t_of_normal.setdefault(normal, []).append((n, ratio))
@@ -703,19 +719,19 @@ def _build_velocity_rows(
             columns.add_row([(tangent, sign)])
             t_entries.add_row([(n, -1.0)])
         n += 1
-    # Second disk of a contact: t >= |w|.
+    # Write the second disk of a contact as t >= |w|.
     t_of_disk: dict[int, int] = {}
     for k_disk, disk in enumerate(rows.disks):
         if any(d.normal == disk.normal for d in rows.disks[:k_disk][-1:]):
             t_of_normal.setdefault(disk.normal, []).append((n, 1.0))
             t_of_disk[k_disk] = n
             n += 1
-    # Normals without a disk: w_n >= sum of t.
+    # Write normals of contacts without a disk as w_n >= sum of a t.
     normals = [normal for normal in t_of_normal if normal not in {d.normal for d in rows.disks}]
     for normal in normals:
         columns.add_row([(normal, 1.0)])
         t_entries.add_row(t_of_normal[normal])
-    # Disks, as second-order cones.
+    # Write disks as second-order cones.
     for k_disk, disk in enumerate(rows.disks):
         t = t_of_disk.get(k_disk)
         columns.add_row([(disk.normal, 1.0)] if t is None else [])
@@ -727,11 +743,14 @@ def _build_velocity_rows(
 
 
 def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[IntpArray, FloatArray]:
-    """Find rows (complete contacts) that b pushes to a bound by more than the threshold, and their impulses."""
+    """Find rows that b pushes into a bound by more than `threshold`; return their indices and impulses at that bound.
+
+    A contact is found with all of its rows or not at all.
+    """
     c, push = problem.cones, problem.b / (np.sqrt(problem.d) * sigma)
     bound = np.where(push < 0.0, c.lower, c.upper)
     is_far = (np.abs(push) > threshold) & np.isfinite(bound) & ~c.friction_rows
-    # All rows of a contact with a far normal row; a contact with only far friction rows is not included.
+    # Include all rows of a contact if its normal row is far; far friction rows alone do not count.
     first = np.repeat(c.ptr[:-1], np.diff(c.ptr))
     is_far_friction = c.friction_rows & is_far[first]
     rows = np.flatnonzero(is_far | is_far_friction)
@@ -793,7 +812,7 @@ def make_bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]
 
 
 def merge_bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
-    """Compute xi (n,) from the multipliers of `make_bound_rows`, the first entries of z."""
+    """Compute xi (n,) from the multipliers z; its first entries belong to the rows of `make_bound_rows`."""
     xi, first = np.zeros(qp.n), 0
     for sign, _, _, indices in make_bound_rows(qp):
         xi[indices] += sign * z[first : first + len(indices)]
@@ -802,7 +821,7 @@ def merge_bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
 
 
 def make_two_sided_rows(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
-    """Return C, l and u of the rows l <= C x <= u; with `identity` the bounds of x are further rows."""
+    """Return C, l and u of the rows l <= C x <= u; with `identity`, the bounds of x are appended as rows."""
     low = np.full(len(qp.b), -np.inf)
     low[: qp.n_zero] = qp.b[: qp.n_zero]
     if not identity or qp.lb is None or qp.ub is None:

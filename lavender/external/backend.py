@@ -1,7 +1,8 @@
 """Description of a QP backend, and one run of it by its own interface or through qpsolvers.
 
-qpsolvers returns iterates and multipliers of all backends. It solves problems without constraints by SciPy's LSQR
-instead of some backends. Here infinite bounds, or the equality form, prevent this, and a result of LSQR is rejected.
+qpsolvers returns iterates and multipliers of all backends. For some backends it solves problems without constraints by
+SciPy's LSQR instead. To prevent this, such problems are passed with infinite bounds or in the equality form, and a
+result of LSQR is rejected.
 """
 
 from __future__ import annotations
@@ -39,30 +40,30 @@ class Backend:
         Packages that pip installs.
     summary, reference : str
     call : callable, optional
-        Function that calls the backend's own interface. Default: it is called through qpsolvers.
+        Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     settings : mapping, optional
-        For qpsolvers: the backend's option names, with a field of `Limits` (a str) or a fixed value. None if the
-        backend runs at its own tolerances.
+        Options to pass through qpsolvers: name -> a field of `Limits` (a str), or a fixed value. None if the backend
+        runs at its own tolerances.
     min_tolerance : float
         Smallest tolerance that the backend accepts.
     max_iter : int
         Default limit of iterations.
     dense : bool
-        Whether it accepts dense matrices only.
+        Whether the backend accepts dense matrices only.
     definite : bool
-        Whether it needs a positive definite P, which the velocity form has.
+        Whether the backend needs a positive definite P, as in the velocity form.
     warm : bool
-        Whether it uses a start point.
+        Whether the backend uses a start point.
     stoppable : bool
-        Whether it accepts a time limit.
+        Whether the backend accepts a time limit.
     linear : {"bounds", "equality", ""}
         How problems without constraints are passed: with infinite bounds, in the equality form, or not at all.
     finite : bool
-        Whether it rejects infinite bounds; the finite ones are then passed as rows.
+        Whether the backend rejects infinite bounds; finite bounds are then passed as rows.
     noisy : bool
-        Whether it prints even if output is disabled.
+        Whether the backend prints even if its output is disabled.
     cones : bool
-        Whether it accepts second-order cones, and so the convex relaxation of friction.
+        Whether the backend accepts second-order cones, and so the convex relaxation of friction.
     """
 
     name: str
@@ -99,11 +100,11 @@ def _call_through_qpsolvers(
     eps = clamp_tolerance(limit.eps, backend.min_tolerance) if backend.min_tolerance else limit.eps
     limits = {**vars(limit), "eps": eps}
     options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
-    settings = {name: x for name, x in options.items() if x is not None}  # The time limit can be None.
+    settings = {name: x for name, x in options.items() if x is not None}  # Leave out a time limit of None.
     if backend.warm:
         settings.update(_make_warm_start_settings(backend.name, qp, impulse))
     settings.update(extra)
-    # Equality rows, then inequality rows.
+    # Split the rows: the first `n_zero` are equalities, the others inequalities.
     z = qp.n_zero
     dense = backend.dense
     p = qp.P.toarray() if dense else qp.P
@@ -119,7 +120,8 @@ def _call_through_qpsolvers(
     g, h = (inequality, rhs) if len(rhs) else (None, None)
     a, b = (rows[:z], qp.b[:z]) if z else (None, None)
     if lb is None and g is None and a is None:
-        lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)  # With bounds, qpsolvers does not use LSQR.
+        # If bounds are given, qpsolvers does not use LSQR.
+        lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
     with capture_backend_output(False) as warnings:
@@ -129,7 +131,7 @@ def _call_through_qpsolvers(
         return Answer(
             Status.NUMERICAL_ERROR, f"qpsolvers ran LSQR in place of {backend.name}; its answer is not used"
         )
-    # The iterate and the multipliers.
+    # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, status_text = _get_status(solution, extras)
     zeta = np.zeros(len(qp.b))
@@ -141,7 +143,7 @@ def _call_through_qpsolvers(
     if len(qp.b) > z and _has_size(solution.z, len(rhs)):
         zeta[z:] = np.asarray(solution.z)[: len(qp.b) - z]
     elif len(qp.b) > z:
-        x = None  # The solution of the velocity form consists of multipliers.
+        x = None  # In the velocity form, impulses are computed from the multipliers alone.
     xi = np.asarray(solution.z_box, float) if _has_size(solution.z_box, qp.n) else None
     if bounds and _has_size(solution.z, len(rhs)):
         xi = merge_bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
@@ -174,7 +176,7 @@ def _describe_result(is_solved: bool | None, x: Any) -> str:
 
 
 def _get_iterations(extras: Mapping[str, Any]) -> int | None:
-    """Find the number of iterations in the backend's data; None if it is not there."""
+    """Return the number of iterations from the additional data of a backend, or None if they do not contain it."""
     info = extras.get("info", extras)
     for source in (info, extras):
         for name in ("iter", "iterations", "num_iterations", "nbIter", "num_iter"):
@@ -182,7 +184,7 @@ def _get_iterations(extras: Mapping[str, Any]) -> int | None:
             if isinstance(value, (int, np.integer)):
                 return int(value)
             if isinstance(value, (tuple, list, np.ndarray)) and len(value):
-                return int(value[0])  # quadprog returns the numbers of added and of dropped constraints.
+                return int(value[0])  # quadprog returns two counts, of added and of dropped constraints.
     stats = extras.get("stats")
     return len(stats) if isinstance(stats, list) else None
 

@@ -1,4 +1,4 @@
-"""Specs of all backends of qpsolvers, for linear problems and boxed LCPs with symmetric A.
+"""Specs of all QP backends, for linear problems and boxed LCPs with symmetric A.
 
     min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `as_qp`
 
@@ -7,8 +7,8 @@ one cone:
 
     l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n,  or the dual cone w_n >= a |w_t| + a_s |w_s|
 
-Some backends are called by their own interface (`native.py`), because qpsolvers returns their iterates but not their
-iterations, exit flags and certificates, and has no warm start for them. The others are called through qpsolvers
+Some backends are called by their own interface (`native.py`), because qpsolvers returns neither their numbers of
+iterations nor their exit flags and certificates, and cannot warm-start them. The others are called through qpsolvers
 (`backend.py`).
 """
 
@@ -22,7 +22,7 @@ from lavender.external.qp_solver import OPTION_HELP, QPSolver, explain_refusal
 from lavender.solvers.registry import SolverSpec
 
 #: Options of backends that qpsolvers calls: a str is a field of `Limits`, other values are fixed.
-PROXIMAL = {  # Without the gap, proxqp accepts multipliers of inactive bounds (observed on a redundant stack).
+PROXIMAL = {  # Without the test of the duality gap, proxqp accepts non-zero multipliers of inactive bounds.
     "eps_abs": "eps", "eps_rel": 0.0, "max_iter": "max_iter",
     "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap_relative",
 }  # fmt: skip
@@ -113,7 +113,8 @@ def _make_spec(backend: Backend) -> SolverSpec:
         name=backend.name,
         factory=partial(QPSolver, backend),
         laws=frozenset(laws),
-        # Boxes as edges of cones make A singular.
+        # Under the law "cone", friction boxes are written as one row for each edge of the cone, which makes A
+        # singular.
         box_friction_laws=frozenset() if backend.definite else frozenset({"cone"}),
         resumable=False,
         external=True,

@@ -1,7 +1,7 @@
 """Wrapper for solvers of other packages: they receive copies, and everything that they return is checked.
 
-A plug-in may store the arrays that it receives, change them later, or return an invalid claim. So it works on copies of
-the problem and of the impulse; the caller and the judge never read its arrays.
+A plug-in may store the arrays that it receives, change them later, or return an invalid claim. It therefore works on
+copies of the problem and of the impulse, and the caller and the judge never read the arrays that the plug-in holds.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ForeignSolver(Solver):
         return self._call_method(method, *arguments) if self._has_method(method) else None
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Return the solver's estimate of its costs [ns], 0 for `prepare` if it has none."""
+        """Return the wrapped solver's own estimate of its costs [ns]; without one, the cost of `prepare` is 0."""
         estimate = self._call_optional("cost", problem)
         if estimate is None:
             return Cost()
@@ -68,11 +68,11 @@ class ForeignSolver(Solver):
         self._call_optional("start_workers", state.state, time_limit)
 
     def set_deadline(self, state: State, deadline: Deadline) -> None:
-        """Set the deadline after which no long step may end."""
+        """Pass the deadline to the wrapped solver, which starts no long operation that would end after it."""
         self._call_optional("set_deadline", state.state, deadline)
 
     def prepare(self, problem: Problem) -> State:
-        """Prepare a copy of the problem: factor, colour, allocate."""
+        """Call the wrapped solver's `prepare` (factor, colour, allocate) with a copy of the problem."""
         return State(problem, self._call_method("prepare", _copy_problem(problem)))
 
     def update(self, state: State, problem: Problem) -> State:
@@ -100,11 +100,14 @@ class ForeignSolver(Solver):
         return self._check_claim(claim, error, len(impulse), max_iter)
 
     def _check_claim(self, claim: Any, error: str, m: int, max_iter: int) -> Claim:
-        """Return the claim with checked fields; if `error` or a field is wrong, a NUMERICAL_ERROR with a message."""
+        """Return the claim with checked fields, or a claim of NUMERICAL_ERROR with a message.
+
+        The latter is returned if `error` is not empty or a field is invalid.
+        """
         if type(claim) is not Claim:
             error = error or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
             return Claim(Status.NUMERICAL_ERROR, 0, {}, f"solver {self.name!r} {error}")
-        unchecked: Any = claim  # Its fields may hold anything.
+        unchecked: Any = claim  # The fields of a plug-in's claim may have any type.
         iterations = int(unchecked.iterations) if _is_count(unchecked.iterations) else 0
         work, certificate, dual = unchecked.work, unchecked.certificate, unchecked.dual
         if not isinstance(unchecked.status, Status):

@@ -29,9 +29,10 @@ ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
 MAX_BACKEND_MESSAGE_LENGTH = 500  # [characters] Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # [bytes] Size of one matrix entry of a program in a request.
-TRANSFER_RATE = 3e8  # [bytes/s] Programs that would take longer to send than the limit time out.
+# [bytes/s] If sending a program at this rate exceeds the time limit, the call times out at once.
+TRANSFER_RATE = 3e8
 
-#: Running processes that have no call. A thread that takes one is its only user.
+#: Running processes without a current call. A thread removes a process from the list before it uses it.
 idle_processes: list[ProcessBackend] = []
 
 
@@ -40,7 +41,8 @@ def start_process(backend: Backend) -> None:
     process = _take_idle_process() or ProcessBackend(run_backend)
     with suppress(ProcessEnded):  # If the system starts no process, the backend runs in this one.
         process.start()
-        with suppress(TimeoutError, InvalidAnswer, RemoteError):  # The call itself reports them.
+        # The later call of the backend raises these errors.
+        with suppress(TimeoutError, InvalidAnswer, RemoteError):
             process.call_function(backend, timeout=subprocesses.START_TIMEOUT, max_bytes=0)
         idle_processes.append(process)
 
@@ -107,7 +109,7 @@ def call_backend(
             InputError(str(error)) if error.kind == "InputError" else BackendFailed(f"{error.kind}: {error}")
         ) from None
     idle_processes.append(process)
-    try:  # The backend may have written anything.
+    try:  # The answer may be invalid, since the backend's code can write to the process's output.
         work = {str(kind): int(count) for kind, count in fields["work"].items()}
         by_name = dict(zip(ANSWER_ARRAYS, arrays, strict=True))
         return Answer(status=Status[fields["status"]], message=str(fields["message"]), work=work, **by_name)
@@ -133,7 +135,8 @@ def _close_idle_processes() -> None:
         idle_processes.pop().close()
 
 
-if hasattr(os, "register_at_fork"):  # Windows has none. A forked process must not use its parent's processes.
+# A forked process must not use its parent's processes. Windows has no fork.
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=idle_processes.clear)
 
 
@@ -149,7 +152,7 @@ def run_backend(
     limit: Limits | None = None,
     settings: dict[str, Any] | None = None,
 ) -> subprocesses.Answer:
-    """Run a backend; without a program, solve a tiny one, because backends import their code when they first solve."""
+    """Run a backend on `qp`. If `qp` is None, solve a tiny program, so that the backend imports all of its code."""
     if qp is None or impulse is None or limit is None or settings is None:
         if backend.name not in _warmed_up:
             _warmed_up.add(backend.name)

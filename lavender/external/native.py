@@ -27,7 +27,8 @@ from lavender.external.running import (
 )
 from lavender.judge.solution import Status
 
-# Weight of DAQP's proximal steps for a P with unit diagonal. A program that failed with 1e-8 takes 64 iterations.
+# [-] Weight of DAQP's proximal steps, for a P with unit diagonal. A much smaller weight makes steps fail: with 1e-8,
+# DAQP did not solve a program that takes 64 iterations with this weight.
 DAQP_PROXIMAL_WEIGHT = 1e-2
 
 
@@ -79,8 +80,8 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     xi = merge_bound_multipliers(qp, z[first:])
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     if almost and any(part is not None for part in keep_if_infeasibility_certificate(qp, x, zeta)):
-        status = Status.INFEASIBLE  # The solver's own test is stricter than the certificate needs.
-    # One factorisation before the first step and one for each step.
+        status = Status.INFEASIBLE  # "Almost infeasible" suffices, because the judge checks the certificate.
+    # There is one factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
     return Answer(
         status=status, message=name, x=x, zeta=zeta, xi=xi, work=work, direction=x, contradiction=zeta
@@ -185,7 +186,8 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         "threads": 1,
         "primal_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
         "dual_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
-        "qp_regularization_value": 1e-13,  # The default shifts the diagonal by 1e-7, which changes the problem.
+        # The default shifts the diagonal by 1e-7, which changes the problem.
+        "qp_regularization_value": 1e-13,
         "qp_iteration_limit": limit.max_iter,
     }
     if limit.time_limit is not None:
@@ -220,8 +222,8 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
 def _get_osqp_algebra() -> str:
     """Return the default algebra of OSQP.
 
-    Without it, every `osqp.OSQP()` searches the modules of two other algebras. This takes 0.2 ms and import locks,
-    for which a process that is forked meanwhile waits forever.
+    If no algebra is passed to `osqp.OSQP()`, it searches the modules of two other algebras at every call. This takes
+    0.2 ms and holds import locks, for which a process that is forked at that moment would wait forever.
     """
     import osqp
 

@@ -140,7 +140,7 @@ class QPSolver(Solver):
 
 
 def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
-    """Return whether a row assumed to stay at its bound leaves it, or may cause a proof of infeasibility."""
+    """Return whether a row that was assumed to stay at its bound leaves it, or may have caused a claim INFEASIBLE."""
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
@@ -149,7 +149,10 @@ def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim)
 
 
 def explain_refusal(problem: Problem) -> str | None:
-    """Return why no QP backend accepts this problem, before any conversion; a factorisation finds other causes."""
+    """Return the reason why no QP backend accepts this problem, or None.
+
+    The test needs no conversion and no factorisation; an indefinite A, for example, is found only later.
+    """
     if problem.has_singular_program:
         return None
     if not problem.is_symmetric:

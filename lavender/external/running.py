@@ -29,9 +29,9 @@ MIN_TOLERANCE = 1e-14
 MIN_GAP = 1e-18  # Smallest absolute gap of objectives passed to a backend.
 # Gap relative to the objective in the first call: at large mass ratios, rounding of the sums causes about as much.
 MAX_RELATIVE_GAP = 1e-13
-MIN_RELATIVE_GAP = 1e-16  # The same in the last, strictest call.
+MIN_RELATIVE_GAP = 1e-16  # Gap relative to the objective in the last, strictest call.
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
-MAX_GAP_RESIDUAL = 1e-8  # The root of MIN_RELATIVE_GAP: relative residual that a gap of this size can cause.
+MAX_GAP_RESIDUAL = 1e-8  # Relative residual that a gap of MIN_RELATIVE_GAP can cause: its square root.
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Limits:
     gap : float
         Difference of the primal and dual objectives.
     gap_relative : float
-        The same relative to the objective; one of both suffices.
+        Difference of the objectives relative to the objective. A backend may stop if either gap is reached.
     max_iter : int
     time_limit : float or None, s
     repeated : bool
@@ -143,12 +143,12 @@ def call_backend_until_accepted(
     """Run the backend until the judge accepts its iterate, and write the best iterate to `impulse`.
 
     The stopping tests of backends differ from the judge's. If a backend claims convergence and the judge's residual is
-    above `tol`, it is called again with 100 times smaller tolerances, up to three times in all. The answer with the
-    smallest residual and its claim are returned, unless a later call proves that no solution exists. If no call
-    returns an iterate, `impulse` is the start point.
+    above `tol`, the backend is called again with 100 times smaller tolerances, up to three times in all. The answer
+    with the smallest residual and its claim are returned, unless a later call proves that no solution exists. If no
+    call returns an iterate, `impulse` keeps the start point.
 
-    An interior-point method leaves an error sqrt(x w) on a row with vanishing impulse and slack, so the tolerance of
-    its gap decreases towards eps^2.
+    An interior-point method leaves an error sqrt(x w) on a row with vanishing impulse x and slack w, so the tolerance
+    of the gap decreases towards eps^2.
 
     Parameters
     ----------
@@ -186,7 +186,8 @@ def call_backend_until_accepted(
             or above <= tol
             or remaining <= 0
             or deadline.passed()
-            or np.any(e[qp.assumed] != 0.0)  # An assumption fails: the caller solves another program.
+            # If a row that was assumed at its bound leaves it, the caller solves a program with all rows.
+            or np.any(e[qp.assumed] != 0.0)
         ):
             break
         limits = [
@@ -196,7 +197,7 @@ def call_backend_until_accepted(
         if limits:
             impulse[:] = start
     assert best is not None
-    # A program keeps the answer that it has: `auto` would call this backend again to check the claim.
+    # Not in the program form: `check_infeasible` may run `auto`, which calls this backend again.
     if last is not best[1] and last.status is Status.INFEASIBLE and qp.form != "program":
         infeasible, proved, _ = check_infeasible(problem, last, tol, deadline)
         if proved:
@@ -213,7 +214,8 @@ def call_backend_until_accepted(
     if tol == 0.0 and status is Status.CONVERGED:
         status, message = Status.STALLED, f"{message}; tol=0: ran at its smallest tolerance"
     elif status is Status.CONVERGED and relative > tol and not above <= tol:
-        # The backend's tests use other norms, so its claim is not false if there was no stricter call.
+        # The backend's tests use other norms than the judge, so its claim is not false if no stricter call was
+        # possible.
         if limits:
             status = Status.TIME_LIMIT if deadline.passed() else Status.MAX_ITERATIONS
             message = f"{message}; no iterations or time remained for stricter tolerances"
@@ -228,7 +230,8 @@ def call_backend_until_accepted(
 def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
     """Return the limits of the first call and of the stricter ones."""
     eps = max(0.5 * compute_backend_tolerance(problem, tol), MIN_TOLERANCE)
-    # Unknowns are near 1, so objectives are between 1 and m, and rounding of their sums often exceeds a gap of 1e-13.
+    # Unknowns are near 1, so objectives are between 1 and m, and rounding of their sums often exceeds a gap of 1e-13:
+    # the first call does not require a smaller one.
     levels = [
         (eps, 1e-2 * eps, MAX_RELATIVE_GAP),
         (max(1e-2 * eps, MIN_TOLERANCE), max(1e-5 * eps, 1e-13), 1e-2 * MAX_RELATIVE_GAP),
@@ -315,7 +318,7 @@ _thread_output = _ThreadOutput()
 
 
 class _Stream:
-    """Replacement of sys.stdout or sys.stderr, which is the stream itself for threads that run no backend."""
+    """Replacement of sys.stdout or sys.stderr. Threads that do not run a backend write to the original stream."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -325,7 +328,7 @@ class _Stream:
 
 
 class _SharedContext:
-    """A context of the whole process, which the first thread enters and the last one leaves."""
+    """A context manager of the whole process: the first thread that needs it enters it, and the last leaves it."""
 
     def __init__(self, make_context: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
         self._make_context, self._lock, self._n_threads = make_context, threading.Lock(), 0

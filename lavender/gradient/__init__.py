@@ -1,7 +1,8 @@
 """Derivatives of a solution by the problem's data, and checks of their existence.
 
-A solution lambda with w = A lambda - b is a root of the natural map F of block_projection.pxd, block by block. If every
-block is strictly inside one case (sticks, slides, open, at a bound, free), F is smooth, and with z = D^1/2 lambda
+A solution lambda with w = A lambda - b is a root of the natural map F(z) = z - Pi(z - D^-1/2 w), z = D^1/2 lambda,
+with the projection Pi of lavender_ext/core/block_projection.pxd in each block. If every block is strictly inside one
+state (sticks, slides, open, at a bound, free), F is smooth, and with P = dPi
 
     G dz = P D^-1/2 (db - dA lambda) + D^1/2 dl + (dPi/de) de,    G = I - P + P H,   H = D^-1/2 A D^-1/2      (1)
     dA lambda = dJ v' + J M^-1 (dJ^T lambda - dM v') + dtheta lambda,   v' = M^-1 J^T lambda                  (2)

@@ -1,4 +1,4 @@
-"""Derivatives of many problems: one compiled call prepares all of them, and each `vjp` is one more call."""
+"""Derivatives of many problems: one compiled call prepares them, and each `vjp` of all problems is one further call."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lavender_ext.derivative.linear import Linears
 
 
 class _LazySequence(Sequence[Any]):
-    """One object for each of many problems, created at its first use.
+    """Sequence with one object for each of n problems; an object is created at its first use.
 
     Parameters
     ----------
@@ -59,7 +59,8 @@ class _LazySequence(Sequence[Any]):
 class Gradients(_LazySequence):
     """Gradients of many problems, computed by `Derivatives.vjp`: `[i]` is the `Gradient` of problem i.
 
-    Attributes such as `b`, `mu` and `v_free` are the concatenated gradients of all problems; matrices have none.
+    Attributes such as `b`, `mu` and `v_free` hold the concatenated gradients of all problems. Gradients by matrices
+    (A, J, M) have no such attribute.
     """
 
     def __init__(self, of: Derivatives, numbers: FloatArray, separate: dict[int, Gradient]) -> None:
@@ -88,7 +89,7 @@ class Gradients(_LazySequence):
     def _make_item(self, i: int) -> Gradient:
         return Gradient(self._of._get(i), self._numbers[self._of._linears.result_slice(i)])
 
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
+    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
@@ -109,7 +110,7 @@ class Derivatives(_LazySequence):
         self._problems, self._linears, self._separate = problems, linears, separate
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle problems and impulses; a copy is prepared again."""
+        """Pickle problems and impulses only; the copy prepares the derivatives again."""
         return derivatives, (self._problems, [each._impulse for each in self])
 
     def _make_item(self, i: int) -> Derivative:
@@ -134,9 +135,9 @@ class Derivatives(_LazySequence):
         Raises
         ------
         InputError
-            The number of cotangents differs from the number of problems; also as for `Derivative.vjp`.
+            The number of cotangents differs from the number of problems, or `Derivative.vjp` raises it.
         CapabilityError
-            As for `Derivative.vjp`.
+            `Derivative.vjp` raises it.
         """
         n, arguments = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
         cotangents = {
@@ -173,7 +174,8 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
     Raises
     ------
     InputError
-        The number of solutions differs from the number of problems; also as for `derivative`, with the problem's index.
+        The number of solutions differs from the number of problems, or `derivative` raises it; the message then has
+        the problem's index.
     """
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `derivative`")

@@ -21,12 +21,13 @@ from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import multiply_body_jacobian
 from lavender_ext.derivative.linear import CASES, Linear, write_body_wrenches
 
-# Solutions with a larger relative residual (without the part that rounding explains) are not differentiated.
+# A solution is rejected if its relative residual exceeds this and its round-off floor.
 MAX_ACCEPTED_RESIDUAL = 1e-8
 MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of its largest entry count as rounding.
-# A right-hand side counts as unsolvable if its cosine with a null vector of G^T is larger.
+# A right-hand side of G x = r counts as unsolvable if its cosine with a null vector of G^T is larger than this.
 MAX_NULL_COSINE = 1e-3
-# Blocks within this many estimated errors of another state are reported by `switching`; the estimate is of first order.
+# `Derivative.switching` reports blocks within this many estimated errors of another state. The factor covers that the
+# error is estimated to first order only.
 SWITCHING_ERRORS = 10.0
 UNIT_ROUNDOFF = 2.0**-53
 
@@ -46,7 +47,7 @@ class Unique:
     velocity : bool
         Whether the velocities of all bodies are unique; for a matrix, whether all slacks are.
     target : (m,) bool
-        Whether b of this row alone can change without a change of state of any block.
+        Whether a derivative by b of this row alone exists: b can change without a change of any block's state.
     """
 
     impulse: Flags
@@ -75,7 +76,7 @@ class Tangent:
     Parameters
     ----------
     slack : (m,), m/s
-        Change of w, per unit of the change.
+        Change of w per unit of the change of the data.
     """
 
     slack: FloatArray
@@ -111,12 +112,12 @@ class Derivative:
             factor_dense(problem.disk, linear)
         regular = linear.regular if linear.rows <= MAX_KERNEL_ROWS else self._system.of_kernel
         general = problem.generalized
-        # Whether the kernel can compute `vjp`: it has a factor, and its rows and velocities are in the original order.
+        # The kernel can compute `vjp` if it has a factor of G and if rows and velocities are in the original order.
         in_order = general is None or general.order is None
         self._uses_kernel = regular and not problem.cones.has_ellipse and in_order
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle problem and impulse; a copy is computed again."""
+        """Pickle problem and impulse only; the copy computes the derivative again."""
         return derivative, (self.problem, self._impulse)
 
     @property
@@ -219,14 +220,17 @@ class Derivative:
 
     @cached_property
     def _bound_weights(self) -> FloatArray:
-        """Weights (2, m) of the gradients by lower and upper bounds: 1 if active; if lower = upper, 1/2 each."""
+        """Weights (2, m) of the gradients by lower and upper bounds: 1 if active, 1/2 each if the bounds are equal."""
         case, c = self._linear.case, self.problem.cones
         is_active = np.array([case == CASES["low"], case == CASES["high"]], np.float64)
         return np.where(is_active.any(axis=0) & (c.lower == c.upper), 0.5, is_active)
 
     @cached_property
     def _ellipse_terms(self) -> tuple[Any, FloatArray, FloatArray]:
-        """Friction rows of ellipses, and derivatives of z and y by e_j, because D_j^1/2 is proportional to 1 / e_j."""
+        """Friction rows j of ellipses, and -dz_j/de_j and -dy_j/de_j there, with y = z - D^-1/2 w.
+
+        The derivatives are not zero, because D_j^1/2 of an ellipse's row is proportional to 1 / e_j.
+        """
         rows = np.flatnonzero(np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr)))
         rows = rows[self.problem.cones.friction_rows[rows]]
         root, e = self._root[rows], self.problem.cones.friction_coefficient[rows]
@@ -241,9 +245,9 @@ class Derivative:
         return BodyChain(self)
 
     def _solve(self, r: FloatArray, check: bool = False) -> FloatArray:
-        """Solve G x = r on all rows; with `check` raise CapabilityError without a solution."""
+        """Solve G x = r on all rows; with `check`, raise CapabilityError if there is no solution."""
         x, rows = r.copy(), self._system_rows
-        # On the other rows G is the identity: move their contribution to the right-hand side.
+        # On rows outside of the system, G is the identity: move their contribution to the right-hand side.
         x[rows] = 0.0
         fixed = (
             self._linear.multiply_projection_derivative(self._apply_a(x / self._root) / self._root)
@@ -280,7 +284,8 @@ class Derivative:
     def _check_coefficient_changes(self, name: str) -> None:
         """Raise CapabilityError if a coefficient of one contact cannot change under the cone law.
 
-        There w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, so a change of a coefficient acts like a change of a target.
+        Under this law, a sliding contact has w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, so a change of a coefficient
+        acts like a change of the normal's target.
         """
         if self.problem.law != "cone" or not self._system.singular:
             return
@@ -290,7 +295,7 @@ class Derivative:
         r = self._apply_coefficient_change(self._coefficient_rows.compute_row_coefficient_changes(*changes))[
             rows
         ]
-        # Entries of r depend on the coefficient of their own block only.
+        # An entry of r depends only on the coefficient of its own block: test each block separately.
         block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[rows]
         size = MAX_NULL_COSINE * np.sqrt(np.bincount(block, r * r))
         for q in self._system.draw_null_vectors(True):
@@ -307,11 +312,11 @@ class Derivative:
         Parameters
         ----------
         velocity : (nv,) or (n, 6), optional
-            Cotangent of the velocities after the step; its unit is the unit of the scalar over m/s (rad/s).
+            Cotangent of the velocities after the step [1/(m/s), 1/(rad/s), times the unit of the scalar].
         impulse : (m,), optional
-            Cotangent of the impulses, per N s.
+            Cotangent of the impulses [1/(N s), times the unit of the scalar].
         slack : (m,), optional
-            Cotangent of w, per m/s.
+            Cotangent of w [1/(m/s), times the unit of the scalar].
 
         Returns
         -------
@@ -320,9 +325,10 @@ class Derivative:
         Raises
         ------
         InputError
-            A cotangent has another shape or is not finite, or there is none.
+            A cotangent has a wrong shape or is not finite, or no cotangent is given.
         CapabilityError
-            `velocity` for a problem given as a matrix; a cotangent of impulses that are not unique (see `unique`).
+            `velocity` is given for a problem in matrix form, or a cotangent weighs impulses that are not unique (see
+            `unique`).
         """
         p = self.problem
         if velocity is None and impulse is None and slack is None:
@@ -343,7 +349,7 @@ class Derivative:
         if y is not None:
             rhs += self._apply_jacobian(self._apply_inverse_mass(y))
         scaled, q = (rhs / self._root)[self._system_rows], np.zeros(p.m)
-        # Slacks and velocities are unique if A comes from bodies and the law is convex.
+        # Slacks and velocities are unique if A comes from bodies or J and M and the law is convex: no check is needed.
         if p.matrix is not None or p.law == "coulomb" or c.any():
             self._check_unique(scaled)
         q[self._system_rows] = self._system.solve(scaled, True)
@@ -372,8 +378,9 @@ class Derivative:
         Parameters
         ----------
         b, target, v_free, lower, upper, mu, patch_radius, rolling, compliance, A, J, M : array-like, optional
-            Changes of the data with these names, of the same shapes; mu also (k, 2). With b= the change of b itself is
-            given; with target=, v_free= and J= it is computed from b = target - J v*. M must be symmetric.
+            Changes of the data with these names, in the shapes of the data; mu also (k, 2). `b` is the change of b
+            itself; for changes of `target`, `v_free` and `J`, the change of b = target - J v* is computed. A change of
+            M must be symmetric.
         jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia : array-like, optional
             Changes of the arrays of `Rows`.
 
@@ -385,13 +392,13 @@ class Derivative:
         Raises
         ------
         InputError
-            The problem has no data of this name, a shape is wrong, a number is not finite, or there is no change.
+            The problem has no data of this name, a shape is wrong, a number is not finite, or no change is given.
         CapabilityError
             No derivative along this change exists.
         """
         p, linear = self.problem, self._linear
         data = self._check_changes(changes)
-        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db is the change of w with fixed impulses.
+        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db is the change of w at constant impulses.
         for name in ("b", "target"):
             dw -= data.get(name, 0.0)
         for name, weight in zip(("lower", "upper"), self._bound_weights, strict=True):
@@ -409,7 +416,7 @@ class Derivative:
         dj = self._body_chain.compute_jacobian_change(data) if p.rows is not None else data.get("J")
         if p.rows is not None and "J" in data:
             dj = data["J"] if dj is None else dj + data["J"]
-        momentum = None  # This is dJ^T lambda - dM v' of equation (2).
+        momentum = None  # Will hold dJ^T lambda - dM v' of equation (2) in `lavender.gradient`.
         if dj is not None:
             dw += dj @ self._velocity
             momentum = dj.T @ self._impulse
@@ -434,7 +441,7 @@ class Derivative:
         return Tangent(slack, dv, impulse, self)
 
     def _apply_coefficient_change(self, de: FloatArray) -> FloatArray:
-        """Compute (dPi/de) de (m,) for changes de (m,) of the coefficients of rows; with ellipses also by D."""
+        """Compute (dPi/de) de (m,) for changes de (m,) of the rows' coefficients e, including the change of D by e."""
         linear = self._linear
         if not self.problem.cones.has_ellipse:
             return linear.multiply_projection_derivative(de, False, True)
@@ -485,7 +492,7 @@ class Derivative:
 
     @cached_property
     def unique(self) -> Unique:
-        """Uniqueness of impulse, slack and target by row. Linearly dependent rows can share a load in many ways."""
+        """Uniqueness of impulse, slack and target by row; linearly dependent rows can share a load in many ways."""
         p, m = self.problem, self.problem.m
         impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
         rows = self._system_rows
@@ -508,12 +515,12 @@ class Derivative:
 
     @cached_property
     def states(self) -> States:
-        """State of each block, as `solution.states`, with a bound of the error that `distance_in_errors` estimates."""
+        """State of each block, as `solution.states`, with a proved bound of the answer's error."""
         return compute_states(self.problem, self._impulse, self._linear)
 
     @cached_property
     def _estimated_error(self) -> FloatArray:
-        """Estimated error of each block (k,) [N s]: the next step of Newton's method, and rounding."""
+        """Estimated error of each block (k,) [N s]: the size of the next step of Newton's method plus rounding."""
         linear, p = self._linear, self.problem
         with np.errstate(all="ignore"):
             size = np.abs(self._apply_abs_a()) + np.abs(p.b)
@@ -543,7 +550,7 @@ class Derivative:
 
     @property
     def distance_in_errors(self) -> FloatArray:
-        """`distance` (k,) divided by the estimated error of the block: one step of Newton's method, and rounding."""
+        """`distance` (k,) divided by the block's estimated error: the next step of Newton's method plus rounding."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self._estimated_error)
         return distance
@@ -552,7 +559,8 @@ class Derivative:
     def switching(self) -> tuple[int, ...]:
         """Indices of the blocks within ten estimated errors of another state.
 
-        If there are any, several derivatives exist; this one belongs to the present states (`states[i].name`).
+        If there is such a block, the derivative differs between the states; this object has the derivative for the
+        present states (`states[i].name`).
         """
         return tuple(int(i) for i in np.flatnonzero(self.distance_in_errors <= SWITCHING_ERRORS))
 
@@ -565,8 +573,8 @@ class Derivative:
     def motions(self) -> Any:
         """The `SolutionSet` of this problem, computed by `lavender.find_solutions` at the first use.
 
-        Under Coulomb's law there may be several. The derivative belongs to the given solution; it does not include a
-        change of the solver's choice.
+        Under Coulomb's law there may be several solutions. The derivative belongs to the given solution. It does not
+        describe that a solver may find another solution if the data change.
         """
         return import_module_lazily("lavender.lab.motion").get_solutions(self.problem.disk)
 
@@ -598,7 +606,8 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     -------
     Derivative
         `.vjp(velocity=, impulse=)` computes gradients by all data, `.jvp(b=, mu=, ...)` changes of the solution.
-        `.states`, `.distance`, `.switching`, `.unique` and `.motions` show whether the derivative exists and is unique.
+        `.states`, `.distance`, `.switching`, `.unique` and `.motions` show whether the derivative exists and is
+        unique.
 
     Raises
     ------

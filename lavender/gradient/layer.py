@@ -32,9 +32,9 @@ class Step:
     Parameters
     ----------
     cones : Cones
-        Its mu is not used.
+        Blocks of the rows. The coefficients `cones.mu` are not used; mu is an argument.
     bounds : tuple of bytes
-        Fields of `cones` without mu, for comparisons.
+        Contents of all other fields of `cones`, by which two steps are compared.
     friction, solver : str
     tol : float, -
     """
@@ -73,9 +73,10 @@ class Step:
         Parameters
         ----------
         needed : sequence of bool
-            Whether each gradient is computed. The others are zeros; they need not exist.
+            Whether to compute the gradient by each array. Gradients that are not needed are returned as zeros, even if
+            they do not exist.
         *arrays
-            Arrays of `forward`, impulses, cotangents of velocities, cotangents of impulses.
+            Arrays of `forward`, then its impulses, then cotangents of velocities and of impulses.
         """
         arguments = arrays[: len(ARGUMENTS)]
         flat, batch = _flatten_batch(arguments)
@@ -104,7 +105,7 @@ def _flatten_batch(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, 
     arrays = [np.asarray(x, np.float64) for x in arrays]
     batch_shapes = [x.shape[: x.ndim - n] for x, n in zip(arrays, ARGUMENT_AXES, strict=True)]
     batch = np.broadcast_shapes(*batch_shapes)
-    count = prod(batch)  # `reshape` cannot infer it from -1 if an array has no rows.
+    count = prod(batch)  # Computed here, as `reshape(-1, ...)` fails for arrays without entries.
     return [
         np.broadcast_to(x, (*batch, *x.shape[x.ndim - n :])).reshape(count, *x.shape[x.ndim - n :])
         for x, n in zip(arrays, ARGUMENT_AXES, strict=True)
@@ -143,7 +144,7 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
 
 
 def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float) -> Step:
-    """Build the `Step` of these arrays; without cones, all rows belong to contacts, one for each value of mu."""
+    """Build the `Step` of these arrays; if `cones` is None, the rows are divided evenly among one contact per mu."""
     m, k = arrays[0].shape[-2], arrays[3].shape[-1]
     if cones is None:
         if (m or k) and (k == 0 or m % k or not 1 <= m // k <= 3):
@@ -166,7 +167,7 @@ def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver:
 
 @lru_cache(maxsize=256)
 def _reuse_equal_step(step: Step) -> Step:
-    """Return the equal step of an earlier call if there was one, else this step.
+    """Return an equal step of an earlier call if there is one, else `step`.
 
     JAX caches compiled callbacks by the identity of their object, so a new object would be compiled in every call.
     """

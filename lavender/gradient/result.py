@@ -15,8 +15,8 @@ from lavender.problem.derived import cached_property
 
 MATRICES = ("A", "J", "M")
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
-# Data by which solutions can be differentiated, and the forms of problems that have them (see `OPERATORS`). For `jvp`,
-# mu= also accepts coefficients (k, 2).
+# Data by which solutions can be differentiated -> forms of problems that have these data (see `OPERATORS`). In `jvp`,
+# mu may have the shape (k, 2) of `coefficients`.
 INPUTS = {
     **dict.fromkeys(("b", "lower", "upper", "mu", "coefficients", "patch_radius", "rolling"), OPERATORS),
     "A": ("matrix",),
@@ -27,7 +27,8 @@ INPUTS = {
 
 
 COEFFICIENT_INPUTS = ("mu", "patch_radius", "rolling")
-# If several linearly dependent rows share a load, a change of these data in one row contradicts the other rows.
+# Data of single rows. If linearly dependent rows share a load, no derivative by the data of one of them exists,
+# because a change would contradict the other rows.
 ROW_INPUTS = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
 
 
@@ -84,9 +85,10 @@ class Gradient:
     """
 
     def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
-        self._derivative, self._adjoint = derivative, adjoint  # q, s (m), f (nv) and c (m), concatenated.
+        # `_adjoint` holds q, s (m), f (nv) and c (m) of equation (4) in `lavender.gradient`, concatenated.
+        self._derivative, self._adjoint = derivative, adjoint
 
-    if TYPE_CHECKING:  # `_Input` sets these below; lower, upper and the others are (m,) or (k,) arrays.
+    if TYPE_CHECKING:  # Declare the attributes that `_Input` descriptors define below.
         b: FloatArray
         target: FloatArray
         v_free: FloatArray
@@ -119,7 +121,7 @@ class Gradient:
 
     @property
     def _f(self) -> FloatArray:
-        """f = y - J^T s."""
+        """Gradient f = y - J^T s (nv,) by v*, of equation (4)."""
         m = self._derivative.m
         return self._adjoint[2 * m : len(self._adjoint) - m]
 
@@ -134,7 +136,7 @@ class Gradient:
     def __repr__(self) -> str:
         return f"<Gradient of {self._derivative.m} rows by {', '.join(self._derivative.inputs)}>"
 
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
+    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
@@ -150,7 +152,7 @@ class Gradient:
 
     @cached_property
     def _by_fixed_impulse(self) -> FloatArray:
-        """Gradient (m,) by impulses at a bound: c and the effect of the impulse on w and v."""
+        """Gradient (m,) by impulses that are at a bound, including their effect on w and v."""
         derivative = self._derivative
         matrix, compliance = derivative.problem.matrix, derivative.problem.compliance
         if matrix is not None:
@@ -207,7 +209,7 @@ class Gradient:
         return -np.outer(self._s, derivative._impulse)
 
     def _list_outer_product_pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the gradient (5) by A, J or M as pairs (u, v) of the sum of u v^T."""
+        """Return the gradient (5) by A, J or M, a sum of outer products u v^T, as pairs (u, v)."""
         derivative = self._derivative
         if name == "A":
             return [(-self._s, derivative._impulse)]
@@ -225,7 +227,7 @@ class Gradient:
         return _sum_on_pattern(general.mass, *self._list_outer_product_pairs("M"))
 
     def full(self, name: str) -> FloatArray:
-        """Compute the gradient by A, J or M as a dense array, with entries outside of the pattern.
+        """Compute the gradient by A, J or M as a dense array, including entries outside of the sparsity pattern.
 
         Raises
         ------
@@ -238,12 +240,12 @@ class Gradient:
             raise InputError(
                 f"full needs one of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern"
             )
-        getattr(self, name)  # Raises CapabilityError.
+        getattr(self, name)  # Raises CapabilityError if the gradient does not exist.
         return np.asarray(sum(np.outer(u, v) for u, v in self._list_outer_product_pairs(name)))
 
 
 def _sum_on_pattern(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
-    """Compute the entries of the sum of u v^T on the pattern of a matrix in compressed rows."""
+    """Compute the sum of u v^T over `pairs` at the non-zero positions of the matrix `pattern`."""
     row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     data = sum(u[row] * v[pattern.indices] for u, v in pairs)
     return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)

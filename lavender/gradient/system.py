@@ -22,19 +22,19 @@ from lavender_ext.factor.sparse import free_part
 MIN_PIVOT_RATIO = 1e-12
 # Shift of each diagonal entry of a singular G, relative to the entry: eps of equation (6) in `lavender.gradient`.
 SHIFT_OF_SINGULAR = 1e-11
-# Number of proximal steps of (6). Each divides the error of a component by 1 + pivot / shift: eight steps leave 2^-8 if
-# its pivot is as large as the shift, and 1e-16 if it is 100 times as large.
+# Largest number of proximal steps of (6). Each step divides the error of a component by 1 + pivot / shift: eight steps
+# leave 2^-8 of it if the pivot equals the shift, and 1e-16 if the pivot is 100 times the shift.
 MAX_PROXIMAL_STEPS = 8
 # The iteration (6) ends if a step changes x by up to this fraction of its largest entry.
 MIN_PROXIMAL_CHANGE = 1e-14
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
 MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
-# Systems of up to this many rows are also dense if a contact slides, or if A is sparse and not symmetric.
+# Larger systems of up to this many rows are factored as dense matrices if a contact slides, or if A is not symmetric.
 MAX_DENSE_ROWS = 400
 
 Solve = Callable[
     [FloatArray, bool], FloatArray
-]  # The arguments are the right-hand side and whether to transpose.
+]  # Function that solves G x = r; its arguments are r and whether to transpose G.
 
 
 def factor_dense(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
@@ -62,7 +62,7 @@ class System:
             factor = self._factor_symmetric
         else:
             factor = self._factor_dense if self.n <= MAX_DENSE_ROWS else self._factor_lu
-        # `Derivative` has called `factor_dense` for small systems.
+        # For systems of up to MAX_KERNEL_ROWS rows, `Derivative` has called `factor_dense` before.
         is_factored = self.n <= MAX_KERNEL_ROWS
         solve = linear.solve if is_factored and linear.regular else None if is_factored else factor(0.0)
         self.singular = solve is None
@@ -81,14 +81,14 @@ class System:
         return self.linear.solve if factor_dense(self.problem, self.linear, shift) else None
 
     def _form_h(self) -> tuple[Any, Any, FloatArray]:
-        """Form H on the rows of G, in compressed rows."""
+        """Form H on the rows of the system; return the arrays of its compressed rows."""
         a, linear = self.problem.csr, self.linear
         indptr, indices, data = free_part(a.indptr, a.indices, a.data, linear.system_row, self.n)
         root = linear.root[linear.system_row >= 0]
         return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
 
     def _factor_symmetric(self, shift: float) -> Solve | None:
-        """Factor G = H, which is symmetric because no contact slides."""
+        """Factor G with a shifted diagonal if no contact slides: G equals H then and is symmetric."""
         indptr, indices, data = self._form_h()
         system = LinearSystem((indptr, indices), USE_WIDE_LANES)
         failed = system.factor(data, None, shift, MIN_PIVOT_RATIO)
@@ -121,7 +121,7 @@ class System:
         return lambda r, transpose: lu.solve(r, trans="T" if transpose else "N")
 
     def solve(self, r: FloatArray, transpose: bool = False) -> FloatArray:
-        """Solve G x = r or G^T x = r; if G is singular, by (6)."""
+        """Solve G x = r or G^T x = r; if G is singular, iterate by equation (6) of `lavender.gradient`."""
         x = self._solve_factored(r, transpose)
         if self.singular:
             g = self.g.T if transpose else self.g
@@ -133,7 +133,7 @@ class System:
         return x
 
     def draw_null_vectors(self, transpose: bool) -> FloatArray:
-        """Return random unit vectors (NULL_VECTORS, n) in the null space of G or G^T; none if G is regular."""
+        """Return random unit vectors (NULL_VECTORS, n) in the null space of G, or of G^T; empty if G is regular."""
         if not self.singular:
             return np.zeros((0, self.n))
         g, vectors = (self.g.T if transpose else self.g), []

@@ -1,4 +1,4 @@
-"""Condense A = J M^-1 J^T of a file in which M is not a mass matrix; sizes are bounded before any allocation."""
+"""Form A = J M^-1 J^T of a file in which M is not a mass matrix; memory is bounded before any allocation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.io.stored import Budget
 
-DENSE_CHUNK_NUMBERS = 2**23  # Numbers of M^-1 J^T or of A that are stored densely at a time: 64 MiB.
+DENSE_CHUNK_NUMBERS = 2**23  # At most this many entries of M^-1 J^T or A are held densely at a time (64 MiB).
 SPARSE_ENTRY_BYTES = 16  # Bytes of one entry of a sparse matrix: value and index.
 
 
@@ -37,7 +37,7 @@ def form_dense_a(
     a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
     gap = mass - mass.T
     if gap.nnz == 0 or not np.any(gap.data):
-        a = sp.csr_array(0.5 * (a + a.T))  # M is symmetric: A is asymmetric only by the order of additions.
+        a = sp.csr_array(0.5 * (a + a.T))  # With a symmetric M, A is asymmetric only by rounding.
     return a, j @ solve(f)
 
 
@@ -59,9 +59,9 @@ def _make_mass_solver(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function y -> M^-1 y that uses LU factors of a size that is bounded in advance.
 
-    The factors of a component of n unknowns have up to n^2 entries. If that exceeds the budget, the unknowns are
-    ordered for a small bandwidth: with l diagonals below and u above the main diagonal, L and U with row exchanges
-    have up to n (2 l + u + 1) entries.
+    The factors of a connected component of n unknowns have up to n^2 entries. If that exceeds the memory budget, the
+    unknowns are ordered for a small bandwidth: with l diagonals below and u above the main diagonal, L and U with row
+    exchanges have up to n (2 l + u + 1) entries.
     """
     n = matrix.shape[0]
     size = np.bincount(label).astype(float)

@@ -9,11 +9,11 @@ springs, actuation and applied forces. For one step dt:
     contacts       Coulomb's cone, normal first, J at the point between both surfaces, target = correction depth / dt
     joint limits   lambda >= 0, target = -gap / dt, times `correction` if gap < 0
 
-SAP's own contacts are softer: it derives a stiffness, a dissipation and a regularisation of friction from the materials
-and from diag(J A^-1 J^T), and does not publish them. `impulse` returns SAP's impulses nevertheless: with this A and J
-they give SAP's next velocity; otherwise the plant is rejected. For a box, a cart and an arm that come to rest in steps
-of 2 ms, the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median (0.6 % of the change that
-contact causes; 1.3e-9 with the "lagged" approximation), and by up to 0.1 m/s during an impact.
+SAP's own contacts are softer: SAP derives a stiffness, a dissipation and a regularisation of friction from the
+materials and from diag(J A^-1 J^T), and does not publish them. `impulse` returns SAP's impulses: with this A and J
+they must give SAP's next velocity, otherwise the plant is rejected. For a box, a cart and an arm that come to rest in
+steps of 2 ms, the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median (0.6 % of the velocity
+change by contact; 1.3e-9 with Drake's "lagged" approximation), and by up to 0.1 m/s during an impact.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from lavender.io.pinocchio import compute_target_velocity, wrap_engine_errors
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-# A joint limit may push only if it is reached within this many steps at the present speed.
+# A joint limit is converted to a row only if the joint reaches it within this many steps at its present speed.
 LIMIT_HORIZON_STEPS = 4.0
-# Largest accepted error of A (v+ - v*) = J^T lambda, as a fraction of |A| |v+ - v*| + |J|^T |lambda| in SAP's norm [-].
-# SAP's own tolerance leaves less than this; above it, a force that this module does not read acts on the plant.
+# Largest accepted error of A (v+ - v*) = J^T lambda, as a fraction of |A| |v+ - v*| + |J|^T |lambda| in SAP's norm
+# [-]. SAP's own tolerance leaves less than this; above it, a force that this module does not read acts on the plant.
 MOMENTUM_TOLERANCE = 1e-6
 
 
@@ -56,7 +56,7 @@ def from_drake(
     context : pydrake.systems.framework.Context
         The plant's context within the context of its diagram.
     dt : float, optional, s
-        The plant's own time step. Another value is rejected, because impulses and v* belong to that step.
+        Must equal the plant's own time step, the default, because Drake computes impulses and v* for that step.
     friction : {"coulomb", "cone"}
     compliance : scalar or (m,) 1/kg, optional
         Default: none.
@@ -151,7 +151,7 @@ def _build_problem(
 def _check_no_locked_joints(plant: Any, context: Any) -> None:
     """Raise CapabilityError for locked joints.
 
-    Drake removes their velocities from its step, and the process is killed by a signal if they carry contacts.
+    Drake leaves out the velocities of locked joints, and crashes the process if their bodies have contacts.
     """
     from pydrake.multibody.tree import JointIndex
 
@@ -364,7 +364,7 @@ def _complete_impulses(
     for k, limit in enumerate(limits):
         i = limit.velocity
         if limit.gap > LIMIT_HORIZON_STEPS * dt * speed[i]:
-            continue  # The limit is too far away to act.
+            continue  # The joint does not reach this limit within LIMIT_HORIZON_STEPS.
         if limit.sign * momentum_error[i] > MOMENTUM_TOLERANCE * size[i]:
             impulses[first_limit_row + k] = limit.sign * momentum_error[i]
             momentum_error[i] = 0.0

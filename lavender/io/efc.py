@@ -4,12 +4,12 @@
     many = lavender.solve_many(imported.batch)
     lavender.residual_many(imported.batch, imported.impulse).verdict        # judge MuJoCo's own answers
 
-The problem is the one of `lavender.io.mujoco`, with the same rows in the same order. In arrays, with the time step dt:
+Each problem equals the one that `lavender.io.mujoco` builds, with the same order of rows. With the time step dt:
 
     v* = qvel + dt a0      target = dt aref + J qvel      compliance = 1 / D      lambda = dt f
 
 Tangents of an elliptic contact are scaled by friction[j] / friction[0]. float32 numbers are converted exactly, and the
-judge uses the round-off floor of float32. MJX and Warp pad with rows of zeros; these are soft and have no effect.
+judge uses the round-off floor of float32. MJX and Warp pad worlds with rows of zeros, which have no effect.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_kinds
 from lavender_ext.judge.measure import all_finite
 
-# Values of mjtConstraint: an equality, friction loss of a joint and of a tendon, an elliptic contact (the largest
-# value). Rows of all other types only push.
+# Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
+# Rows of all other types have impulses >= 0.
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
 # Arrays that are read for each row, in addition to efc_J, and for each contact: type and shape.
@@ -48,7 +48,7 @@ ROW_FIELDS: dict[str, Any] = dict.fromkeys(
 CONTACT_FIELDS: dict[str, Any] = {
     "efc_address": (np.int32, ()), "dim": (np.int32, ()), "geom": (np.int32, (2,)), "friction": (float, (5,)),
 }  # fmt: skip
-CHUNK_ENTRIES = 2**21  # Entries of J that are converted to float64 at once.
+CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at a time.
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
 # float32, in which the factors of M are rounded, too.
 MASS_TOLERANCES = {"float64": single.MASS_TOLERANCE, "float32": 2.0**-14}
@@ -106,17 +106,17 @@ def from_efc(
     nefc : (n,) int, optional
         Number of rows in use, 0 to m; default m. The rows behind them are not read.
     contacts : (world, efc_address, dim, friction), optional
-        Arrays of the contacts: (c,), (c,), (c,) int and (c, 5). Contacts that begin at an elliptic row in use are
-        read, and must name each of these rows once. All others are ignored.
+        Arrays of the contacts: (c,), (c,), (c,) int and (c, 5). A contact is read if `efc_address` is an elliptic row
+        in use, and ignored otherwise. The contacts that are read must cover each elliptic row exactly once.
     efc_force : (n, m), optional
         The engine's answer.
     qfrc_smooth : (n, nv), optional
-        Compared with M qacc_smooth, to the precision of the data.
+        Force without constraints. If given, it must equal M qacc_smooth to the precision of the data.
     friction : {"cone", "coulomb"}, default "cone"
         Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
         Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.
     like : array, optional
-        The impulses are a copy in the library of this array, as for `solve_many`. Default: NumPy.
+        The impulses are returned as an array of this array's library, as by `solve_many`. Default: NumPy.
 
     Returns
     -------
@@ -202,14 +202,15 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     model : mujoco.MjModel
         Its options (solver, tolerance, iterations, jacobian, ...) determine the answers.
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
-        The result of `mj_getState`. MuJoCo's answer depends on its warm start and its controls, which only
-        mjSTATE_INTEGRATION contains; without them the answer is the one of a start at zero, which has other errors.
-        A row of qpos and qvel is accepted, too.
+        The results of `mj_getState`, or rows of qpos and qvel. MuJoCo's answer depends on its warm start and its
+        controls, which only mjSTATE_INTEGRATION contains. With other states, both are zero, and the answer and its
+        error differ from those of the simulation.
     threads : int
         Number of threads; the results do not depend on it.
     errors : {"raise", "status"}
-        Treatment of a state that is not finite: raise an error, or convert it to a world without rows and with a v_free
-        of NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with errors="status".
+        Treatment of a state that is not finite: raise an error, or convert it to a world without rows and with a
+        v_free of NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with
+        errors="status".
 
     Returns
     -------
@@ -245,7 +246,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     n, nv, sparse = len(values), model.nv, bool(mj.mj_isSparse(model))
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
-    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # The diagonal of M, for states that are not finite.
+    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
     pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
@@ -273,7 +274,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
 
     def jacobian(data: Any) -> FloatArray:
         m = data.nefc
-        if not sparse:  # The array is longer than m nv if MuJoCo counted rows of zeros and left them out.
+        # MuJoCo may allocate rows of zeros that it leaves out: the array is then longer than m nv.
+        if not sparse:
             return np.reshape(data.efc_J[: m * nv], (m, nv))
         jac = np.empty((m, nv))
         mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
@@ -300,9 +302,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
 
 
 class _RowBuffer:
-    """Arrays of many states, one state after the other in the order of arrival.
+    """Growing arrays of the rows of many states, in the order in which the states are appended.
 
-    The allocated size grows to the size that `states` states are expected to need.
+    When an array is full, it is enlarged to the size that `states` states are expected to need.
     """
 
     def __init__(self, states: int, **kinds: tuple[type, tuple[int, ...]]) -> None:
@@ -310,8 +312,8 @@ class _RowBuffer:
             name: np.empty((0, *shape), dtype) for name, (dtype, shape) in kinds.items()
         }
         self.states, self.n, self.capacity = states, 0, 0
-        self.state_numbers: list[int] = []  # The state of each appended range,
-        self.counts: list[int] = []  # and the number of its entries.
+        self.state_numbers: list[int] = []  # Number of the state of each appended range.
+        self.counts: list[int] = []  # Number of entries of each appended range.
 
     def append(self, i: int, source: Any, count: int, **values: FloatArray) -> None:
         """Append `count` entries of state i to each array, from `values` or else from attributes of `source`."""
@@ -329,7 +331,7 @@ class _RowBuffer:
 
 
 def _merge_buffers(parts: list[_RowBuffer], n: int) -> tuple[dict[str, Any], Any]:
-    """Return the arrays of all n states in their order, and the first entry of each state (n + 1,)."""
+    """Return the arrays of all n states, sorted by state, and the index of the first entry of each state (n + 1,)."""
     count, ptr = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
     ranges = [(np.array(part.state_numbers, np.int64), np.array(part.counts, np.int64)) for part in parts]
     for numbers, counts in ranges:
@@ -413,7 +415,7 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
 
 
 def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str) -> None:
-    """Raise CapabilityError if M a0 differs from the smooth force, relative to the size of its terms."""
+    """Raise CapabilityError if M a0 differs from the unconstrained force `force` by more than MASS_TOLERANCES."""
     gap = np.abs(np.einsum("nij,nj->ni", mass.astype(float), smooth) - force).max(axis=1, initial=0.0)
     size = np.einsum("nij,nj->ni", np.abs(mass.astype(float)), np.abs(smooth)).max(axis=1, initial=0.0)
     bad = np.flatnonzero(gap > MASS_TOLERANCES[precision] * size)

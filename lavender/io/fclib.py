@@ -33,13 +33,13 @@ from lavender.problem.generalized import Generalized
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
 ROLLING = "_rolling"  # Suffix of both group names.
 ROLLING_ROWS = 5  # Normal, two tangents, two rolling rows.
-# Shapes of the arrays of a form: m rows of c contacts, p equations, n velocities.
+# Dimensions of the arrays of each form, one letter each: m rows of c contacts, p equations, n velocities.
 PARTS = {
     LOCAL: {"W": "mm", "V": "mp", "R": "pp", "q": "m", "s": "p", "mu": "c", "mu_r": "c"},
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
-BOUNDS_ROW_BYTES = 64  # Bytes per row in `Cones` and b.
-MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A single number in a chunk of more numbers than this is rejected.
+BOUNDS_ROW_BYTES = 64  # [bytes] Memory that `Cones` and b need per row.
+MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A scalar stored in an HDF5 chunk of more numbers than this is rejected.
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Contents:
     def build_problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
         """Return the problem.
 
-        A global problem is returned in generalised coordinates (J = H^T); it is condensed if M is not a mass matrix.
+        A global problem is returned in generalised coordinates (J = H^T), or as A and b if M is not a mass matrix.
 
         Raises
         ------
@@ -151,7 +151,8 @@ class Contents:
     def _build_generalised_form(self, max_bytes: int) -> Generalized | None:
         """Return the generalised form, or None if M is not a mass matrix of bodies.
 
-        M is not one if it is asymmetric or not definite, or if a connected component is too large to factor.
+        M does not count as a mass matrix if it is asymmetric or not positive definite, or if a connected component of
+        it is too large to factor.
         """
         assert self.M is not None
         n = self.M.shape[0]
@@ -326,7 +327,11 @@ class _Reader:
         return m, n
 
     def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
-        """nz = -2 compressed rows, -1 compressed columns, >= 0 triplets (p columns, i rows)."""
+        """Read a sparse matrix of the given shape; None accepts any number.
+
+        FCLIB's `nz` selects the format: -2 compressed rows, -1 compressed columns, nz >= 0 triplets with columns p and
+        rows i.
+        """
         (m, n), nz, nzmax = (
             self.read_matrix_shape(path),
             self.read_integer(f"{path}/nz"),
@@ -353,7 +358,7 @@ class _Reader:
 
 
 def _get_chunk_length(data: Any) -> int:
-    """Return how many numbers HDF5 unpacks at a time, even if fewer are read."""
+    """Return the length of a dataset's chunks: HDF5 decompresses whole chunks, even if fewer numbers are read."""
     return math.prod(data.chunks) if data.chunks else 0
 
 
@@ -437,7 +442,7 @@ def _read_file(r: _Reader) -> Contents:
 
 
 def _read_point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
-    """Read a solution or guess: r, and u, v, l if present; l is required if there are equations."""
+    """Read a solution or guess: r, and u, v and l if they are present; l is required if the problem has equations."""
     point = {"r": r.read_vector(f"{group}/r", m)}
     for name, size in (("u", m), ("v", n), ("l", p)):
         if size and r.has_path(f"{group}/{name}"):
@@ -635,7 +640,7 @@ def _write_file(out: Any, file: Contents) -> None:
             text = file.info.get(name, "").encode()
             _write_array(
                 info, name, np.array(text, f"S{len(text) + 1}")
-            )  # FCLIB reads strings up to the NUL.
+            )  # FCLIB expects strings that end in a NUL character.
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:

@@ -11,7 +11,8 @@ or elliptic, and elliptic contacts are solved by one of two laws:
     contact_resolution = convex       MuJoCo's relaxation: the law "cone"
     contact_resolution = signorini    Coulomb's law over softened rows: the law "coulomb"
 
-The velocity before the step is the velocity after it minus dt qacc. With several substeps only the last one is visible.
+The velocity before the step is computed as the velocity after it minus dt qacc. If a step has several substeps, only
+the last substep can be converted.
 """
 
 from __future__ import annotations
@@ -49,8 +50,9 @@ def from_genesis(scene: Any) -> EngineStep:
     InputError
         `scene` is not a built scene with rigid bodies.
     CapabilityError
-        The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with torsional
-        or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth force.
+        The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with
+        torsional or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth
+        force.
     """
     solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
     if solver is None or not getattr(scene, "is_built", False):
@@ -82,7 +84,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     if not is_elliptic:
         contact_rows = size * _copy_to_host(solver.collider.collider_state.n_contacts).astype(np.int64)
     index = np.arange(m)
-    ends = np.cumsum([equalities, losses, contact_rows], axis=0)[:, :, None]  # (3, n, 1)
+    ends = np.cumsum([equalities, losses, contact_rows], axis=0)[:, :, None]  # Shape (3, n, 1).
     contact_type = ELLIPTIC if is_elliptic else PYRAMIDAL
     row_type = np.select(
         [index < ends[0], index < ends[1], index < ends[2]], [EQUALITY, FRICTION[0], contact_type], LIMIT
@@ -119,8 +121,8 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
 def _list_elliptic_contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any, Any, Any, Any]:
     """Return (world, efc_address, dim, friction) of all elliptic contacts.
 
-    The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of torsional or
-    rolling friction its own coefficient.
+    The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of torsional
+    or rolling friction its own coefficient.
     """
     world = np.repeat(np.arange(len(count)), count)
     number = np.arange(len(world)) - np.repeat(np.cumsum(count) - count, count)
@@ -149,7 +151,7 @@ def _check_configuration(scene: Any, solver: Any) -> None:
 
 
 def _copy_to_host(array: Any, rows: int | None = None) -> Any:
-    """Copy the first `rows` rows of an array of the engine to the host, in its canonical order."""
+    """Copy the first `rows` rows of an engine's array to host memory, in the array's logical order of dimensions."""
     from genesis.utils.misc import qd_to_torch
 
     tensor = qd_to_torch(array, copy=None)

@@ -22,10 +22,10 @@ Without the scaling and with the normal row first, this is the problem of this p
 Bodies that cannot move (inverse mass and inertia 0) keep their velocity: their columns of J are zero, and their motion
 is part of the target.
 
-The matrix that the engine built, D, is compared with the one of J, M and the compliance. This proves that the
-attributes of this version mean what is written here. The comparison runs for the first step of a solver, again
-if its layout changes, and with `verify=True`. Supported are PADMM and DVI, over a dense or sparse Jacobian. LOX solves
-another problem, and sparse dynamics never form D: both are rejected by name.
+The matrix D that the engine built is compared with J M^-1 J^T + diag(compliance). This proves that the attributes of
+the installed version have the meaning assumed here. The comparison runs for the first step of a solver, again if its
+layout changes, and with `verify=True`. Supported are the dynamics solvers PADMM and DVI, over a dense or sparse
+Jacobian. Rejected are LOX, which solves another problem, and sparse dynamics, which never form D.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from lavender.batch.data import Batch
 from lavender.io.engine_step import Claims, EngineStep
 from lavender.problem.cones import CONTACT, ROW, Cones
 
-# Largest accepted difference of the engine's D and J M^-1 J^T + compliance, relative to the largest entry of the world:
-# 200 roundings of float32. Observed: up to 4e-7. A wrong row or a missing term differs by 1e-2 or more.
+# Largest accepted difference of the engine's D and J M^-1 J^T + compliance, relative to the largest entry of the
+# world: 200 roundings of float32. Observed: up to 4e-7. A wrong row or a missing term differs by 1e-2 or more.
 MATRIX_TOLERANCE = 2.4e-5
 # At the first step, up to this number of worlds are compared, the ones with the largest numbers of rows.
 # `verify=True` compares all worlds.
@@ -77,7 +77,8 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     solver : newton.solvers.SolverKamino
         After `step`, and before the next step or reset. Configured with PADMM or DVI, and without sparse dynamics.
     verify : bool, default False
-        Compare the engine's matrix of every world with the one of J, M and the compliance, not only at the first step.
+        Compare the engine's matrix of every world with J M^-1 J^T + diag(compliance) at this step, too. By default
+        this is done only at the first step.
 
     Returns
     -------
@@ -91,8 +92,8 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     InputError
         `solver` is not a SolverKamino, or has no constraints.
     CapabilityError
-        Another configuration (LOX or sparse dynamics); attributes of this version of newton are missing; a body's
-        inverse inertia is singular; or the engine's matrix differs from the one of J, M and the compliance.
+        The solver is configured with LOX or sparse dynamics; the installed version of newton lacks attributes; a
+        body's inverse inertia is singular; or the engine's matrix differs from J M^-1 J^T + diag(compliance).
     """
     verify = check_bool("verify", verify)
     engine = getattr(solver, "_solver_kamino", None)
@@ -163,9 +164,10 @@ class _Layout:
         self.first_body = _as_int(info.bodies_offset)[:n]
         within = np.arange(self.velocity_ptr[-1]) - self.velocity_ptr[self.velocity_world]
         self.velocity_position = COLUMNS_PER_BODY * self.first_body[self.velocity_world] + within
-        # World and index in its group of each dynamic and each effort row, with its position in the joints' arrays.
+        # For each row of joint dynamics and each effort row: world, index within the world, index in the joints'
+        # arrays.
         self.soft_rows = {kind: self._find_soft_rows(kind) for kind in ("dynamic", "effort")}
-        # First row in its world and number of rows of each joint that a joint's kinematic rows form together.
+        # For each joint: index within its world of its first kinematic row, and the number of its kinematic rows.
         world, count = _as_int(joints.wid), _as_int(joints.num_kinematic_cts)
         per_world: Any = np.bincount(world, count, minlength=n).astype(np.int64)
         group = _as_int(info.joint_kinematic_cts_group_offset)[:n]
@@ -204,8 +206,9 @@ class _Worlds:
                 f"{self.rows[world]}. {KAMINO_ADVICE}"
             )
         self.row_ptr, self.velocity_ptr = _cumulate_counts(self.rows), layout.velocity_ptr
-        self.world = np.repeat(np.arange(n), self.rows)  # world of each row
-        self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]  # index within the world
+        self.world = np.repeat(np.arange(n), self.rows)  # World of each row.
+        # Index of each row within its world.
+        self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]
         # Index of the same row in the engine's order: both tangents of a contact, then its normal.
         self.source = self.index.copy()
         self.is_contact_row = self.index >= self.before_contacts[self.world]
@@ -213,7 +216,8 @@ class _Worlds:
         self.source[self.is_contact_row] += NORMAL_FIRST[rank] - rank
         self.begins_contact = np.zeros(len(self.index), bool)
         self.begins_contact[self.is_contact_row] = rank == 0
-        self.position = _as_int(problem.vio)[self.world] + self.source  # in vectors of all rows
+        # Position of each row in the engine's vectors over the rows of all worlds.
+        self.position = _as_int(problem.vio)[self.world] + self.source
         self.jacobian_values, self.jacobian_start = self._read_jacobian()
 
     def _read_jacobian(self) -> tuple[np.ndarray, np.ndarray]:
@@ -274,9 +278,12 @@ class _Worlds:
         return np.bincount(self.world[rows], minlength=self.n) > 0
 
     def _form_jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Return J and J v*: (rows, nv) if worlds have equal numbers of bodies, else one array of all entries."""
+        """Return J and J v* (rows,) [m/s].
+
+        J is (rows, nv) if all worlds have equal numbers of bodies, else a flat array of all entries.
+        """
         values, start = self.jacobian_values, self.jacobian_start
-        first = start[self.world] + self.source * self.columns[self.world]  # of each row
+        first = start[self.world] + self.source * self.columns[self.world]  # First entry of each row.
         if self.layout.has_equal_bodies:
             nv = int(self.columns[0])
             jac = values[first[:, None] + np.arange(nv)].astype(float)
@@ -293,11 +300,15 @@ class _Worlds:
         return jac, products
 
     def _form_mass_matrix(self) -> tuple[Any, np.ndarray]:
-        """Return M, as lower triangles of one pattern or one array of all entries, and the fixed bodies (bodies,)."""
+        """Return M, and a mask (bodies,) of the bodies that cannot move.
+
+        M is given as lower triangles with a common sparsity pattern, or as a flat array of all entries.
+        """
         inv_mass = _copy_as_float64(self.engine._model.bodies.inv_m_i)
         inv_inertia = _copy_as_float64(self.engine.data.bodies.inv_I_i)
         is_fixed = (inv_mass == 0.0) & (inv_inertia == 0.0).all(axis=(1, 2))
-        # M is not read if J is 0. A body with numbers that are not finite makes J v* and so the world NaN.
+        # Bodies that are fixed or have numbers that are not finite get the identity. J is 0 on the former, so M does
+        # not matter; the latter make J v*, and thus the world, NaN.
         is_ordinary = np.isfinite(inv_mass) & np.isfinite(inv_inertia).all(axis=(1, 2)) & ~is_fixed
         inv_mass = np.where(is_ordinary, inv_mass, 1.0)
         inv_inertia = np.where(is_ordinary[:, None, None], inv_inertia, np.eye(3))
@@ -343,7 +354,7 @@ class _Worlds:
         return soft
 
     def _compute_row_bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return lower and upper bounds [N s] and the coefficient of friction of each row; 0 on rows of no contact."""
+        """Return lower bounds, upper bounds [N s] and friction coefficients of all rows; 0 on rows of joints."""
         problem, world, index = self.problem, self.world, self.index
         lower, upper, mu = np.full(len(index), -np.inf), np.full(len(index), np.inf), np.zeros(len(index))
         is_bounded = (index >= self.joints[world]) & (index < (self.joints + self.bounded)[world])
@@ -359,7 +370,7 @@ class _Worlds:
         return lower, upper, mu
 
     def _mark_block_begins(self) -> np.ndarray:
-        """Return the rows (bool) that begin a block: the rows that hold one joint together form one block."""
+        """Return a mask of the rows that begin a block; all kinematic rows of one joint form one block."""
         begins = ~self.is_contact_row | self.begins_contact
         layout = self.layout
         if (layout.joint_rows != self.joints).any():
@@ -400,7 +411,7 @@ class _Worlds:
         return name_blocks_of_world
 
     def _copy_contact_bodies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return world (c,), number in it (c,) and bodies (c, 2) of each contact; -1 is the ground."""
+        """Return world (c,), number within the world (c,) and bodies (c, 2) of each contact; body -1 is the ground."""
         if self.stored_contacts is None or not self.contacts.any():
             return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
         data = self.stored_contacts.data
@@ -416,7 +427,7 @@ class _Worlds:
         }  # fmt: skip
 
     def compare_delassus_matrix(self, i: int) -> float:
-        """Return the largest difference of the engine's D of world i from J M^-1 J^T, relative to its largest entry."""
+        """Return the largest difference of the engine's D from J M^-1 J^T in world i, relative to D's largest entry."""
         size, first_body = int(self.rows[i]), int(self.layout.first_body[i])
         bodies = slice(first_body, first_body + int(self.bodies[i]))
         if size == 0:
@@ -444,12 +455,14 @@ class _Worlds:
 
 
 def _verify_delassus_matrix(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
-    """Compare the engine's matrix with the one of J, M and the compliance if this has not been done.
+    """Compare the engine's matrix D with J M^-1 J^T + diag(compliance), unless it was compared in an earlier step.
+
+    `complete` compares the matrices of all worlds in any case.
 
     Raises
     ------
     CapabilityError
-        They differ in a world of finite numbers.
+        The matrices differ in a world with finite numbers.
     """
     kinds = worlds.count_rows_by_kind()
     layout = worlds.bodies.tobytes(), _as_int(worlds.problem.maxdim).tobytes()

@@ -36,7 +36,8 @@ Differences from rigid contact with Coulomb friction:
 - MuJoCo's friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` returns the problem
   with Coulomb's law if no contact has more than two tangents.
 - MuJoCo evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
-  integrator without implicit damping. The pass of `noslip_iterations` follows the solve and is not part of the problem.
+  integrator without implicit damping. The pass of `noslip_iterations` follows the solve and is not part of the
+  problem.
 
 The data are checked for consistency: every index before it is used; M a0 must equal the smooth force and 1 / R must
 equal efc_D; J must reproduce efc_vel, efc_b and qfrc_constraint. Data of a problem with a matrix other than M are
@@ -62,20 +63,20 @@ from lavender.problem.generalized import Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
 from lavender_ext.io import mujoco_rows
 
-# Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings. MuJoCo computed a0
-# with a factor of the same matrix.
+# Largest accepted difference of M a0 and the smooth force (the force without constraints), relative to their size: 64
+# roundings. A larger difference means that MuJoCo computed a0 with a matrix other than M.
 MASS_TOLERANCE = 2.0**-46
 COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
-# Largest accepted difference of two sums, relative to the size of their terms: 1,000 terms added in another order stay
-# below it, and data that were changed exceed it by far.
+# Largest accepted difference of a product with J from MuJoCo's stored result, relative to the size of its terms.
+# Adding 1,000 terms in another order stays below it; data that were changed exceed it by far.
 SUM_TOLERANCE = 2.0**-40
 # The velocity before the step is recovered from the velocities of bodies only if each joint's axis has at least this
 # fraction that is independent of the joints before it in the same body [-].
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
-# Bytes of MuJoCo's memory for a row (12 numbers and more), a contact, and an entry of efc_J with its column.
+# [bytes] Lower bounds of the memory that MuJoCo allocates for a row, a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
-# Integrators with a constraint problem that uses M itself.
+# Integrators with a constraint problem that uses M and not, for example, M + dt D with joint damping D.
 MASS_MATRIX_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = (
@@ -105,7 +106,7 @@ class _ModelCache:
         self.type_counts = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
         self.tree = model.body_parentid, model.dof_bodyid
         self.mass = model.M_rowadr, model.M_rownnz, model.M_colind
-        # The first operator of this model. Its sparsity pattern is compared before it is reused.
+        # Operator of this model's first problem. Later problems share its index arrays if their patterns are equal.
         self.first_operator: Any = None
 
 
@@ -128,7 +129,8 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     Problem
         In generalised coordinates, with v* and keys of blocks (geoms and number of a contact, joint, tendon,
         equality). The law is "cone" with elliptic friction cones, "lcp" with pyramidal cones or without friction,
-        "linear" with only equalities. The problem has no initial guess; `impulse(model, data)` returns MuJoCo's answer.
+        "linear" with only equalities. The problem has no initial guess; `impulse(model, data)` returns MuJoCo's
+        answer.
 
     Raises
     ------
@@ -277,14 +279,14 @@ def _get_timestep(opt: Any) -> float:
 
 
 def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> Any:
-    """Return (indptr, indices, data) of M's lower triangle; the first two are the arrays of `like` if they are equal.
+    """Return (indptr, indices, data) of M's lower triangle; equal index arrays of the operator `like` are reused.
 
     Raises
     ------
     CapabilityError
         M a0 is not the smooth force: a0 and the problem were computed with a matrix other than M.
     """
-    if seen.n and not data.M[0]:  # The first diagonal entry of a computed M is positive.
+    if seen.n and not data.M[0]:  # M was not computed: its first diagonal entry would be positive.
         raise InputError("M of this MjData is 0: mj_forward(model, data) was not called")
     result = mujoco_rows.lower_triangle_of_mass(
         *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
@@ -347,12 +349,14 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
 
 @np.errstate(over="ignore", invalid="ignore")
 def _compute_compliance(data: Any) -> FloatArray:
-    """Return R (m,) [1/kg] if efc_R and 1 / efc_D differ: 1 / efc_D on rows that a copy of the data did not fill.
+    """Return R (m,) [1/kg] for data in which efc_R and 1 / efc_D differ.
+
+    Rows with efc_R = 0, which a copy of the data did not fill, get 1 / efc_D.
 
     Raises
     ------
     CapabilityError
-        They differ on a row with a nonzero efc_R, or an efc_D is not above 0.
+        efc_R and 1 / efc_D differ on a row with a nonzero efc_R, or an efc_D is not above 0.
     """
     r, inverse = data.efc_R, data.efc_D
     empty = r == 0.0
@@ -365,9 +369,10 @@ def _compute_compliance(data: Any) -> FloatArray:
 
 
 def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
-    """Return the velocities (nv,) of the forward pass.
+    """Return the velocities (nv,) at the last forward pass.
 
-    They are qvel, or after a step they are recovered from the velocities of bodies, which were computed before it.
+    After `mj_forward` these are qvel. After a step they are recovered from the velocities of bodies in `data.cvel`,
+    which MuJoCo computed before the step.
 
     Raises
     ------
@@ -385,7 +390,7 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
         )
     if gap <= SUM_TOLERANCE * size or (
         not np.any(spatial) and np.any(data.efc_vel)
-    ):  # A copy may not fill cvel.
+    ):  # In a copy of the data, cvel may be unset.
         return v
     v = mujoco_rows.recover_joint_velocity(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
     if (
@@ -401,13 +406,13 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
 
 
 def _get_expected_velocity(model: Any, data: Any, m: int) -> FloatArray:
-    """Return efc_vel (m,), which J v must equal, or zeros (no check) if it contains velocities of moving surfaces."""
+    """Return efc_vel (m,), which J v must equal; zeros, which disable the check, if it includes moving surfaces."""
     speed: FloatArray = np.zeros(m) if getattr(model, "flg_surfacevel", False) else data.efc_vel
     return speed
 
 
 def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> None:
-    """Raise an error if J does not reproduce MuJoCo's products with it, to rounding.
+    """Raise an error if products with J differ from MuJoCo's results by more than rounding.
 
     Parameters
     ----------

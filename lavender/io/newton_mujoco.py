@@ -4,9 +4,9 @@
     solver.step(state_in, state_out, control, contacts, dt)
     step = lavender.io.from_newton_mujoco(solver, velocity)
 
-The solver runs MuJoCo Warp; its problem is the one of `lavender.io.efc`. The engine overwrites the velocity before the
-step, so it must be copied. A world with more rows than the engine has memory for is solved without the rest:
-`claims.residuals["dropped_rows"]` counts them, and the problem that is judged is the one that was solved.
+The solver runs MuJoCo Warp; `lavender.io.efc` describes its problem. A step overwrites the velocity, so the caller
+must copy it before the step. If a world has more rows than the engine has memory for, the engine drops some rows:
+`claims.residuals["dropped_rows"]` counts them, and the converted problem does not contain them either.
 """
 
 from __future__ import annotations

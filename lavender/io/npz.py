@@ -1,7 +1,7 @@
 """Read and write problems in NumPy archives (.npz).
 
-Three formats are read: our own, the plain box format, and the format of a benchmark generator. Nothing in an archive is
-executed or unpickled. The memory for all entries is computed from their headers before the first entry is read, and
+Three formats are read: our own, the plain box format, and the format of a benchmark generator. Nothing in an archive
+is executed or unpickled. The memory for all entries is computed from their headers before the first entry is read, and
 the arrays are checked against each other before a kernel uses them. `docs/formats.md` describes each entry.
 """
 
@@ -34,11 +34,11 @@ from lavender.problem.program import recover_program
 from lavender.problem.rows import Rows
 
 FORMAT_VERSION = 1
-MAX_NPY_HEADER_BYTES = 10_000  # Longest accepted .npy header; 100 bytes are usual.
+MAX_NPY_HEADER_BYTES = 10_000  # [bytes] A longer .npy header is rejected; 100 bytes are usual.
 MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has up to 30.
-# Upper bound of the bytes of Python objects per byte of JSON text; nested empty lists need 24.
+# Memory that Python objects need per byte of JSON text, at most; nested empty lists need 24.
 JSON_BYTES_PER_BYTE = 40
-# Compression methods that NumPy writes. With other methods, the archive determines how much memory they use.
+# Compression methods that NumPy writes. Others are rejected: their memory use depends on parameters in the archive.
 ACCEPTED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 CONES = tuple(f"cones_{f.name}" for f in fields(Cones) if f.name != "rolling")
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
@@ -172,7 +172,7 @@ class Archive(Mapping[str, np.ndarray]):
 
 def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
     """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
-    if npy.read_magic(stream) != (1, 0):  # Later versions are for long field names.
+    if npy.read_magic(stream) != (1, 0):  # Later versions of the .npy format are only for long headers.
         raise ValueError("it is a record array or not an array; plain numbers (.npy, version 1.0) are needed")
     shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_NPY_HEADER_BYTES)
     if dtype.kind not in "buifUS":
@@ -291,7 +291,7 @@ def _read_own_format(archive: Archive) -> Stored:
     b, ptr = archive["b"], archive["cones_ptr"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    # This is checked before bounds of as many rows are allocated.
+    # Check the number of rows before bounds of that length are allocated.
     if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
     optional_parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
@@ -373,11 +373,11 @@ def _check_entries(archive: Archive, needed: Collection[str], optional: Collecti
         raise InputError(f"entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION}")
 
 
-# -- plain box format and the benchmark generator's -----------------------------------------------
+# -- plain box format and format of a benchmark generator ------------------------------------------
 
 
 def _read_box_format(archive: Archive) -> Stored:
-    """Read the box format: w = A l - b, lo <= l <= hi complementary to w; the rows of a friction cone are a contact."""
+    """Read the box format: w = A l - b, lo <= l <= hi complementary to w; friction cones become contacts."""
     b = archive["b"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
@@ -412,7 +412,7 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
         raise InputError(
             f"cone_start and cone_dim must name cones of 1 to 3 rows that do not overlap, within the {m} rows"
         )
-    inside = np.zeros(m, bool)  # Rows that do not begin a block.
+    inside = np.zeros(m, bool)  # Whether a row belongs to the block of the row before it.
     for s, e in zip(start, end, strict=True):
         inside[s + 1 : e] = True
     first = np.flatnonzero(~inside)
@@ -452,7 +452,7 @@ def _read_vector(archive: Archive, name: str, problem: Problem) -> FloatArray | 
 
 
 def _read_matrix(archive: Archive) -> Any:
-    """Return the dense `A`, or compressed rows with checked indices."""
+    """Return the matrix A of an archive: the dense entry `A`, or a CSR matrix from entries with checked indices."""
     if "A" in archive:
         return archive["A"]
     m = archive["b"].size

@@ -7,7 +7,7 @@ M is computed by `crba`, J by each constraint model; rows are in the order of th
     anchors (point, frame)   all rows free,           target = -correction error / dt + desired velocity
     point contacts           Coulomb's cone, z first, target = -gap / dt along z, times `correction` if gap < 0,
                              + desired velocity
-    joint limits             lambda >= 0,             the same with the distance to the limit
+    joint limits             lambda >= 0,             target as for contacts, with gap = distance to the limit
     joint friction           |lambda| <= dt times the model's limits, target = 0
 
 A contact's z axis points from the first joint's side to the second's: w > 0 along it is separation.
@@ -102,7 +102,7 @@ def from_pinocchio(
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
-        data.q_in = q  # Joint limits are evaluated at q_in, and no algorithm sets it.
+        data.q_in = q  # Pinocchio evaluates joint limits at q_in, which none of its algorithms sets.
     pairs = zip(constraint_models, constraint_datas, strict=True)
     rows, target, cones, names = _convert_constraints(model, data, pairs, dt, correction)
     return Problem.from_jacobian(
@@ -130,7 +130,7 @@ def _convert_constraints(
         model_of = _unwrap_constraint(wrapped_model)
         _check_constraint(i, model, model_of, _unwrap_constraint(wrapped_data))
         with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
-            data_of = model_of.createData()  # New data have the sizes of this model.
+            data_of = model_of.createData()  # Data of the caller could have the sizes of another model.
             model_of.calc(model, data, data_of)
             jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
         own_cones, target, order = _convert_constraint(model_of, data_of, len(jac), dt, correction)
@@ -158,7 +158,7 @@ def _check_arguments(models: Any, datas: Any, dt: Any, correction: Any) -> tuple
 def _compute_mass_and_acceleration(
     pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any
 ) -> tuple[Any, Any]:
-    """Return M (nv, nv) and the free acceleration (nv,); raise CapabilityError if they do not belong together."""
+    """Return M (nv, nv) and the free acceleration a (nv,); raise CapabilityError if M a is not the applied force."""
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         a = np.array(pin.aba(model, data, q, v, tau))
         force = tau - np.array(pin.nle(model, data, q, v))
@@ -244,7 +244,7 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
     Raises
     ------
     InputError
-        They do not, or a placement is not a rotation.
+        A joint belongs to another model, the data belong to another kind, or a placement is not a rotation.
     CapabilityError
         A frame anchor has a desired offset.
     """

@@ -38,7 +38,7 @@ STATES_FOLDER = "states"
 
 @dataclass(frozen=True)
 class StepVerdict:
-    """Verdict about the engine's answer for one world in one step, which `when` receives.
+    """Verdict about the engine's answer for one world in one step; `Recorder` passes it to `when`.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class StepVerdict:
         Number of the call of `add`, from 0, and the world's index in it.
     rows : int
     velocity_error : float, m/s
-        Of the worst row; NaN if the world cannot be judged.
+        Velocity error of the worst row; NaN if the world cannot be judged.
     relative : float
         Relative residual [-].
     verdict : str
@@ -85,12 +85,12 @@ class Recorder:
     solver : str, default "engine"
         Name of the engine's solver in the records.
     replace : bool, default False
-        Remove the problem files of another recording from the folder. Without it, such a folder is an error.
+        Whether to remove the problem files of another recording from the folder; if false, such files raise an error.
 
     Raises
     ------
     InputError
-        Nothing is selected, an argument is invalid, or the folder holds a recording or cannot be written.
+        No world can be selected, an argument is invalid, or the folder holds a recording or cannot be written.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Recorder:
         self._worst: list[
             tuple[float, str]
         ] = []  # Heap of (velocity error, file) with the smallest error first.
-        self._unjudged: set[int] = set()  # Worlds that already have a line for their first invalid step.
+        self._unjudged: set[int] = set()  # Worlds with a line about their first step that cannot be judged.
 
     def __enter__(self) -> Recorder:
         return self
@@ -283,7 +283,7 @@ class Recorder:
         return True
 
     def _add_to_worst_files(self, error: float, name: str) -> None:
-        """Add a file to the worst ones; remove the file that leaves them unless it was selected."""
+        """Add a file to the `keep_worst` files with the largest errors; delete the one it replaces, unless selected."""
         if len(self._worst) < self.keep_worst:
             heapq.heappush(self._worst, (error, name))
             return

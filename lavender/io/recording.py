@@ -37,13 +37,13 @@ class Recording:
     files : tuple of str
         Names of the problem files.
     without : int
-        Selected steps without constraints.
+        Number of selected steps that had no constraints and therefore have no file.
     left_out : tuple of str
         Reasons why steps could not be exported, one line each.
     above_floor : int
-        MuJoCo's answers with an error above the round-off floor.
+        Number of MuJoCo's answers with an error above the round-off floor.
     stopped : int
-        Of these, the answers with a velocity error above `threshold`.
+        Number of MuJoCo's answers with an error above the round-off floor and a velocity error above `threshold`.
     threshold : float, m/s
     worst : str
         Verdict, velocity error and row of the worst answer.
@@ -104,15 +104,15 @@ def record(
         Steps of the simulation.
     every : int
     control : {"random", "zero"}, array (any, nu), or callable (model, data, step)
-        "random" draws uniformly within the ranges of the actuators. An array is played row by row and repeated from
-        its start. The result of a callable is written to `data.ctrl`, unless it is None.
+        "random" draws uniformly within the ranges of the actuators. An array has the controls of consecutive steps and
+        is repeated from its start when it ends. The result of a callable is written to `data.ctrl`, unless it is None.
     seed : int
         Seed of "random".
     states : path of an .npz, "keyframes", or arrays, optional
         Start states (`lavender.io.states`): the steps are divided evenly among them. The first step from a state uses
         its controls, if it has any. Default: `data` as it is.
     replace : bool
-        Remove the problem files of another recording from the folder. Without it, such a folder is an error.
+        Whether to remove the problem files of another recording from the folder; if false, such files raise an error.
     precision : {"float64", "float32"}
         Precision in which this MuJoCo computes (`mjtNum`); written with each problem.
     threshold : float, m/s
@@ -187,7 +187,7 @@ def record(
 def _solve_step(
     mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
 ) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
-    """Solve the constraints of the present step with MuJoCo, without a step in time; None without constraints.
+    """Solve the constraints of the present state with MuJoCo without advancing time; return None without constraints.
 
     Returns
     -------
@@ -225,7 +225,7 @@ def record_file(
     Raises
     ------
     InputError
-        As `record`, or no step had a constraint that could be exported.
+        `record` raises it, or no step had a constraint that could be exported.
     """
     mj, model = load_model(path)
     result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
@@ -258,7 +258,7 @@ def load_controls(control: Control) -> Control:
 def _load_controls_npy(path: str) -> Any:
     """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
     try:
-        read_first_bytes(path)  # Checks that it is a regular file.
+        read_first_bytes(path)  # Raises an error if `path` is not a regular file.
         # A memory map cannot be longer than the file, whatever size the header declares.
         result = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, BadZipFile) as error:

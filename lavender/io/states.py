@@ -30,7 +30,7 @@ OPTIONAL = (
     "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
     "xfrc_applied",
 )  # fmt: skip
-LABELS = ("world", "step")  # Arrays that `lavender audit` also writes: the origin of each state.
+LABELS = ("world", "step")  # Additional arrays in the files of `lavender audit`: the origin of each state.
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class StartStates:
     Parameters
     ----------
     vectors : (n, size)
-        As `mj_getState` gives them for mjSTATE_INTEGRATION.
+        State vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
     controls : (n, nu), optional
         Controls of the first step; None if the source has none.
     """
@@ -76,14 +76,15 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     Raises
     ------
     InputError
-        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no keyframes.
+        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no
+        keyframes.
     """
     if isinstance(source, StartStates):
         return source
     if isinstance(source, str) and source == KEYFRAMES:
         return _read_keyframes(mj, model)
     if isinstance(source, (str, os.PathLike)):
-        read_first_bytes(source)  # Checks that it is a regular file.
+        read_first_bytes(source)  # Raises an error if `source` is not a regular file.
         with closing(Archive(source)) as archive:
             return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
     arrays = source if isinstance(source, Mapping) else {VECTOR: source}

@@ -30,17 +30,18 @@ ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of re
 MAX_BYTES = (
     2**31
 )  # Default limit of the memory for the arrays of a file; a file of a megabyte can declare a terabyte.
-# Characters of the file's name in the name of its temporary file. A name may have 255 bytes, four per character.
+# The name of a temporary file contains this many characters of the final name; names may have 255 bytes, and a
+# character up to four.
 TEMPORARY_NAME_CHARACTERS = 40
 # Name of the lock file of an output folder. The lock of an output file is FILE.lock.
 FOLDER_LOCK = ".lavender.lock"
-# An output is written without a lock if its file system answers with one of these errors: it has no locks.
+# Errors with which a file system without locks answers; an output on it is written without a lock.
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
-# Time [s] after which an output counts as locked: long enough for a second try if the other command ends meanwhile.
+# [s] An output counts as locked if its lock is not obtained in this time, which allows several attempts.
 LOCK_TIMEOUT = 0.2
 NUMBER_BYTES = 8  # Bytes of a number in memory: float64, or an index before it is checked.
 TEMPORARY_NAME = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # Names of files that are not complete yet.
-# Age [s] above which a temporary file is removed: its writer was killed, because no write takes this long.
+# [s] Older temporary files are removed: no write takes this long, so their writer was killed.
 MAX_TEMPORARY_AGE = 86400.0
 
 
@@ -86,8 +87,8 @@ def lock_step_folder(
     """Lock a folder for recorded problems, create it if necessary, and return its path until the block ends.
 
     The folder must not hold problem files, because the steps of two recordings are not one sequence. `replace` removes
-    the problem files and the engine's results; with `continued`, the files belong to this recording and stay. Another
-    recording to the same folder is an error meanwhile.
+    the problem files and the engine's results. With `continued`, the files belong to the present recording and are
+    kept. Another recording to this folder raises an error until the block ends.
 
     Raises
     ------
@@ -150,8 +151,8 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
         yield path
     finally:
         if lock.is_locked:
-            # The file is removed before the lock is released: FileLock rejects a file without a name. Windows cannot
-            # remove an open file.
+            # Remove the lock file before releasing the lock; a process that waits for it detects that the file was
+            # removed. On Windows, where an open file cannot be removed, the file remains.
             with contextlib.suppress(OSError):
                 os.unlink(lock.lock_file)
             lock.release()
@@ -191,7 +192,7 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
     elif target.exists() and os.path.samestat(status, target.stat()):
         return target
     else:
-        kind = "a file that has lost its name"  # A path of an open descriptor, as /dev/fd/3.
+        kind = "a file that has lost its name"  # The path names an open file descriptor, as /dev/fd/3.
     raise InputError(f"cannot write {path}: it is {kind}, which is not replaced; give the name of a file")
 
 
@@ -201,7 +202,7 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
     Raises
     ------
     InputError
-        It cannot be written.
+        The file or folder cannot be written.
     """
     path = as_path(path)
     parent = _resolve_links(path) if folder else resolve_destination(path).parent
@@ -242,9 +243,10 @@ def _explain_write_failure(error: OSError, folder: Path) -> str:
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
-    """Call `write` with a temporary path in the same folder, then rename: readers see the old file or the new one.
+    """Write a file atomically, so that readers see the old file or the complete new file.
 
-    Symbolic links are followed: their target is replaced, the links stay. The permissions of the file stay, too.
+    `write` is called with a temporary path in the folder of the file, which is then renamed. If `path` is a symbolic
+    link, the target of the link is replaced. The permissions of an existing file are kept.
 
     Raises
     ------
@@ -257,7 +259,8 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     _remove_old_temporaries(target.parent)
     try:
         write(temporary)
-        with contextlib.suppress(OSError):  # The file may be new, or the file system may have no modes.
+        # A new file has no permissions to keep, and some file systems have none.
+        with contextlib.suppress(OSError):
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
@@ -282,9 +285,10 @@ def _remove_old_temporaries(folder: Path) -> None:
 
 
 def _is_process_running(process: int) -> bool:
-    """Return whether a process of this machine exists: a changed clock makes its temporary file look old.
+    """Return whether a process of this machine is running, so that its temporary files are not removed.
 
-    It is False on Windows, which does not remove open files.
+    A temporary file of a running process may look old if the clock was changed. On Windows, which does not remove open
+    files, the result is False.
     """
     if os.name != "posix":
         return False
@@ -308,7 +312,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
-    """Return the content of a file if it is current, else make it, and write it to the file if that is possible."""
+    """Return the content of a file if `is_current` accepts it; else return the result of `make` and try to store it."""
     if path.exists() and is_current(content := path.read_bytes()):
         return content
     content = make()
@@ -322,7 +326,8 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Non
 
     def write_to(temporary: Path) -> None:
         with open(temporary, "xb") as stream:
-            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would write allow_pickle as an entry.
+            # Without allow_pickle: NumPy before 2.1 stores it as an entry.
+            np.savez_compressed(stream, **arrays)
 
     write_atomically(path, write_to)
 
@@ -352,7 +357,7 @@ def write_figure(canvas: Any, path: str | os.PathLike[str], **options: Any) -> N
     from matplotlib import rc_context
 
     try:
-        with rc_context({"pdf.fonttype": 42}):  # TrueType fonts: publishers reject Type 3.
+        with rc_context({"pdf.fonttype": 42}):  # Embed TrueType fonts, since publishers reject Type 3 fonts.
             write_atomically(
                 path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **options)
             )

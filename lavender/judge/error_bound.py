@@ -22,7 +22,8 @@ Any other one is uncertain: P0 is the middle of all values that P may have, and 
     the same, Coulomb           P lower triangular             P0 = I / 2, e = (a + sqrt(a^2 + 1)) / 2, a^2 = sum a_g^2
     sticks or slides, Coulomb   I + phi u (a e_n - u)^T        phi = 1/2, e = sqrt(1 + a^2) / 2, u = y_t / |y_t|
     the same, cone              I - phi q q^T, q ~ (a, -u)     phi = 1/2, e = 1/2
-    slides, two or more rows    P turns with u                 P0 = P and, with x >= |dy|, t = |y_t|, kappa = a s_n / t,
+    slides, two or more rows    P turns with u                 P0 = P and, with x >= |dy|, t = |y_t|, kappa = a s_n /
+    t,
                                 e = (a x_n + kappa x_t) / (t - x_t) + (kappa + a) x_t / (t - x_t)                   (5)
 
 Why it holds: all mean values in the box of (3) or (4) are regular, so F is one-to-one on the box and a local

@@ -28,7 +28,7 @@ REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = (
     "clarabel_cone",
     "block_gauss_seidel",
-)  # Reference solvers, in order, under the law "cone" (relaxed friction), whose problem is not a QP.
+)  # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
 # A reference must reach this relative residual, or 10 times the round-off floor.
 REFERENCE_MAX_RESIDUAL = 1e-9
 

@@ -187,7 +187,7 @@ def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
 
 
 def find_changed_problems(entries: Iterable[Entry]) -> Iterator[str]:
-    """Build every problem again from its name; yield a line for each whose numbers differ from its entry's hash."""
+    """Build every problem again from its name; yield a line for each that does not have the hash of its entry."""
     for entry in entries:
         problem = suite.case(entry.name).problem
         if (now := hash_problem(problem)) != entry.sha:

@@ -240,7 +240,7 @@ class Frame(NamedTuple):
     rows : (worlds,) int
         Number of rows that are not padding.
     contacts : (worlds,) int
-        Number of contacts whose rows are not padding.
+        Number of contacts with rows that are not padding.
     """
 
     batch: Batch
@@ -435,7 +435,7 @@ class WarpWorlds:
     mj : module
         MuJoCo.
     model : mujoco.MjModel
-        Model whose option for the Jacobian is dense.
+        Model with the option of a dense Jacobian.
     start_arrays : dict of (worlds, ...)
         State in which the worlds start, by the names of MjData.
     """

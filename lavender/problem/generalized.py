@@ -3,8 +3,8 @@
     w = J v+ - target + compliance lambda,   v+ = v* + M^-1 J^T lambda,   A = J M^-1 J^T + diag(compliance)
 
 M is factored once, M = L^T D L, rows from the last to the first. In the order of a kinematic tree, with parents before
-their children, leaves are eliminated first and there is no fill-in. Other matrices are reordered to reduce fill-in; see
-`lavender_ext/core/generalized.pxd`.
+their children, leaves are eliminated first and there is no fill-in. Other matrices are reordered to reduce fill-in;
+see `lavender_ext/core/generalized.pxd`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stac
 from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
 from lavender_ext.factor.graph import least_degree
 
-# |M_ij - M_ji| above this fraction of sqrt(M_ii M_jj) is an error: rounding of sums over bodies in float64 causes less.
+# |M_ij - M_ji| above this fraction of sqrt(M_ii M_jj) is an error: rounding of sums over bodies in float64 causes
+# less.
 MAX_ASYMMETRY = 1e-12
 MAX_ASYMMETRY_FLOAT32 = 2.0**-16  # The same if M has dtype float32; its lower triangle is used.
 # With fewer velocities, a factorisation costs less than the search of an order.

@@ -7,7 +7,8 @@ With the rows J x = target (the first ones) and J x >= target (the others),
     J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]                                    (2)
 
 f: variables with lb = ub; l, u: other finite bounds; G without rows with infinite h. Numbers of at least 1e20 in
-absolute value count as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others, and
+absolute value count as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others,
+and
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 

@@ -87,7 +87,7 @@ class Advice:
     family: str
     target: float  # Tolerance [-] or time [s].
     ranking: tuple[Choice, ...]
-    # Number of leading solvers of `ranking` whose results are equal within noise, in a fixed order.
+    # The first this many solvers of `ranking` are equal within noise; their order is fixed.
     equal: int = 1
     min_share: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
 
@@ -267,8 +267,8 @@ def rank_within_time(
 ) -> Advice:
     """Rank solvers by the residual that they leave on these cases, or steps, within a time [s].
 
-    Whether a run whose time equals the limit within noise counts is a matter of chance. A solver that would rank first
-    with a limit that is larger by the noise is therefore listed as equally good as the best.
+    Whether a run counts is a matter of chance if its time equals the limit within noise. A solver that would rank
+    first with a limit that is larger by the noise is therefore listed as equally good as the best.
     """
     selected = _select_groups(cases, _group_runs(records) if groups is None else groups)
     liars = _list_false_claims(records, cases)

@@ -31,7 +31,7 @@ from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
 SAMPLES = 500  # Number of resamplings for each ranking.
-# Resamplings are computed in groups whose arrays have at most this many entries.
+# Resamplings are computed in groups, with arrays of at most this many entries.
 MAX_ARRAY_ENTRIES = 1_000_000
 CERTAIN_SHARE = 0.8  # A second solver is named if the first wins a smaller share of the resamplings.
 # A solver that wins this share of the resamplings is as good a choice as the first.

@@ -39,7 +39,7 @@ from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
 TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
-STRICT_RESIDUAL = 1e-9  # Tolerance of a second run of lavender's solver, whose residual is reported.
+STRICT_RESIDUAL = 1e-9  # Tolerance of a second run of lavender's solver; its residual is reported.
 MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # The loosest tolerance comes first.
 N_REPEATS = 20
 BATCH_SIZE = 64  # Number of problems in one call of solve_many.

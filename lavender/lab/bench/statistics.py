@@ -179,7 +179,7 @@ class Claims:
         Number of runs with the status CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE, and number of these statuses that the
         judge contradicts.
     attempted, reached : int
-        Number of runs to a tolerance, and number of these runs whose judged residual reached it.
+        Number of runs to a tolerance, and number of these runs that reached it by the judged residual.
     crashed : int
         Runs with the status ERROR, KILLED or CRASHED.
     """

@@ -241,7 +241,7 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
 
 
 def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask (c,) of the contacts whose targets are bounces, which do not depend on gaps.
+    """Return a mask (c,) of the contacts with targets that are bounces and do not depend on gaps.
 
     A target is a bounce if it is -e times the normal velocity `before` the step (c,) [m/s], with the same restitution
     coefficient e for all of these contacts.

@@ -535,9 +535,9 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 
         kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
 
-    so that two impulses whose difference moves no body (a table on four legs) have distance 0. The bound holds for any
-    reference, also an inaccurate one: with e the judge's error of lambda*, the solution of the problem with targets
-    shifted by d e is within sqrt(1/2) |e|_A of lambda* (proof in `lavender.lab.motion.bound`).
+    so that two impulses with a difference that moves no body (a table on four legs) have distance 0. The bound holds
+    for any reference, also an inaccurate one: with e the judge's error of lambda*, the solution of the problem with
+    targets shifted by d e is within sqrt(1/2) |e|_A of lambda* (proof in `lavender.lab.motion.bound`).
 
     Parameters
     ----------

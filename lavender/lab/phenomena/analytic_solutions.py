@@ -1,4 +1,4 @@
-"""Analytic solutions of phenomena whose formulas need a function of their own."""
+"""Analytic solutions of phenomena that need more than one formula."""
 
 from __future__ import annotations
 

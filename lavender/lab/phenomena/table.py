@@ -45,7 +45,7 @@ def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
 
 
 def format_markdown_table(records: Sequence[Record]) -> str:
-    """Build a Markdown table whose cells have the worst value of the first quantity and the number of passed cases.
+    """Build a Markdown table; its cells have the worst value of the first quantity and the number of passed cases.
 
     A cell is bold if a case failed.
     """

@@ -21,7 +21,7 @@ all give the same velocities.
 Ball arithmetic cannot distinguish a zero from a small number. That a row has both zero impulse and w = 0 is proven if
 it depends exactly on rows with non-zero impulse, or if a solution in rational numbers shows it (nothing slides, at
 most MAX_RATIONAL_UNKNOWNS unknowns). Otherwise the row is named as on the boundary of two cases, unless a proof
-succeeds that starts from an answer of INTERIOR_SOLVERS, whose impulses are inside a family.
+succeeds that starts from an answer of INTERIOR_SOLVERS, inside a family.
 
 Needs python-flint (extra `proof`).
 """

@@ -47,7 +47,8 @@ class Enclosure:
         Whether it is proved that all solutions have the same velocities. This holds for convex laws; under Coulomb's
         law it needs `motion.prove_uniqueness`.
     reason : str
-        If nothing is proven: the cause and a remedy. If a solution is proven: the rows whose impulses are not unique.
+        If nothing is proven: the cause and a remedy. If a solution is proven: the rows with impulses that are not
+        unique.
     impulse : (m,) N s, or None
         The exact solution, rounded.
     boundary : tuple of str

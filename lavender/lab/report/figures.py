@@ -161,7 +161,7 @@ def build_overall_figure(records: Records, measure: str = "time") -> Figure:
     ----------
     records : Records
     measure : {"time", "work"}
-        Horizontal axis. "work": number of passes over A, for solvers whose work consists of such passes only.
+        Horizontal axis. "work": number of passes over A, for solvers that do no other work.
     """
     by_work = measure == "work"
     single = any(r.step < 0 for r in records)

@@ -4,10 +4,10 @@ All times are times of one call of `lv.solve`, also for solvers of other package
 part of the time that is spent in their own interface.
 
 paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
-paper/work-over-all.pdf     error against passes over A, for solvers whose work consists of such passes only
+paper/work-over-all.pdf     error against passes over A, for solvers that do no other work
 paper/class-FOLDER.pdf      these two figures for each folder that the cases came from, if there are several
 paper/profile-LAW-X.pdf     performance profiles by time, for each friction law and tolerance
-paper/work-profile-....pdf  performance profiles by passes over A, for solvers whose work consists of such passes only
+paper/work-profile-....pdf  performance profiles by passes over A, for solvers that do no other work
 paper/sequence-....pdf      each step of a sequence
 paper/figures.tex           these figures with their captions
 paper/tables.tex            recommendations, mean times by law, own interfaces, claims against the judge (booktabs)
@@ -122,7 +122,7 @@ def _reduce_figure_to_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
     Only the first two curves keep their bands.
     """
     if all(c.steps for c in figure.curves):
-        # Step functions are performance profiles, whose solvers `build_profile_figure` has selected.
+        # Step functions are performance profiles: `build_profile_figure` has selected their solvers.
         return figure
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))

@@ -413,8 +413,8 @@ def _place_curve_names(
 ) -> dict[int, tuple[float, float]]:
     """Return the positions of the names of curves: at their ends, with a distance between the names of leaders.
 
-    If a curve is drawn as points without a line, all names are listed to the right of the axes, whose right end is
-    `edge`, because a name next to a point would cover other points.
+    If a curve is drawn as points without a line, all names are listed to the right of the axes, beyond `edge`, because
+    a name next to a point would cover other points.
     """
     if any(c.points for c in curves):
         return {i: (edge + 24.0, TOP + FONT_SIZE + MIN_NAME_DISTANCE * i) for i in range(len(curves))}

@@ -55,7 +55,7 @@ class Cell:
 
     @classmethod
     def size(cls, value: float, **more: Any) -> Cell:
-        """Create the cell of a number of any magnitude, whose format the column chooses."""
+        """Create the cell of a number of any magnitude; the column chooses its format."""
         return cls("", value=value, quantity="size", **more)
 
     def __str__(self) -> str:

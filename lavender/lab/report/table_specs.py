@@ -407,7 +407,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
 
 
 def tabulate_skipped_runs(skips: Sequence[Skip]) -> Table:
-    """Tabulate pairs of case and solver that were not run, or whose runs were stopped."""
+    """Tabulate pairs of case and solver that were not run, or were stopped during their runs."""
     return Table(["case", "solver", "reason"], [[s.case, s.solver, s.reason] for s in skips])
 
 

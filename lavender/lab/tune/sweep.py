@@ -36,7 +36,7 @@ TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
 N_TRIAL_ROUNDS = 2
 # Variants of a setting on the Pareto front are tried if it takes at most this multiple of the present setting's time.
 MAX_VARIED_TIME_RATIO = 1.5
-# Assumed number of settings whose variants are tried, to estimate the remaining time.
+# Assumed number of settings with variants that are tried, to estimate the remaining time.
 EXPECTED_VARIED_SETTINGS = 4
 TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
 

@@ -129,7 +129,7 @@ class Item:
     defines : set of str
         Names that the declaration defines.
     origin : str
-        Module in whose file the declaration is.
+        Module that contains the declaration.
     kept_names : frozenset of str
         Core functions that keep their names.
     """

@@ -403,7 +403,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
 
 
 def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
-    """Return the record of a measurement whose last repeat returned the solution `s`."""
+    """Return the record of a measurement; its last repeat returned the solution `s`."""
     setups, solves = outcome.setups, outcome.solves
     times = outcome.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual

@@ -33,7 +33,7 @@ def map_bodies_to_parent_joints(scene: Scene, engine: str) -> dict[int, Joint]:
 def get_collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
     """Return the collision shape of a body.
 
-    Raise CapabilityError if the body has no shape. If `static` is false, raise it also for a static body whose shape
+    Raise CapabilityError if the body has no shape. If `static` is false, raise it also for a static body that
     is not a plane.
     """
     shape = body.shape
