@@ -193,7 +193,7 @@ __all__ = [
 ]
 
 
-if not TYPE_CHECKING:  # Type checkers report unknown names.
+if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
     def __getattr__(name):
         if name in _LAZY_MODULES:
@@ -210,6 +210,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and the solvers that `auto` runs
-    get(_name)  # imported with the package, because the first solve may have a time limit
+# Import `auto` and the solvers that it runs with the package, because the first solve may have a time limit.
+for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):
+    get(_name)
 lavender.base.early_sigint.restore_keyboard_interrupt()

@@ -26,7 +26,7 @@ except ImportError as error:
 
 
 def _call(function: Any, like: Any, arrays: Any) -> Any:
-    # `vmap` adds a leading axis to every array.
+    # With "broadcast_all", `vmap` adds a leading axis to every array.
     return jax.pure_callback(function, like, *arrays, vmap_method="broadcast_all")
 
 
@@ -40,7 +40,7 @@ def _forward(step: Step, *arguments: Any) -> Any:
     """Solve, and return the result and the data for `_backward`."""
     arrays = tuple(x.value for x in arguments)
     result = _solve(step, *arrays)
-    # Saved values are traced, but `jit` compiles for each structure: () or None marks whether a gradient is needed.
+    # `jit` traces saved values but compiles for each structure, so () and None mark whether a gradient is needed.
     return result, (arrays, result[1], tuple(() if x.perturbed else None for x in arguments))
 
 
@@ -77,8 +77,8 @@ def solve(
 ) -> tuple[Any, Any]:
     """Compute the velocities and impulses of one step, with gradients by all arrays.
 
-    Parameters and results are as for `lavender.torch.solve`, with JAX arrays. The solve runs on the CPU, outside of the
-    code that JAX compiles.
+    Parameters and results are as for `lavender.torch.solve`, with JAX arrays. The solve runs on the CPU, outside of
+    the code that JAX compiles.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def solve(
             raise InputError(
                 f"{name} is {x.dtype}; float64 is needed: jax.config.update('jax_enable_x64', True) before it is made"
             )
-    infer_result_shapes(arguments)  # raises InputError
+    infer_result_shapes(arguments)  # Raises InputError if the shapes disagree.
     # `broadcast_all` of `vmap` adds its axis at the front, so all arrays need the same number of batch axes.
     batch_axes = max(x.ndim - n for x, n in zip(arguments, ARGUMENT_AXES, strict=True))
     arguments = [

@@ -58,7 +58,7 @@ class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """Save nothing."""
+        """Save no arguments, because no second derivatives exist."""
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
@@ -76,7 +76,7 @@ class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
 def _move_batch_axis(info: Any, dims: Any, arrays: Any, axes: Any) -> list[Any]:
     """Move the new batch axis of every array to the front, before the batch axes that the arrays already have.
 
-    `axes`: number of axes of each array without batch axes.
+    `axes` holds the number of axes of each array without batch axes.
     """
     n_inner = max(x.ndim - (d is not None) - n for x, d, n in zip(arrays, dims, axes, strict=True))
     out = []
@@ -115,7 +115,7 @@ def solve(
     target, compliance : (..., m), optional
         m/s and 1/kg; default 0.
     cones : Cones, optional
-        Bounds of the rows; its mu is not used.
+        Bounds of the rows; `cones.mu` is not used, as mu is an argument.
     friction, solver, tol
         As for `Problem.from_jacobian` and `lavender.solve`.
 
@@ -146,7 +146,7 @@ def solve(
             raise InputError(
                 f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
             )
-    infer_result_shapes(arguments)  # raises InputError
+    infer_result_shapes(arguments)  # Raises InputError if the shapes disagree.
     arguments[1] = 0.5 * (arguments[1] + arguments[1].transpose(-1, -2))
     velocity, impulse = _Solve.apply(make_step(arguments, cones, friction, solver, tol), *arguments)
     return velocity, impulse

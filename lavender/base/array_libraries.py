@@ -24,7 +24,8 @@ def find_converter(like: Any) -> Callable[[np.ndarray], Any] | None:
     Returns
     -------
     callable or None
-        Each call copies. None if `like` is None or a NumPy array: results stay NumPy arrays.
+        Function that copies a NumPy array to the library of `like`. None if `like` is None or a NumPy array, because
+        results are then returned as NumPy arrays.
 
     Raises
     ------
@@ -61,7 +62,8 @@ def _to_jax(array: np.ndarray, like: Any) -> Any:
 
     is_float = array.dtype.kind == "f" and np.dtype(like.dtype).kind == "f"
     values = np.array(array, like.dtype if is_float else None)
-    devices = getattr(like, "devices", None)  # An abstract array of a trace has none.
+    # An abstract array, as JAX passes while tracing, has no devices.
+    devices = getattr(like, "devices", None)
     if isinstance(like, jax.core.Tracer) or devices is None:
         raise InputError(
             "like is an abstract array of a JAX transformation: use lavender.jax inside of jit or grad"

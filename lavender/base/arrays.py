@@ -1,8 +1,8 @@
-"""Validation of arguments: dtype, shape and range of arrays; numbers, flags and names. Kernels check nothing.
+"""Validation of arguments: dtype, shape and range of arrays; numbers, flags and names. Kernels do not validate.
 
-The ranges are defined in `lavender_ext/core/validate.pxd`: absolute values do not exceed 1e60, and masses,
-lengths and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer,
-so the message suggests a unit to change.
+The ranges are defined in `lavender_ext/core/validate.pxd`: absolute values do not exceed 1e60, and masses, lengths and
+other nonnegative quantities are 0 or at least 1e-60. A problem can be written in other units without changing its
+solution, so the message about a number out of range suggests a unit to change.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 ArrayLike = (
     npt.ArrayLike
-)  #: A number, nested sequences of numbers, or an array; docstrings give shape and unit.
+)  #: Type of arguments: a number, nested sequences of numbers, or an array; docstrings give shape and unit.
 
 
 FLOAT64, FLOAT32, INT32 = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.int32)
@@ -113,12 +113,13 @@ def as_array(
     name : str
         Name of the argument in messages.
     value : array_like
-        A scalar fills a one-dimensional shape of known length. An empty list fits any shape without rows.
+        A scalar is repeated if the shape is one-dimensional with a known length. An empty list is accepted for any
+        shape with a first length of 0 or None.
     shape : tuple of int or None
         Required shape; None allows any length.
     dtype : {numpy.float64, numpy.int32}
     finite : bool, default True
-        Reject numbers that are not finite, or above MAX_MAGNITUDE in absolute value.
+        Whether to reject numbers that are not finite, or above MAX_MAGNITUDE in absolute value.
     copy : bool, default True
         If False, an array that already has the required dtype and layout is returned itself, marked read-only.
     unit : str, optional
@@ -181,7 +182,7 @@ def as_array(
 
 
 def as_float_array(name: str, value: Any) -> np.ndarray:
-    """Convert `value` to an array of float32 or float64 of any shape, without a copy if it is one of them.
+    """Convert `value` to an array of float32 or float64 of any shape; such an array is returned without a copy.
 
     The numbers are not checked.
 
@@ -206,7 +207,8 @@ def check_unmasked(name: str, value: Any) -> None:
 
     A conversion to a plain array would use the number under the mask.
     """
-    if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy imports `np.ma` at its first use.
+    # Test the attribute first, because NumPy imports `np.ma` only at its first use.
+    if hasattr(value, "mask") and np.ma.is_masked(value):
         masked = np.argwhere(np.ma.getmaskarray(value))
         index = ", ".join(map(str, masked[0]))
         raise InputError(f"{name} has no value at [{index}], {len(masked)} masked in all: fill them")
@@ -333,7 +335,7 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         raise InputError(f"{name} has dtype {value.dtype}; real numbers are needed")
     try:
         a = sp.csr_array(value, copy=copy)
-        a.check_format(full_check=True)  # The kernels do not check indices.
+        a.check_format(full_check=True)  # Check all indices here, since the kernels do not.
     except ValueError as error:
         raise InputError(
             f"{name} is not a valid compressed matrix ({error}); check its indices and pointers"
@@ -451,7 +453,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return `value` as a str; raise InputError unless it is one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"{name} is {value!r}; {' or '.join(map(repr, choices))} is needed")
-    return str(value)  # The repr of NumPy's strings would show their type in messages.
+    return str(value)  # Convert NumPy's strings: their repr in messages would show the type.
 
 
 def as_names(things: str, value: Any, count: int) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """The deadline of a solve: the only clock that solvers read, between their steps.
 
-It covers the time from the call of `solve` to its return. A step that cannot be interrupted starts only if its
-estimated time fits into the remaining time. The time of the judge's last pass, which always follows, is reserved.
+A time limit covers the time from the call of `solve` to its return. A step that cannot be interrupted starts only if
+its estimated time fits into the remaining time. Time for the final pass of the judge, which follows every solve, is
+reserved.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from time import perf_counter
 
-# [s] Time between two readings of the clock. It also bounds the delay after Ctrl-C; users notice about 50 ms.
+# [s] Time between two readings of the clock, and largest delay of a reaction to Ctrl-C. Users notice about 50 ms.
 CHUNK_TIME = 0.01
 
 

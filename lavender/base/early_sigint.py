@@ -15,7 +15,7 @@ EXIT_INTERRUPTED = 130  # Shells report this status for a command that Ctrl-C en
 
 
 def _is_lavender_command() -> bool:
-    """Return whether this process runs the command `lavender`, by any of the ways to start it."""
+    """Return whether this process runs the command `lavender`, as a script or by `python -m`."""
     program = sys.argv[0] if sys.argv else ""
     if program == "-m":
         # `sys.argv[0]` is "-m" until Python has found the module: read the original command line instead.
@@ -32,7 +32,7 @@ def _is_lavender_command() -> bool:
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:
     os.write(2, b"lavender: stopped\n")
-    os._exit(EXIT_INTERRUPTED)  # Nothing has started that would need a clean end.
+    os._exit(EXIT_INTERRUPTED)  # End without clean-up, which is not needed before the command has started.
 
 
 def exit_on_sigint() -> None:
@@ -40,7 +40,7 @@ def exit_on_sigint() -> None:
     if _is_lavender_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         try:
             signal.signal(signal.SIGINT, _exit_on_signal)
-        except ValueError:  # not in the main thread
+        except ValueError:  # Handlers can only be set in the main thread.
             return
 
 

@@ -54,7 +54,7 @@ class UnknownName(LavenderError, KeyError):
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str], successor: str = "") -> None:
-        import difflib  # Imported only if an error occurs.
+        import difflib  # Imported here, as it is needed only for error messages.
 
         known = sorted(set(known))
         by_lower_case = {word.lower(): word for word in reversed(known)}
@@ -72,11 +72,11 @@ class UnknownName(LavenderError, KeyError):
         super().__init__(self.message)
 
     def __str__(self) -> str:
-        # KeyError would show the repr of the message.
+        # Without this method, KeyError would show the repr of the message.
         return self.message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By default, an exception is unpickled by calling its class with `args`, which does not fit `__init__`.
+        # The default unpickles an exception by calling its class with `args`, but `__init__` has other parameters.
         return _restore_unknown_name, (self.message,)
 
 

@@ -3,8 +3,9 @@
 `from lavender.base.lazy_import import sparse as sp` replaces `import scipy.sparse as sp`: these parts of SciPy would
 double the time of `import lavender`. `import_numerics` imports them before the clock of a solve starts.
 
-`lazy_loader` (SPEC 1) is not used because it is not thread-safe. Four threads used three lazy modules of SciPy at once:
-8 of 12 processes on Python 3.11 got an AttributeError. Its `attach` for names of a package deadlocked in one of 12.
+The package `lazy_loader` (SPEC 1) is not used because it is not thread-safe. When four threads used three lazy modules
+of SciPy at once, 8 of 12 processes on Python 3.11 raised AttributeError, and its function `attach` deadlocked in 1 of
+12.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def import_lock() -> RLock:
 def import_locked(name: str) -> Any:
     """Import a module, under the lock, and return it.
 
-    Python locks each module separately, a file before its package. Of two threads that enter a package by different
-    files, one would get an incomplete module.
+    Python's own import system locks each module separately. If two threads import different modules of one package at
+    once, one thread may therefore get an incomplete module.
     """
     with import_lock():
         return import_module(name)
@@ -45,10 +46,11 @@ def import_locked(name: str) -> Any:
 
 def _replace_lock_after_fork() -> None:
     global _lock
-    _lock = RLock()  # In a forked process, the thread that may hold the old lock does not exist.
+    # A forked process needs a new lock: the thread that may hold the old one does not exist there.
+    _lock = RLock()
 
 
-if hasattr(os, "register_at_fork"):  # Windows has none.
+if hasattr(os, "register_at_fork"):  # Windows has no fork.
     os.register_at_fork(after_in_child=_replace_lock_after_fork)
 
 
@@ -59,7 +61,7 @@ class _LazyModule:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_name" or name.startswith("__"):  # `copy` reads these before `__init__` has run.
+        if name == "_name" or name.startswith("__"):  # `copy` reads these names of an uninitialised object.
             raise AttributeError(name)
         value = getattr(import_locked(self._name), name)
         setattr(self, name, value)
@@ -77,7 +79,7 @@ else:
 
 
 def import_module_lazily(name: str) -> Any:
-    """Return a module of a higher layer, for a method that only calls a function there."""
+    """Import and return a module of a higher layer, for a method that is a shortcut to a function there."""
     return _LazyModule(name)
 
 

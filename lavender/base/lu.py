@@ -1,8 +1,8 @@
-"""Factor sparse matrices by SuperLU, after a check for structurally singular ones. No other module calls SuperLU.
+"""Factor sparse matrices by SuperLU, after rejecting structurally singular matrices. No other module calls SuperLU.
 
-A square matrix is structurally singular if some of its rows together have entries in too few columns; it is then
-singular for any values. SuperLU (SciPy 1.17) reads and writes outside its arrays on some of these, which may crash the
-interpreter.
+A square matrix is structurally singular if some set of k rows has entries in fewer than k columns; it is then singular
+for any values. SuperLU (SciPy 1.17) reads and writes outside its arrays for some structurally singular matrices, which
+may crash the interpreter.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
 
     `options` are the options of `scipy.sparse.linalg.splu`.
     """
-    from scipy.sparse.linalg import splu  # The import takes 0.1 s, and only this function needs it.
+    from scipy.sparse.linalg import splu  # Imported here: it takes 0.1 s, and only this function needs it.
 
     a = sp.csc_array(matrix)
     # A full diagonal implies full structural rank.
@@ -28,7 +28,7 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
 
 
 def splu(system: LinearSystem) -> Any:
-    """Factor the matrix of a linear system by SuperLU, the fallback if its own factorisation fails."""
+    """Factor the matrix of a `LinearSystem` by SuperLU, as a fallback if the system's own factorisation fails."""
     matrix = sp.csr_array((system.data, system.indices, system.indptr), copy=True)
     matrix.eliminate_zeros()
     return factor_sparse_lu(matrix, permc_spec="COLAMD")

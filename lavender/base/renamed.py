@@ -43,7 +43,8 @@ INSTEAD = {
     },
 }
 
-#: Keyword argument of other packages -> arguments with that meaning; the first one that a call has is suggested.
+#: Keyword argument of other packages -> arguments here with that meaning; the first that the function has is
+#: suggested.
 ARGUMENT_HINTS = {
     **dict.fromkeys(("hi", "high", "u", "ub", "upper_bound"), ("upper", "ub")),
     **dict.fromkeys(("l", "lb", "lo", "low", "lower_bound"), ("lower", "lb")),
@@ -69,7 +70,7 @@ ARGUMENT_HINTS = {
     **dict.fromkeys(("motor_speed", "target_velocity", "velocity"), ("speed",)),
 }
 
-#: Solver name that users try -> name to suggest; others get the most similar names.
+#: Solver name that users try -> name to suggest. For other unknown names, the most similar names are suggested.
 SOLVER_HINTS = {"lcp": "lemke", "none": "auto", "qp": "osqp"}
 
 

@@ -1,11 +1,11 @@
-"""Run functions on third-party code in another Python process, which can be killed.
+"""Run functions that call third-party code in another Python process, which can be killed.
 
-Code that hangs, calls `os._exit`, starts processes or exhausts memory ends only its own call. Requests are pickled.
-Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
+Code that hangs, calls `os._exit`, starts processes or exhausts memory makes only its own call fail. Requests are
+pickled. Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
-No process pool of a library provides this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return
-to the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
-the output of the code; and a script without `if __name__ == "__main__"` cannot use the pool.
+Process pools of libraries are not used, for four reasons (measured with pebble 5.2.3). If the code handles SIGTERM or
+does not return to the interpreter, the pool kills it only 3 s after its limit. Processes that the code started are not
+killed. The parent unpickles the output of the code. A script without `if __name__ == "__main__"` cannot use the pool.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ from typing import IO, Any
 import numpy as np
 
 START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a function and its modules may take this long.
-KILL_TIMEOUT = 10.0  # [s] The system may need longer to end a killed process that waits for a broken disk.
-PIPE_TIMEOUT = 0.1  # [s] A pipe that stays open for longer after the kill is held by another process.
+# [s] The end of a killed process is awaited for this long; one that waits for a disk may not end.
+KILL_TIMEOUT = 10.0
+# [s] A pipe that stays open for this time after a kill is held by another process; it is abandoned.
+PIPE_TIMEOUT = 0.1
 MAX_TEXT_SIZE = 2**20  # [bytes] An answer that announces more JSON than this is invalid.
 MAX_ERROR_LENGTH = 500  # [characters] Longer texts of errors are cut.
-#: If set, a process is killed together with the processes that it started.
+#: Whether a process is killed together with the processes that it started, as one process group.
 PROCESS_GROUPS = os.name == "posix"
-#: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
+#: Program of the other process. `python -m` is not used: it searches modules in the current folder first, where the
+#: sources of a checkout would hide the installed package.
 SERVE_SCRIPT = (
     "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve_requests; "
     "serve_requests(*map(int, sys.argv[1:]))"
@@ -82,7 +85,7 @@ class ProcessBackend:
     ) -> None:
         self._function, self._memory, self._environment = function, memory, environment or {}
         self.popen: subprocess.Popen[bytes] | None = None
-        self._lifeline = -1  # writing end of a pipe that the system closes when this process ends
+        self._lifeline = -1  # Writing end of a pipe; when this process ends, the system closes it.
         self._exchange_thread: threading.Thread | None = None
 
     @property
@@ -153,17 +156,18 @@ class ProcessBackend:
         RemoteError
             The function raised; the process runs on.
         TimeoutError
-            The process was killed. It is also killed by Ctrl-C.
+            The call exceeded `timeout`; the process was killed. Ctrl-C kills it, too.
         ProcessEnded
+            The process ended before it answered.
         InvalidAnswer
-            The process was killed.
+            The answer is invalid; the process was killed.
         """
         request = pickle.dumps(arguments, pickle.HIGHEST_PROTOCOL)
         process = self.popen
         assert process is not None
         received: list[tuple[bytes, bytes] | BaseException] = []
 
-        # If a process that left the group still holds a pipe, only this thread waits for it.
+        # Run the exchange on a thread: if a process outside of the group keeps a pipe open, only that thread waits.
         def exchange_request_and_answer() -> None:
             try:
                 assert process.stdin is not None and process.stdout is not None
@@ -219,7 +223,7 @@ class ProcessBackend:
         if process is None:
             return
         if PROCESS_GROUPS:
-            # The group keeps the number of its first process as long as another process of the group runs.
+            # Kill the group. Its number, that of its first process, is not reused while a process of the group runs.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
         self._close_lifeline()
@@ -229,7 +233,7 @@ class ProcessBackend:
         if self._exchange_thread is not None:
             self._exchange_thread.join(PIPE_TIMEOUT)
             if self._exchange_thread.is_alive():
-                return  # That thread closes the streams.
+                return  # The exchange's thread still waits for a pipe and closes the streams later.
         _close_streams(process)
 
     def _close_lifeline(self) -> None:
@@ -246,7 +250,7 @@ def _close_streams(process: subprocess.Popen[bytes]) -> None:
 
 
 def _read_bytes(stream: IO[bytes], size: int) -> bytes:
-    """Read `size` bytes; EOFError if the stream ends before."""
+    """Read `size` bytes; raise EOFError if the stream ends before."""
     data = stream.read(size)
     if len(data) < size:
         raise EOFError
@@ -254,7 +258,7 @@ def _read_bytes(stream: IO[bytes], size: int) -> bytes:
 
 
 def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any]]:
-    """Return the JSON object and copies of the arrays of an answer, which may hold anything.
+    """Parse an answer: return its JSON object and copies of its arrays. The bytes may be invalid in any way.
 
     Raises
     ------
@@ -281,7 +285,7 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
 
 
 def serve_requests(lifeline: int, memory: int) -> None:
-    """Answer requests until the pipe ends: the first names the function, the others hold its arguments."""
+    """Answer requests until the pipe ends: the first names the function, each later one has arguments for it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if lifeline >= 0:
         _kill_with_parent(lifeline)
@@ -299,15 +303,13 @@ def serve_requests(lifeline: int, memory: int) -> None:
         except EOFError:
             return
         try:
-            arguments = pickle.loads(request)  # The request comes from the parent.
+            arguments = pickle.loads(request)  # Unpickling is safe, as only the parent sends requests.
             if function is None:
                 (function,) = arguments
                 text, numbers = _pack_answer({}, ())
             else:
                 text, numbers = _pack_answer(*function(*arguments))
-        except (
-            BaseException
-        ) as error:  # Third-party code raises anything; a panic of Rust is not an Exception.
+        except BaseException as error:  # A panic of Rust code, for example, is not an Exception.
             failure = {"error": str(error)[:MAX_ERROR_LENGTH], "kind": type(error).__name__}
             text, numbers = json.dumps(failure).encode(), b""
         answers.write(struct.pack("<QQ", len(text), len(numbers)) + text + numbers)
@@ -321,7 +323,7 @@ def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, 
 
 
 def _detach_standard_streams() -> tuple[IO[bytes], IO[bytes]]:
-    """Return the streams of requests and answers; discard all later output."""
+    """Return the streams of requests and answers, and redirect standard output and error to the null device."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)
@@ -330,10 +332,11 @@ def _detach_standard_streams() -> tuple[IO[bytes], IO[bytes]]:
 
 
 def _kill_with_parent(lifeline: int) -> None:
-    """Have this process and those that it starts killed when the parent ends.
+    """Arrange that this process and the processes that it starts are killed when the parent ends.
 
-    On Linux the kernel sends the signal when the last writing end of the pipe closes, so code that never returns to
-    the interpreter is killed, too. On other systems a thread waits for the end of the pipe.
+    `lifeline` is the reading end of a pipe; the parent holds the writing end. On Linux the kernel sends a signal when
+    the writing end closes, which also kills code that never returns to the interpreter. On other systems a thread
+    waits for the end of the pipe.
     """
     os.set_inheritable(lifeline, False)
     with contextlib.suppress(ImportError, AttributeError):  # Only Linux has F_SETSIG.
@@ -343,7 +346,7 @@ def _kill_with_parent(lifeline: int) -> None:
         fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpgrp())
         fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-        if select.select([lifeline], [], [], 0.0)[0]:  # The parent ended before this was set up.
+        if select.select([lifeline], [], [], 0.0)[0]:  # The parent ended before the signal was set up.
             os.killpg(0, signal.SIGKILL)
         return
 
@@ -355,10 +358,10 @@ def _kill_with_parent(lifeline: int) -> None:
 
 
 def limit_cpu_time(extra: float) -> None:
-    """Have the system kill this process after `extra` more CPU time [s], in case the parent no longer can."""
+    """Make the system kill this process after `extra` more CPU time [s], in case the parent has ended and cannot."""
     with contextlib.suppress(
         ImportError, ValueError, OSError, OverflowError
-    ):  # OverflowError: the limit is inf.
+    ):  # An infinite limit raises OverflowError: no limit is then set.
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

@@ -1,6 +1,6 @@
 """Run a function on several threads, which are reused by later calls.
 
-To start and end a thread takes 0.07 ms, to wake a waiting one 0.01 ms; some calls take no longer than that.
+Starting and ending a thread takes 0.07 ms, waking a waiting thread 0.01 ms. Some calls take no longer than 0.07 ms.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Further calls wait. The pool starts a thread only if there is work and no thread is idle.
+# Largest number of threads of the pool; further calls wait. It starts a thread only if no thread is idle.
 MAX_THREADS = 1024
 
 
@@ -26,7 +26,7 @@ def get_thread_pool() -> ThreadPoolExecutor:
     """Return the pool of threads of this process."""
     from concurrent.futures import (
         ThreadPoolExecutor,
-    )  # The import takes 5 ms, and only this function needs it.
+    )  # Imported here: it takes 5 ms, and only this function needs it.
 
     return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="lavender")
 
@@ -34,12 +34,12 @@ def get_thread_pool() -> ThreadPoolExecutor:
 if hasattr(os, "register_at_fork"):  # Windows cannot fork.
     os.register_at_fork(
         after_in_child=get_thread_pool.cache_clear
-    )  # A forked process has none of the threads.
+    )  # A forked process has no threads of its parent and needs a new pool.
 
 
 @contextmanager
 def _defer_sigint() -> Iterator[None]:
-    """Deliver Ctrl-C after the block: an interrupted start leaves a thread that the pool never ends."""
+    """Defer Ctrl-C until the block ends: if it interrupts the start of a thread, the pool cannot end that thread."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows has no signal masks.
         yield
         return
@@ -53,9 +53,9 @@ def _defer_sigint() -> Iterator[None]:
 def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
     """Call `work(stop)` on this thread and on up to `threads - 1` others, and return all results.
 
-    Each call processes items of a common queue until the queue is empty. Calls that no thread has started by then are
-    cancelled. `work` must start no further item once `stop[0]` is not 0: it is set after an error or Ctrl-C, which is
-    raised when all calls have ended.
+    Each call processes items of a common queue until the queue is empty. Calls that have not started by then are
+    cancelled. After an error or Ctrl-C, `stop[0]` is set to 1; `work` must then start no further item. The exception
+    is raised when all calls have ended.
     """
     stop = bytearray(1)
 
@@ -72,7 +72,7 @@ def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
             futures += [get_thread_pool().submit(run) for _ in range(threads - 1)]
         return [run(), *(future.result() for future in futures if not future.cancel())]
     finally:
-        stop[0] = 1  # Ctrl-C may have interrupted the wait of this thread.
+        stop[0] = 1  # Stop the other threads also if Ctrl-C interrupted this thread while it waited for them.
         for future in futures:
             if not future.cancel():
                 future.exception()

@@ -18,13 +18,14 @@ it, in the metric of D = diag(d), with k the number of nonzeros of y:
     J, M and R given  |J^T y|_M^-1 <= (k + 2) 2^-53 sum_j sqrt(d_j) |y_j|,   R y = 0 exactly      (4)
     bodies            as J, M and R, with J as rounded to float64
 
-A solution with an impulse as large as (2) could then not be distinguished from a failure: its round-off floor would
-exceed 1e-6. The errors E and V of any impulse (`lavender.judge.residuals`) are
+A solution would then have an impulse as large as (2), and could not be distinguished from a failure, because its
+round-off floor would exceed 1e-6. The errors E and V of any impulse (`lavender.judge.residuals`) are
 
     E >= net / (|y|_D + |z|_D^-1),    V >= net / sum sqrt(d / nu) |y|,    net = b.y - S           (5)
 
-If these are within tol, or within the rounding of b as computed from target and J v*, an answer may meet tol, and y
-proves nothing. So b of an empty row may be rounding noise, and repeated equations may differ by rounding noise.
+If these bounds are within tol, or within the rounding of b as computed from target and J v*, an answer may meet tol,
+and y proves nothing. b of an empty row may therefore be rounding noise, and repeated equations may differ by rounding
+noise.
 """
 
 from __future__ import annotations
@@ -56,22 +57,23 @@ UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
 # |z| counts as rounding if it does not exceed this fraction of b.y. The floor of a solution (2) is then above 1e-6.
 MAX_ROUNDING_SLACK = 1e-10
-SAFE_SUM_RATIO = 1e3  # A sum above this multiple of its rounding bound is not recomputed exactly.
-# Up to this fraction of the sum of its terms, |z| counts as rounding; larger z is not polished.
+SAFE_SUM_RATIO = 1e3  # A sum below this multiple of its rounding bound is recomputed exactly.
+# y is polished if |z| = |A^T y| is at most this fraction of the sum of its terms, so that rounding may explain z.
 MAX_POLISHED_SLACK = 1e-6
 # Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
 MAX_EXACT_ROWS = 16
-MIN_NAMED_SHARE = 1e-6  # Rows below this fraction of the largest |y| in the metric of D are not named.
+MIN_NAMED_SHARE = 1e-6  # A message names only rows above this fraction of the largest |y| in the metric of D.
 MAX_NAMED_BLOCKS = 6  # Number of blocks of each kind that a message names.
 # Certificates with more rows are not polished: the dense least squares would be too large.
 MAX_POLISHED_ROWS = 1000
-# s for each (row x column x smaller of both) of the dense least squares, measured.
+# [s] Measured time of the dense least squares, per product of rows, columns and the smaller of these two numbers.
 LEAST_SQUARES_TIME = 6e-10
-# Shift of the normal equations, relative to their trace: above the rounding of a factor.
+# [-] Shift s of the normal equations, relative to their trace. It is above the rounding of their factor.
 LEAST_SQUARES_SHIFT = 1e-14
-# Number of iterations. Each divides the error by 1 + (singular value)^2 / shift.
+# Number of proximal iterations. Each divides the error of a component by 1 + (singular value)^2 / shift.
 LEAST_SQUARES_ITERATIONS = 6
-# Columns per product. OpenBLAS starts threads for products of more than 262,144 multiply-adds.
+# Matrix products are computed for this many columns at a time, because OpenBLAS starts threads above 262,144
+# multiply-adds.
 PRODUCT_COLUMNS = 8
 
 
@@ -86,7 +88,7 @@ class Proof:
     impulse_bound : float, N s
         Lower bound (2) of sum |lambda| over all solutions: inf if none exists, 0 if y implies no bound.
     reason : str
-        Why y does not prove that no impulse meets the tolerance; empty if it does.
+        Reason why y does not prove that no impulse meets the tolerance; empty if it proves this.
     conflict : str
         If y is a proof: names of the conflicting blocks.
     skipped_time : float, s
@@ -120,7 +122,7 @@ def format_lower_bound(bound: float) -> str:
 def check_certificate(
     problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
 ) -> str | None:
-    """Return why y (m,) does not prove that no impulse meets `tol`; return None if it proves it."""
+    """Return the reason why y (m,) does not prove that no impulse meets `tol`, or None if y proves this."""
     return prove_infeasibility(problem, y, tol, deadline).reason or None
 
 
@@ -129,9 +131,10 @@ def prove_infeasibility(
 ) -> Proof:
     """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
-    If y fails only by a solver's rounding, it is replaced by the nearest direction on the same rows with A^T y = 0,
-    if that can be computed before the deadline. The last result is stored with the problem, because a solver and the
-    check of its claim make the same call. It is not reused if its polishing was skipped and there is time for it now.
+    If y fails only by a solver's rounding, y is polished: replaced by the nearest direction on the same rows with
+    A^T y = 0, if that can be computed before the deadline. The last result is stored with the problem, because a
+    solver and the check of its claim make the same call. A result without polishing is not reused if there
+    is time for it now.
 
     Parameters
     ----------
@@ -161,8 +164,8 @@ def prove_infeasibility(
 
 
 def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
-    """Check y, then polished directions near y if y fails by rounding or if an exact proof may be found."""
-    with np.errstate(all="ignore"):  # A number that overflows proves nothing.
+    """Check y, and then polished directions if y fails only by rounding or if an exact proof may be found."""
+    with np.errstate(all="ignore"):  # Directions with numbers that overflow are not accepted as proofs.
         inner = problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
             reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
@@ -203,10 +206,11 @@ def _describe_conflict(problem: Problem, y: FloatArray) -> str:
 def _name_blocks(problem: Problem, blocks: tuple[int, ...]) -> str:
     """Return the names of blocks as one text, shortened if all are of one kind."""
     names = [problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in blocks]
-    names = list(dict.fromkeys(names))  # Each free row of a joint is a block with the joint's name.
+    # Remove repeated names: each free row of a joint is a block of that name.
+    names = list(dict.fromkeys(names))
     matches = [re.fullmatch(r"(.*\S) (\d+)", name) for name in names[:MAX_NAMED_BLOCKS]]
     kinds = {match[1] for match in matches if match}
-    if len(names) > 1 and all(matches) and len(kinds) == 1:  # "joints 7 and 9"
+    if len(names) > 1 and all(matches) and len(kinds) == 1:  # Write "joints 7 and 9".
         return f"{kinds.pop()}s " + _join_names([match[2] for match in matches if match], len(names))
     return _join_names(names[:MAX_NAMED_BLOCKS], len(names))
 
@@ -220,7 +224,7 @@ def _join_names(names: list[str], count: int) -> str:
 
 def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     """Check y (m,) by (1) to (5) on a problem without ellipses."""
-    # Only rows with y != 0 are read, because others may have overflown.
+    # Read only rows with y != 0, because numbers of other rows may have overflown.
     rows = np.flatnonzero(y)
     vanished = np.intersect1d(rows, problem.vanished_rows)
     if len(vanished):
@@ -275,7 +279,7 @@ def _bound_transposed_product(
         x = problem.generalized.solve(r)  # type: ignore[union-attr]
     else:
         x = problem.rows.inverse_mass_matrix() @ r
-    # Rounding can make an M^-1 of bodies indefinite: r.x is then not a squared norm, so |J x| is also a lower limit.
+    # Rounding can make an M^-1 of bodies indefinite, so that r.x is not a squared norm: use |J x| if it is larger.
     radius = np.maximum(length * math.sqrt(max(0.0, float(r @ x))), np.abs(problem.jacobian @ x))
     soft = problem.compliance * y  # type: ignore[operator]
     return soft - radius, soft + radius, 0.0 * size if np.any(soft) else size
@@ -339,7 +343,7 @@ def _compute_support(
     first = c.normal_rows
     normal, coefficient, friction_norm = _compute_friction_norms(problem, size)
     support[c.contact_rows] = 0.0
-    # along the cone: z_n + sum of a_g |z_g|
+    # The maximum of z.lambda over a cone with lambda_n = 1 is z_n + sum of a_g |z_g|.
     cone_max, rounding = high.copy(), rounding.copy()
     np.add.at(cone_max, normal, coefficient * friction_norm)
     np.add.at(rounding, normal, coefficient * _compute_friction_norms(problem, rounding)[2])
@@ -377,10 +381,10 @@ def _compute_energy_norm(data: Any, w: FloatArray) -> Any:
 
 
 def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
-    """Yield the nearest direction in the metric of D, on the rows of y, with A^T y = 0 wherever it nearly is 0.
+    """Yield the direction nearest to y in the metric of D, on the rows of y, for which small entries of A^T y are 0.
 
-    The direction is yielded twice: rounded to 26 bits, with which sums of halves and thirds of simple numbers can be
-    exactly 0, and unrounded.
+    The direction is yielded twice: rounded to 26 bits, and unrounded. With 26 bits, sums of halves and thirds of
+    simple numbers can be exactly 0.
     """
     length = np.sqrt(problem.d)
     is_used = np.abs(y) * length > MAX_ROUNDING_SLACK * float(length @ np.abs(y))
@@ -413,15 +417,16 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
 
 
 def _solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Return the shortest x (n,) with the least |S x - z|, for S (k, n) and z (k,), without singular values below 1e-7.
+    """Return the shortest x (n,) that minimises |S x - z|, for S (k, n) and z (k,).
 
-    Proximal iteration with x += S^T (S S^T + s I)^-1 (z - S x), or with (S^T S + s I)^-1 S^T if n < k. Compared with a
-    singular value decomposition by LAPACK, one factor of the smaller side takes a tenth of the time and no threads.
+    Components with relative singular values below about 1e-7 are left out. The method is the proximal iteration
+    x += S^T (S S^T + s I)^-1 (z - S x), or with (S^T S + s I)^-1 S^T if n < k. It takes a tenth of the time of
+    LAPACK's singular value decomposition, and starts no threads.
     """
     wide = matrix.shape[0] < matrix.shape[1]
     product = np.zeros(2 * (min(matrix.shape),))
     short = matrix if wide else matrix.T
-    for first in range(0, short.shape[1], PRODUCT_COLUMNS):  # Larger products start BLAS's threads.
+    for first in range(0, short.shape[1], PRODUCT_COLUMNS):  # Larger products would start threads of BLAS.
         part = np.ascontiguousarray(short[:, first : first + PRODUCT_COLUMNS])
         product += part @ part.T
     size = float(np.trace(product))
@@ -437,7 +442,7 @@ def _solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
 
 
 def _explain_recession_violation(problem: Problem, y: FloatArray) -> str | None:
-    """Return why y (m,) is not in the recession cone of the admissible impulses, or None if it is."""
+    """Return the reason why y (m,) is not in the recession cone of the admissible impulses, or None if it is."""
     c = problem.cones
     bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
     bad[c.contact_rows] = False

@@ -14,29 +14,30 @@ If this contracts, it bounds dy and dz block by block:
     |R_g^T dy| <= ((I - Q)^-1 r)_g         if the norms Q of the blocks of R^T T L diag(e) have a spectral radius
                                            below 1; r_g = |R_g^T T F|                                               (4)
 
-A row or friction component whose margin (derivative/natural.pxd) is larger than its bound is certain: P0 is P there.
-Any other one is uncertain: P0 is the middle of all values that P may have, and the bound is computed again.
+The margin of a row or friction component (derivative/natural.pxd) is the distance of y from another case of the
+projection. If it is larger than the bound, the component is certain: P0 is P there. Any other component is uncertain:
+P0 is the middle of all values that P may have, and the bound is computed again.
 
     uncertain row               P in [0, 1]                    P0 = 1/2, e = 1/2
     uncertain contact, cone     0 <= P <= I, symmetric         P0 = I / 2, e = 1/2
-    the same, Coulomb           P lower triangular             P0 = I / 2, e = (a + sqrt(a^2 + 1)) / 2, a^2 = sum a_g^2
+    uncertain contact, Coulomb  P lower triangular             P0 = I / 2, e = (a + sqrt(a^2 + 1)) / 2, a^2 = sum a_g^2
     sticks or slides, Coulomb   I + phi u (a e_n - u)^T        phi = 1/2, e = sqrt(1 + a^2) / 2, u = y_t / |y_t|
-    the same, cone              I - phi q q^T, q ~ (a, -u)     phi = 1/2, e = 1/2
+    sticks or slides, cone      I - phi q q^T, q ~ (a, -u)     phi = 1/2, e = 1/2
     slides, two or more rows    P turns with u                 P0 = P and, with x >= |dy|, t = |y_t|, kappa = a s_n /
     t,
                                 e = (a x_n + kappa x_t) / (t - x_t) + (kappa + a) x_t / (t - x_t)                   (5)
 
-Why it holds: all mean values in the box of (3) or (4) are regular, so F is one-to-one on the box and a local
-homeomorphism at each of its points (Clarke 1976, Pacific J. Math. 64, 97-102). The root of F(.) = (1 - tau) F(z) is
-followed from tau = 0 to 1; its distance from z does not exceed tau times the bound, so it cannot leave the box. So an
-exact solution lies within the bound, and no other one does. If A is symmetric positive definite and the law is convex,
-(3) contracts for every set of uncertain blocks (if all are uncertain, R^T T L is twice Cayley's transform of H), and
-there is one solution only. Under Coulomb's law, or with another A, further solutions may exist outside of the box.
+Proof: all mean values in the box of (3) or (4) are regular, so F is one-to-one on the box and a local homeomorphism at
+each of its points (Clarke 1976, Pacific J. Math. 64, 97-102). The root of F(.) = (1 - tau) F(z) is followed from tau =
+0 to 1; its distance from z does not exceed tau times the bound, so it cannot leave the box. Therefore exactly one
+solution lies within the bound. If A is symmetric positive definite and the law is convex, (3) contracts for every set
+of uncertain blocks (if all are uncertain, R^T T L is twice Cayley's transform of H), and there is only one solution.
+Under Coulomb's law, or with another A, further solutions may exist outside of the box.
 
-Rounding is counted outward: of w by the sums of its terms, of M^-1 by the condition of M, of G^-1 by I - G^-1 G as
-computed. The bound therefore also holds for data that differ from the given ones by rounding. There is no bound if G
-is singular to rounding (rows that share a load), if nothing contracts, and on islands of more than `MAX_ISLAND_ROWS`
-rows.
+Bounds are enlarged by the rounding errors of w (from the sums of its terms), of M^-1 (from the condition of M) and of
+G^-1 (from I - G^-1 G as computed). The bound therefore also holds for data that differ from the given data by
+rounding. There is no bound if G is singular to rounding (rows that share a load), if neither (3) nor (4) contracts, or
+if an island has more than `MAX_ISLAND_ROWS` rows.
 """
 
 from __future__ import annotations
@@ -54,14 +55,15 @@ from lavender_ext.derivative.linear import CASES, Linear
 UNIT_ROUNDOFF = 2.0**-53
 MAX_ISLAND_ROWS = 600  # Larger islands have no bound: dense products of 600 rows take about 0.1 s.
 MAX_MATRIX_ENTRIES = 4e6  # No bound is computed if A has more entries than this, because A is formed.
-# Every row counts as uncertain if this many rounds have each found further uncertain rows.
+# Every row counts as uncertain if rows became uncertain in this many consecutive computations of the bound.
 MAX_UNCERTAINTY_STEPS = 8
-MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5); each doubles the assumed bound of |dy|.
-MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger.
-# (3) and (4) must contract by at least this much, which covers the rounding of their norms.
+# Largest number of steps of the iteration for (5); each doubles the assumed bound of |dy|.
+MAX_RADIUS_STEPS = 8
+MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger than this.
+# q of (3) and the spectral radius of (4) must be below 1 by this much, which covers the rounding of norms.
 CONTRACTION_MARGIN = 1e-9
 LARGE_NORM = 0.5  # If the estimate of a norm by sums exceeds this, the norm is computed by singular values.
-SUM_ROUNDING_FACTOR = 1.0 + 1e-8  # Factor for the rounding of sums of bounds.
+SUM_ROUNDING_FACTOR = 1.0 + 1e-8  # Sums of bounds are multiplied by this, which covers their rounding.
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class _Component:
 
 @dataclass
 class _Group:
-    """Columns of L and R in (1), and the bound of their block of E.
+    """Columns of L and R in (1) of one friction component or row, and the bound e of the corresponding block of E.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ class _Group:
     component : _Component, optional
         If given, the bound holds only if y_t keeps its direction: |dy_t| < |y_t| / 2.
     is_uncertain : bool
-        Whether the component is uncertain: P0 then has kappa = 1 in (5).
+        Whether the component is uncertain; P0 then has kappa = 1 in (5).
     """
 
     left_rows: Any
@@ -111,7 +113,7 @@ class _Group:
 
 
 def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple[FloatArray, FloatArray]:
-    """Bound the errors of an answer row by row; inf on rows without a known bound.
+    """Bound the errors of an answer row by row; rows for which no bound is known have inf.
 
     Parameters
     ----------
@@ -143,7 +145,7 @@ def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple
 
 
 def bound_slack_rounding(problem: Problem, impulse: FloatArray) -> FloatArray:
-    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, apart from a factor of M."""
+    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, without errors of solving with M."""
     x, b = np.abs(impulse), np.abs(problem.b)
     if problem.matrix is not None:
         operations: Any = np.diff(problem.csr.indptr) + 8.0
@@ -163,7 +165,7 @@ def bound_slack_rounding(problem: Problem, impulse: FloatArray) -> FloatArray:
 
 
 def bound_mass_rounding(problem: Problem) -> FloatArray:
-    """Bound the relative rounding (m,) of M^-1 in the norm of M, as each row uses it, by the condition of M's trees."""
+    """Bound the relative rounding (m,) of M^-1 in the norm of M, for each row, by the condition of M's trees."""
     general = problem.generalized
     if general is None:
         return np.zeros(problem.m)
@@ -209,8 +211,8 @@ class _Scaled:
         z, w = self.root * linear.impulse, linear.slack
         s = w / self.root
         self.y, self.f, self.margin = z - s, linear.residual, self.root * linear.margin
-        self.normal_impulse = z - self.f  # At normal rows this is the impulse of Pi(y).
-        self.power = linear.impulse * (w + disk.b)  # lambda_i (A lambda)_i
+        self.normal_impulse = z - self.f  # This is Pi(y); its entries at normal rows are used.
+        self.power = linear.impulse * (w + disk.b)  # Products lambda_i (A lambda)_i.
         rounding = bound_slack_rounding(problem, impulse)
         if problem is not disk:
             rounding = problem.cones.stretch * rounding + 4 * UNIT_ROUNDOFF * np.abs(disk.b)
@@ -224,7 +226,8 @@ class _Scaled:
             np.append(0, np.cumsum(size)),
             _list_ranges(first, first + size),
         )
-        self.local_row = np.zeros(disk.m, np.intp)  # index of each row in its island; `_Island` fills it
+        # Index of each row within its island, which `_Island` sets.
+        self.local_row = np.zeros(disk.m, np.intp)
         self.components: dict[int, list[_Component]] = {}
         coefficient = cones.friction_coefficient
         for block, rows in cones.friction_components():
@@ -278,7 +281,7 @@ class _Island:
             self.f_rounding[block_rows] += lipschitz * _norm(self.y_rounding[block_rows]) + rounding
 
     def bound(self) -> tuple[FloatArray, FloatArray] | None:
-        """Compute error bounds of impulses and of margins, (n,) [N s] each; None without a bound."""
+        """Compute error bounds of impulses and of margins, (n,) [N s] each; return None if there is no bound."""
         possible = np.isfinite(self.margin)
         uncertain, x = np.zeros(len(self.f), bool), np.zeros(len(self.f))
         for step in range(2 * MAX_UNCERTAINTY_STEPS):
@@ -299,11 +302,11 @@ class _Island:
         return None
 
     def _bound_margins(self, x: FloatArray) -> FloatArray:
-        """Bound the change (n,) of scaled margins by x (n,) >= |dy|: their Lipschitz constants."""
+        """Bound the change (n,) of scaled margins by their Lipschitz constants, for |dy| <= x (n,)."""
         out = x.copy()
         for block, components in self.contacts:
             block_norm, friction = _norm(x[block]), 0.0
-            # This is the change of the projection's normal component.
+            # Bound the change of the normal component of the projection.
             normal_change = block_norm if self.is_cone else x[block[0]]
             for c in components:
                 size = _norm(x[c.rows])
@@ -314,7 +317,7 @@ class _Island:
         return out
 
     def _choose_groups(self, uncertain: Any, x: FloatArray) -> tuple[FloatArray, list[_Group]]:
-        """Choose P0 of (1), and the groups of L and R."""
+        """Choose P0 of (1), and the groups of L and R, for the set of uncertain rows and |dy| <= x (n,)."""
         p, groups = self.p.copy(), list[_Group]()
         half = np.eye(1)
         for i in np.flatnonzero(uncertain & ~self.is_contact):
@@ -412,7 +415,7 @@ class _Island:
         ]
 
     def _compute_radius(self, group: _Group, x: FloatArray) -> float:
-        """Bound E of a group for |dy| <= x (n,), by (5) if it has no radius; inf if y_t may change its direction."""
+        """Return the bound e of a group for |dy| <= x (n,): its radius, or else (5); inf if y_t may reverse."""
         c = group.component
         if c is None:
             assert group.radius is not None
@@ -424,7 +427,7 @@ class _Island:
         if group.radius is not None:
             return group.radius
         kappa, turn = min(a * normal / t, 1.0), x_t / (t - x_t)
-        if group.is_uncertain:  # kappa is 1 in P0
+        if group.is_uncertain:  # P0 has kappa = 1.
             kappa, turn = 1.0, turn + (abs(t - a * normal) + x_t + a * x_n) / (t - x_t)
         return float((a * x_n + kappa * x_t) / (t - x_t) + (kappa + a) * turn)
 
@@ -436,8 +439,9 @@ class _Island:
         Returns
         -------
         errors, x, more
-            Bounds of |dz| (n,) and |dy| (n,), and None. If further rows are uncertain: None, |dy| and those rows (n,).
-            If nothing contracts: None, |dy|, None. A single None if G is singular.
+            Bounds of |dz| (n,) and |dy| (n,), and None. If further rows became uncertain: None, the bound of |dy|, and
+            a mask (n,) of these rows. If neither (3) nor (4) contracts: None, the bound of |dy|, None. If G is
+            singular, None replaces the tuple.
         """
         n = len(self.f)
         p, groups = self._choose_groups(uncertain, guess)
@@ -469,7 +473,7 @@ class _Island:
         for _ in range(MAX_RADIUS_STEPS):
             radius = np.array([self._compute_radius(group, x) for group in groups])
             if not np.isfinite(radius).all():
-                # A component that is uncertain already gets a group without a direction, as x is that large.
+                # Rows of groups that need a known direction become uncertain, since x is too large for it.
                 more = np.zeros(n, bool)
                 for group, e in zip(groups, radius, strict=True):
                     if e == np.inf and group.component is not None:
@@ -497,8 +501,8 @@ def _bound_group_terms(
 ) -> FloatArray | None:
     """Bound |v_g| of each group by (3) and (4), the smaller of both; None if neither contracts.
 
-    coupling: R^T T L, known up to `coupling_error` in its norm; begin: |R^T T F|; `left_ptr` and `right_ptr`
-    (groups + 1,) are the first columns of each group.
+    `coupling` is R^T T L, with an error of at most `coupling_error` in its norm; `begin` is |R^T T F|; `radius` holds
+    e of each group; `left_ptr` and `right_ptr` (groups + 1,) are the first columns of each group.
     """
     bounds = []
     norms = np.sqrt(
@@ -529,7 +533,7 @@ def _bound_group_terms(
 
 
 def _list_ranges(first: IntArray, end: IntArray) -> IntArray:
-    """Concatenate the integers first[i], ..., end[i] - 1 of all ranges i."""
+    """Return the concatenation of the ranges first[i], ..., end[i] - 1 over all i."""
     size = end - first
     return np.asarray(np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum()))
 

@@ -1,4 +1,4 @@
-"""Error measures from the literature, for comparison with other codes: `success` does not depend on them.
+"""Error measures from the literature, for comparison with other codes. They do not affect `Solution.success`.
 
 They are the natural map, the errors of FCLIB and Siconos, and the optimality conditions of a quadratic program.
 """
@@ -42,7 +42,8 @@ def natural_map(problem: Problem, impulse: ArrayLike) -> float:
     lam = problem.impulse_array(impulse)
     w = problem.slack(lam)
     cones = problem.cones
-    # lambda - clip(lambda - w): strictly inside the bounds this is w, which would lose digits in the difference.
+    # Compute lambda - clip(lambda - w). Strictly inside the bounds this is w; computing the difference would lose
+    # digits.
     step_end = lam - w
     error = np.where(step_end > cones.upper, lam - cones.upper, w)
     return float(np.linalg.norm(np.where(step_end < cones.lower, lam - cones.lower, error)))
@@ -62,7 +63,7 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     -------
     dict
         "absolute" = |F|; "siconos" = |F| / max(|q|, |r|, |u|); "relative" = |F| / |q|;
-        "fclib" = |F| / (1 + sqrt(|q|)). Mixes N s and m/s, and depends on the unit of mass.
+        "fclib" = |F| / (1 + sqrt(|q|)). The numbers mix N s and m/s, and depend on the unit of mass.
 
     Raises
     ------
@@ -137,7 +138,7 @@ class QPResidual:
 
     @property
     def worst(self) -> float:
-        """Largest of the four numbers [mixes their units]."""
+        """Largest of the four numbers, although their units differ."""
         return max(self.primal, self.dual, self.gap, self.sign)
 
 

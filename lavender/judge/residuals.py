@@ -1,27 +1,28 @@
 """The judge: measure the error of an impulse in physical units, row by row, independently of the solvers.
 
-With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), and e the error of a block: the
-step of one more projected update (w / d strictly inside the bounds; formulas in `lavender_ext/core/block.pxd`):
+Let w = A lambda - b, recomputed from the problem's data, and d = diag(A) (`Problem.d`). The error e of a block is the
+step that one more projected update would take (w / d strictly inside the bounds; formulas, and the weight nu of a
+row's velocity, in `lavender_ext/core/block.pxd`). Then
 
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]
     relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of the zero impulse, lambda = Pi(0)
-    floor     2^-53 (|A| |lambda| + |b|) measured by the same two norms: the error of rounding lambda to
-              float64; no solver can guarantee less than about twice that
+    floor     relative residual of the slack error 2^-53 (|A| |lambda| + |b|), which rounding lambda to float64
+              causes; no solver can guarantee less than about twice the floor
     success   relative <= tol
 
-Relative residual and floor belong to the worst island: each island (blocks connected through moving bodies, trees of
-M or entries of A) has its own E, V, E0 and V0, so bodies that never meet do not change each other's verdict. E shows
-errors of heavy bodies, V errors of light bodies. If the zero impulse solves an island, row by row to rounding, the
-reference is the size of the terms of its active rows (`lavender_ext/judge/reference.pxd`).
+Each island (blocks connected through moving bodies, trees of M or entries of A) has its own E, V, E0 and V0, so bodies
+that never meet do not change each other's verdict; the relative residual and the floor are those of the worst island.
+E shows errors of heavy bodies, V errors of light bodies. If the zero impulse solves an island, row by row to rounding,
+the size of the terms of its active rows replaces E0 and V0 (`lavender_ext/judge/reference.pxd`).
 
 A floor of at least 1e-3 means that rounding hides a thousandth of the zero impulse's error. The relative residual is
 then at least the floor, so that a diverged impulse does not count as a solution.
 
-In generalised coordinates w = J x + theta lambda - b with M x = J^T lambda, and a solve by the factor of an
-ill-conditioned M loses digits of x that no term above counts. If n 2^-53 cond(M) exceeds a tenth of the tolerance, the
-pass is repeated with x refined by residuals in twice the precision of float64. The floor then also contains the change
-of w and a bound of the error that remains (`lavender_ext/judge/refine.pxd`).
+In generalised coordinates w = J x + theta lambda - b with M x = J^T lambda. Solving with the factor of an
+ill-conditioned M loses digits of x, which the floor above does not include. If n 2^-53 cond(M) exceeds a tenth of the
+tolerance, w is computed again with x refined by residuals in twice the precision of float64. The floor then also
+contains the change of w and a bound of the error that remains (`lavender_ext/judge/refine.pxd`).
 
 A solution computed in float32 has a different floor. Each number is rounded independently by up to u = 2^-24 of
 itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
@@ -33,14 +34,14 @@ itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with
                            (b): u^2 (theta^2 lambda^2 + target^2 + 2 J^2 v*^2), as b = target - J v*
     lambda computed of v+  u^2 A^2 (J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2                                    (5)
 
-(5) counts if impulses are computed by lambda = (target - J v+) / theta, as in engines that minimise over velocities:
-in generalised coordinates, if every active row is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
-norms. A matrix of float32 numbers has no rounding (2); forming A and b from J and M in float32 costs
-about as much as rounding these.
+(5) is included if impulses are computed by lambda = (target - J v+) / theta, as in engines that minimise over
+velocities; this is assumed in generalised coordinates if every active row is soft. The floor is the root of
+(1) + (2, 3 or 4) + (5), measured by E and V. A matrix that was given in float32 has no rounding (2). Forming A and b
+from J and M in float32 causes about as large an error as rounding J and M.
 
 An ellipse is measured as the disk of stretched tangents, `Problem.disk`: the energy is unchanged, and the velocity
-along each tangent is weighted by mu_i / max(mu_1, mu_2), its share in the dissipation. e and w are returned in the
-problem's rows.
+along each tangent is weighted by mu_i / max(mu_1, mu_2), its share in the dissipation. e and w are returned for the
+rows of the problem, not of the disk.
 """
 
 from __future__ import annotations
@@ -69,15 +70,15 @@ from lavender_ext.judge import measure
 
 # [-] A relative residual above this is never attributed to rounding to float64.
 MAX_EXCUSED_RESIDUAL = 1e-5
-MAX_REST_VELOCITY = 1e-9  # m/s. If V0 is smaller, the zero impulse counts as the problem's solution.
+MAX_REST_VELOCITY = 1e-9  # [m/s] If V0 is smaller, the zero impulse counts as the problem's solution.
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to the next number.
 
-# at_floor(relative, floor) tests the residual of one island. Solvers and the judge call the same kernel, which states
-# the reason of the test.
+# at_floor(relative, floor) returns whether rounding explains the residual of one island. Solvers call this kernel,
+# too.
 at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
-# m/s. Default of `threshold`: sensors of robots do not measure smaller velocity errors.
+# [m/s] Default of `threshold`: sensors of robots do not measure smaller velocity errors.
 DEFAULT_THRESHOLD = 1e-6
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
@@ -122,7 +123,7 @@ class Islands(NamedTuple):
     velocity : (n,), m/s
         V.
     energy_at_zero : (n,), sqrt J
-        E0; -1 if no row is active: each row is then compared with its own b.
+        E0; -1 if the zero impulse solves the island and no row is active: each row is then compared with its own b.
     velocity_at_zero : (n,), m/s
         V0.
     """
@@ -188,7 +189,7 @@ class Residual:
     threshold: float = DEFAULT_THRESHOLD
     _float64_relative: float = field(
         default=math.nan, repr=False
-    )  # Relative residual before the refinement of an ill-conditioned M.
+    )  # Relative residual before the refinement for an ill-conditioned M.
 
     if not TYPE_CHECKING:  # Type checkers report unknown names.
 
@@ -197,12 +198,13 @@ class Residual:
 
     @property
     def at_floor(self) -> bool:
-        """Whether rounding explains the residual, and the impulse is better than the zero impulse (float64: 1e5 times).
+        """Whether rounding explains the residual, and the impulse is better than the zero impulse.
 
-        The limit is twice the floor in float64, where the floor is a sum of absolute values (see `at_floor` of this
-        module), and four times in float32: there the floor is a root of squares that takes each number at its worst,
-        sqrt(3) standard deviations, and the maximum over many rows is larger. In float32, rounding of the data alone
-        can be almost as large as the error of the zero impulse.
+        Rounding explains residuals up to twice the floor in float64, where the floor is a sum of absolute values, and
+        up to four times the floor in float32. There the floor is a root of a sum of squares in which each rounding
+        error has its largest size, sqrt(3) standard deviations, but the maximum over many rows may be larger. In
+        float64 the relative residual must also be at most 1e-5. In float32, rounding of the data alone can cause an
+        error almost as large as the error of the zero impulse.
         """
         return _is_at_floor(self.relative, self.above_floor, self.precision)
 
@@ -215,9 +217,9 @@ class Residual:
     def verdict(self) -> str:
         """Verdict: "at its floor", "close enough", "stopped before convergence" (see `excess`) or "wrong".
 
-        At its floor: `at_floor` holds. Close enough: it does not, but no row's velocity error exceeds `threshold`.
-        Wrong: not finite, or an error as large as the zero impulse's. A residual cannot distinguish a smaller
-        mistake from a stop before convergence: a different mu, for example, leaves the same error.
+        At its floor: `at_floor` holds. Close enough: `at_floor` does not hold, but no row's velocity error exceeds
+        `threshold`. Wrong: the residual is not finite, or at least as large as for the zero impulse. A smaller
+        mistake, such as a wrong mu, cannot be distinguished from a stop before convergence.
         """
         return compute_verdict(
             self.relative, self.roundoff_floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
@@ -297,12 +299,13 @@ def compute_verdict(
 ) -> str:
     """Compute `Residual.verdict` from numbers.
 
-    `nothing`: the zero impulse is a solution; `energy_rhs` [sqrt J] is the norm of b.
+    `nothing` is true if the zero impulse is a solution; `energy_rhs` [sqrt J] is the energy norm of b.
     """
     if _is_at_floor(relative, above_floor, precision):
         return AT_FLOOR
     if nothing and _is_explained_by_rounding(relative, floor, precision):
-        # The reference is rounding noise, so compare with b: a diverged impulse has a larger error.
+        # The reference E0 is rounding noise, so compare with the norm of b, which the error of a diverged impulse
+        # exceeds.
         return AT_FLOOR if energy <= energy_rhs else WRONG
     if velocity <= threshold:
         return CLOSE
@@ -350,8 +353,8 @@ def combine_best_islands(
 ) -> FloatArray:
     """Return the best of starts and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 
-    Of the starts an island keeps the one with the lowest relative residual. An impulse replaces it if it solves the
-    island, or if its energy is lower there and its relative residual no larger.
+    In each island, the start with the lowest relative residual is chosen first. An impulse replaces it if the impulse
+    solves the island, or if its energy error there is lower and its relative residual not larger.
     """
     get_reference(problem)
     best: FloatArray = measure.combine_best_islands(problem.metric, list(starts), list(impulses), tol)
@@ -378,9 +381,9 @@ def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None
 def compute_relative(
     problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
 ) -> tuple[float, float]:
-    """Compute (relative, above_floor) of `Residual` for a solver's stopping test, with w, e as scratch (m,).
+    """Compute (relative, above_floor) of `Residual` for a solver's stopping test; w and e (m,) are workspace.
 
-    Without `floor` both are the relative residual.
+    If `floor` is false, the floor is not computed, and above_floor is the relative residual.
     """
     get_reference(problem)
     _, _, relative, above = measure.judge_impulse(problem.metric, impulse, w, e, floor)
@@ -458,7 +461,8 @@ def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
 
 def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:
     """Replace the floor of a residual by the floor of float32."""
-    with np.errstate(over="ignore", invalid="ignore"):  # An impulse that is not finite has no floor.
+    # For an impulse that is not finite, the floor is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
         of_impulse, of_data, of_velocities = estimate_float32_errors(problem, impulse)
         relative = [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
         squares = of_impulse, of_data, of_velocities, of_impulse + of_data + of_velocities
@@ -476,7 +480,7 @@ def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray
 def estimate_float32_errors(
     problem: Problem, impulse: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the squared changes of w (m,) [m2/s2] that float32 causes by (1), by (2, 3 or 4), by (5) of the module."""
+    """Return the squared changes of w (m,) [m^2/s^2] by float32: terms (1), (2, 3 or 4) and (5) of the module."""
     general = problem.generalized
     if general is not None:
         free = general.v_free if general.order is None else general.v_free[general.order]
@@ -534,6 +538,6 @@ def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
         "rounding": None,
         "_float64_relative": judgement.float64_relative,
     }
-    # This takes a quarter of the time of the __init__ of a frozen dataclass.
+    # Set all fields at once, in a quarter of the time of the __init__ of a frozen dataclass.
     object.__setattr__(residual, "__dict__", state)
     return residual

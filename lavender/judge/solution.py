@@ -53,7 +53,7 @@ class Status(str, Enum):
         return self.name
 
 
-# Module names of the members: access through the class costs 600 instructions, a dozen times per solve.
+# Members as module constants: access through the class costs 600 instructions and is needed a dozen times per solve.
 CONVERGED = Status.CONVERGED
 DIVERGED = Status.DIVERGED
 ROUNDOFF_LIMIT = Status.ROUNDOFF_LIMIT
@@ -78,7 +78,7 @@ class SolverStage:
     work : mapping of str to int
         Counts of sweeps, factorisations, pivots, ...
     before, after : float, -
-        Smallest relative residual so far; NaN if it was not computed.
+        Smallest relative residual reached before and after the stage; NaN if it was not computed.
     """
 
     solver: str
@@ -110,8 +110,8 @@ class Claim:
     stages : tuple of SolverStage
         Stages of a solver that calls others.
     judged : lavender_ext.judge.measure.Judged, optional
-        The judge's pass over the impulse that was returned, if the solver made one. It is read only if it belongs to
-        that problem and impulse, bit for bit.
+        Result of the judge for the returned impulse, if the solver called it. It is used only if it belongs to the
+        problem and the impulse, bit for bit.
     """
 
     status: Status
@@ -246,7 +246,7 @@ class Solution:
     stages : tuple of SolverStage
         Stages of `auto` in the order in which they ran; empty for other solvers.
     velocity_tol : float or None, m/s
-        Requested velocity error, if the solve was to stop at one.
+        Requested velocity error; None if the solve was to reach a relative residual.
 
     Examples
     --------
@@ -296,7 +296,10 @@ class Solution:
         rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
         setup_time: float = 0.0,
     ) -> Solution:
-        """Build a solution; `rest` (a function and its arguments) computes the other fields when one is first read."""
+        """Build a solution from the fields that are known; `rest` computes the other fields at the first access to one.
+
+        `rest` is a function and its arguments; the function returns the fields by name.
+        """
         solution: Solution = object.__new__(cls)
         attributes = solution.__dict__
         attributes["impulse"], attributes["status"], attributes["tol"] = impulse, status, tol
@@ -304,15 +307,15 @@ class Solution:
         attributes["_rest"] = rest
         return solution
 
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
+    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
-            # Called only for missing names: a field that `late` postponed, or an unknown attribute.
+            # Python calls this only for names that are missing: fields that `late` postponed, or unknown attributes.
             attributes = self.__dict__
             rest = attributes.get("_rest")
             if rest is not None:
                 function, arguments = rest
-                # Two threads may compute these fields; their values are equal.
+                # Two threads may compute these fields at once; they get equal values.
                 attributes.update(function(*arguments))
                 attributes.pop("_rest", None)
             if name in attributes:
@@ -320,7 +323,7 @@ class Solution:
             raise build_attribute_error("Solution", repr(type(self).__name__), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A read-only view of a dict cannot be pickled.
+        # `work` is a read-only view of a dict, which cannot be pickled: store a dict.
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return _rebuild_solution, (values | {"work": dict(self.work)},)
 
@@ -368,7 +371,7 @@ class Solution:
         """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
         s = problem.cones.stretch
         impulse, proof = mark_read_only(s * self.impulse), self.certificate
-        # Judge the returned numbers: s (lambda / s) differs from lambda by rounding.
+        # Judge the converted impulse again: multiplying by the scale of the ellipse rounds it.
         found = residual(problem, impulse, "float64", tol=self.tol)
         return replace(
             self,
@@ -436,7 +439,7 @@ class Solution:
 
 
 def get_order_name(order: Any) -> str:
-    """Return the name of a sweep order; an array of blocks is a permutation."""
+    """Return the name of a sweep order; the name of an array of block indices is "permutation"."""
     return order if isinstance(order, str) else "permutation"
 
 
@@ -456,7 +459,7 @@ def sum_work(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def raise_if_interrupted(solution: Solution) -> Solution:
-    """Return the solution to a caller that continues; raise KeyboardInterrupt if Ctrl-C ended its solve."""
+    """Return the solution; raise KeyboardInterrupt if Ctrl-C ended its solve, so that the caller does not continue."""
     if solution.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return solution

@@ -27,7 +27,7 @@ NAMES = (
     "free",
     "at a bound",
     "at a bound",
-)  # The index is the case number of the kernels.
+)  # Names of states by the case numbers of the kernels.
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 
@@ -38,7 +38,8 @@ class State:
     Parameters
     ----------
     name : {"open", "closed", "sticks", "slides", "free", "at a bound"}
-        "closed" is a contact without friction; "slides" and "at a bound" mean that at least one component or row is.
+        "closed" is a contact without friction that bears an impulse. "slides" means that at least one friction
+        component slides, "at a bound" that at least one row is at a bound.
     rows : tuple of str
         State of each row; the normal of a contact is open or closed.
     margin : float, N s (N m s on angular rows)
@@ -96,7 +97,7 @@ class States(Sequence[State]):
         first = problem.cones.ptr[:-1]
         if len(first):
             self.margin: FloatArray = np.minimum.reduceat(linear.margin, first)
-            # A contact slides if any component slides; a joint is at a bound if any row is.
+            # A contact slides if any component slides; a joint is at a bound if any of its rows is.
             self._code = np.maximum.reduceat(self.case, first)
         else:
             self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
@@ -127,7 +128,7 @@ class States(Sequence[State]):
 
     @property
     def unknown(self) -> tuple[int, ...]:
-        """Blocks without an error bound: several of them share a load, or the answer is far from a solution."""
+        """Indices of blocks without an error bound: they share a load, or the answer is far from a solution."""
         return tuple(int(i) for i in np.flatnonzero(self.tolerance == np.inf))
 
     @property

@@ -2,12 +2,13 @@
 
     A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
 
-`Problem` holds rows (J and M^-1 of bodies, `lavender/problem/rows.py`), J and M in generalised coordinates
-(`lavender/problem/generalized.py`) or a matrix, one of them, and derives the rest on first use.
+`Problem` holds one of three forms of A: rows (J and M^-1 of bodies, `lavender/problem/rows.py`), J and M in
+generalised coordinates (`lavender/problem/generalized.py`), or a matrix. Other quantities are derived at their first
+use.
 
-Files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
-`program.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms),
-`row_builder.py` (`RowBuilder`: joints and contacts in world coordinates).
+Each of these files builds on the files before it: `data.py` (fields and their checks), `operators.py` (A, J and the
+metric), `program.py` (quadratic programs), `builders.py` (class methods that build problems), `problem.py` (`Problem`
+and its conversions), `row_builder.py` (`RowBuilder`: joints and contacts in world coordinates).
 """
 
 from lavender.problem.data import FRICTION_LAWS, LAWS, OPERATORS, PRECISIONS, Names, check_problem

@@ -53,7 +53,7 @@ class NewProblemOptions(TypedDict, total=False):
 
 
 class ProblemOptions(NewProblemOptions, total=False):
-    """`NewProblemOptions` and the keywords that some of these methods have as parameters of their own."""
+    """`NewProblemOptions`, and further keywords of `Problem` that some of these methods take as explicit parameters."""
 
     names: Sequence[str] | None
     friction: str
@@ -76,7 +76,7 @@ def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()
 
 
 def check_rhs_length(A: Any, b: FloatArray) -> None:
-    """Raise InputError that names b if A is square with another number of rows."""
+    """Raise an InputError about b if A is square and its number of rows differs from the length of b."""
     shape = A.shape if isinstance(A, np.ndarray) or issparse(A) else get_shape("A", A)
     if len(shape) == 2 and shape[0] == shape[1] != len(b):
         raise InputError(f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows")
@@ -148,8 +148,8 @@ class Builders(Operators):
         b : (m,) m/s
             The normal is the first row of each contact.
         mu : scalar, (k,) or (k, 2)
-            Coefficient of each contact. A scalar applies to all contacts, which then have two tangents, or to a single
-            contact. Two coefficients for each contact define an ellipse, see `Cones.contacts`.
+            Coefficient of each contact. A scalar is used for all contacts if these have two tangents, otherwise for a
+            single contact. Two coefficients for each contact define an ellipse, see `Cones.contacts`.
         patch_radius : scalar or (k,) m, optional
             If given, each contact has a spin row.
         rolling : scalar or (k,) m, optional
@@ -160,7 +160,7 @@ class Builders(Operators):
         Raises
         ------
         InputError
-            The number of rows does not fit the number of contacts; mu > 0 for contacts without friction rows.
+            The number of rows does not fit the number of contacts, or mu > 0 for contacts without friction rows.
         """
         check_keywords("contact", more, ("mu", "patch_radius", "rolling"))
         b = as_array("b", b, (None,), unit="m/s")
@@ -206,17 +206,19 @@ class Builders(Operators):
         """Build a problem from the arrays of ODE, Bullet and DART, with a separate bound for each tangent.
 
         Friction rows must directly follow their normal row. If they do not, the problem's rows are a permutation of
-        the arrays' rows, `Problem.findex_order(findex)`. `guess` is in the order of the arrays; `key` and `names` refer
-        to the problem's blocks.
+        the arrays' rows, `Problem.findex_order(findex)`. `guess` is in the order of the arrays; `key` and `names`
+        refer to the problem's blocks.
 
         Parameters
         ----------
         A : (m, m) 1/kg, array or sparse
         b : (m,) m/s
         lower, upper : scalar or (m,) N s
-            Bounds of rows with findex < 0. On other rows upper is mu [-] and lower is not read, as in these engines.
+            Bounds of rows with findex < 0. On other rows, `upper` is mu [-] and `lower` is ignored, as in these
+            engines.
         findex : (m,) int
-            Row of the normal impulse that bounds this row, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+            Index of the normal row that bounds this row by |lambda_i| <= upper_i lambda_findex; -1 for constant
+            bounds.
         **more
             Keywords of `Problem`: name, names, ...
 
@@ -428,7 +430,7 @@ class Builders(Operators):
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
         return cls(
-            generalized.bias(target),  # The class rejects entries that are not finite.
+            generalized.bias(target),  # `Problem` rejects entries that are not finite.
             cones,
             friction=friction,
             compliance=compliance,
@@ -452,9 +454,9 @@ class Builders(Operators):
     ) -> ProblemT:
         """Build a convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
 
-        If P is positive definite, x are generalised velocities with the mass matrix P, and every solver of bounded rows
-        accepts the problem. `lavender.solve_qp` returns x and the multipliers; `problem.qp.solution(solution)` computes
-        them from a solution of `lavender.solve`.
+        If P is positive definite, x are generalised velocities with the mass matrix P, and every solver of bounded
+        rows accepts the problem. `lavender.solve_qp` returns x and the multipliers; `problem.qp.solution(solution)`
+        computes them from a solution of `lavender.solve`.
 
         Parameters
         ----------
@@ -471,13 +473,13 @@ class Builders(Operators):
         **more
             Keywords of `Problem`: name, guess, ...
 
-        Zeros of dense matrices are dropped, and the problem is solved as a sparse one. All arrays are copied.
+        Zeros of dense matrices are dropped, and the program is stored as sparse matrices. All arrays are copied.
 
         Raises
         ------
         InputError
-            The shapes disagree; an entry is NaN; lb > ub; P is not symmetric, or not positive semidefinite (the message
-            has its smallest eigenvalue).
+            The shapes disagree; an entry is NaN; lb > ub; P is not symmetric, or not positive semidefinite (the
+            message has its smallest eigenvalue).
 
         Examples
         --------
@@ -513,9 +515,9 @@ class Builders(Operators):
         J, M, v_free : as in `from_jacobian`
             Only in generalised coordinates. They are copied, so a loop may reuse its arrays.
         b : (m,) m/s, optional
-            Right-hand side.
+            New right-hand side.
         target : scalar or (m,) m/s, optional
-            Instead of b: b = target - J v*.
+            Given instead of b, which is then target - J v*.
         guess : (m,) N s, optional
             Default: no guess, because the old guess belongs to the old numbers.
 
@@ -547,10 +549,10 @@ class Builders(Operators):
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:
-            # The class rejects entries that are not finite.
+            # `Problem` rejects entries that are not finite.
             with np.errstate(over="ignore", invalid="ignore"):
                 b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
-        # Arrays are copied here, so the new problem can use them with copy=False.
+        # Copy arrays here, so that the new problem can use them with copy=False.
         rhs = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         start = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
         qp = self.qp.with_bias(rhs) if self.has_singular_program else None
@@ -573,7 +575,7 @@ def _make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
 
 
 def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
-    """Build contacts of 0 to 2 tangents (c,); all have spin if a radius is given, and rolling if mu_r is given."""
+    """Build contacts of 0 to 2 tangents (c,), with spin rows if a patch radius is given, rolling rows if mu_r is."""
     has_spin, has_rolling, c = patch_radius is not None, rolling is not None, len(mu)
     min_tangents, max_tangents = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
     if min_tangents < 0 or max_tangents > 2:

@@ -10,10 +10,11 @@ A block is one or more bounded rows (`ROW`), or a contact: a normal row, 0 to 2 
                   its own bound, as in many engines; q = mu_2 / mu_1 is stored as `patch_radius`
     CONTACT_ELLIPSE  0 <= lambda_n,  |(lambda_1 / mu, lambda_2 / (mu q))| <= lambda_n. The problem is solved and judged
                   in stretched tangents, in which the ellipse is a disk of the larger coefficient (`Problem.disk`)
-    ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents in one cone: two sliding, one
-                  spin, two rolling; each row is scaled by its own coefficient over mu, so one mu bounds all of them
-    CONTACT_ROLLING  a contact of two tangents, optionally with spin, and |lambda_r| <= mu_r lambda_n on two rolling
-                  rows, mu_r [m] the arm by which rolling moves the normal force; each component has its own bound
+    ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n with the norm over three to five tangents: two sliding, one
+                  spin, two rolling; each row is scaled by its own coefficient divided by mu, so that mu bounds all
+                  rows
+    CONTACT_ROLLING  as CONTACT or CONTACT_SPIN with two tangents, and |lambda_r| <= mu_r lambda_n on two rolling rows;
+                  mu_r [m] is the distance by which rolling moves the normal force
 """
 
 from __future__ import annotations
@@ -133,9 +134,9 @@ class Cones:
     mu: FloatArray
     patch_radius: FloatArray
     rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (): zeros
-    _blocks: ClassVar[kernels.Blocks]  # set on each instance: the same arrays for the kernels
+    _blocks: ClassVar[kernels.Blocks]  # Set on each instance: the arrays of the fields as kernels read them.
 
-    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
+    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
 
         def __init__(
             self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
@@ -160,7 +161,7 @@ class Cones:
         self.__dict__.clear()
         self.__dict__["_blocks"] = blocks
 
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
+    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             # The arrays of the fields are created when one of them is first read.
@@ -341,7 +342,7 @@ class Cones:
 
     @property
     def is_bounded_rows(self) -> bool:
-        """Whether every row has constant bounds: ROW blocks and contacts with only a normal row."""
+        """Whether every row has constant bounds, as in ROW blocks and contacts with only a normal row."""
         return bool(self._blocks.is_bounded_rows)
 
     @property
@@ -351,7 +352,7 @@ class Cones:
 
     @property
     def has_rolling(self) -> bool:
-        """Whether a contact has two rolling rows with a bound of their own (CONTACT_ROLLING)."""
+        """Whether a contact has two rolling rows with a separate bound (CONTACT_ROLLING)."""
         return bool(self._blocks.has_rolling)
 
     @property
@@ -381,7 +382,7 @@ class Cones:
 
     @property
     def stretch(self) -> FloatArray:
-        """Factor of each row (m,) with which the ellipse is a disk: mu_i / max(mu_1, mu_2) on ellipses, else 1."""
+        """Factor of each row (m,) that converts ellipses to disks: mu_i / max(mu_1, mu_2) on tangents, else 1."""
         factor, ellipses = np.ones(self.n_rows), np.flatnonzero(self.kind == CONTACT_ELLIPSE)
         q = self.patch_radius[ellipses]
         factor[self.ptr[ellipses] + 1] = np.where(q > 1.0, 1.0 / q, 1.0)
@@ -401,12 +402,12 @@ class Cones:
 
     @property
     def is_polyhedral(self) -> bool:
-        """Whether every friction row has a bound of its own, so that Coulomb's law is an LCP."""
+        """Whether every friction row has a separate bound, so that Coulomb's law is an LCP."""
         return not bool(np.any(self.n_together > 1))
 
     @property
     def n_together(self) -> IntArray:
-        """Number of tangent rows of each block (k,) that share the bound mu lambda_n of their norm; 0 for ROW."""
+        """Number of tangent rows of each block (k,) with the bound mu lambda_n of their norm; 0 for ROW."""
         return self.n_tangents - (self.kind == CONTACT_BOX)
 
     @property
@@ -436,8 +437,8 @@ class Cones:
         UnknownName
             The shape is unknown.
         InputError
-            "box" with a contact of two tangents and spin, or with a round cone; "disk" with a box that has no friction
-            along one tangent.
+            `shape` is "box", and a contact has two tangents and spin, or is a round cone; or `shape` is "disk", and a
+            box has no friction along one tangent.
         """
         kind, radius, has_pair = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
         if check_shape("shape", shape) == "box":
@@ -501,7 +502,7 @@ class Cones:
 
     @cached_property
     def rolling_rows(self) -> IntArray:
-        """First of the two rolling rows of each block (k,) with a bound of their own, -1 if it has none."""
+        """First of the two separately bounded rolling rows of each block (k,), -1 if it has none."""
         return mark_read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
 
     def friction_components(self) -> Iterator[tuple[int, IntArray]]:
@@ -570,7 +571,7 @@ class Cones:
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Arrays stay read-only in copies and pickles.
+        # Copies and pickles are built by the constructor, which marks their arrays read-only.
         return type(self), self._blocks.arrays
 
 
@@ -648,14 +649,14 @@ def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:
         bound: FloatArray = cones.friction_coefficient[rows] * out[first[blocks]]
         return bound
 
-    # components of one row
+    # Project components of one row.
     for blocks, rows in (
         (np.flatnonzero(tangents == 1), first + 1),
         (np.flatnonzero(cones.separate_rows >= 0), cones.separate_rows),
     ):
         bound = bounds(blocks, rows[blocks])
         out[rows[blocks]] = np.clip(out[rows[blocks]], -bound, bound)
-    # components of two rows
+    # Project components of two rows.
     for blocks, rows in (
         (np.flatnonzero(tangents == 2), first + 1),
         (np.flatnonzero(cones.rolling_rows >= 0), cones.rolling_rows),
@@ -664,7 +665,7 @@ def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:
         bound, size = bounds(blocks, pairs[:, 0]), np.hypot(*out[pairs].T)
         outside = size > bound
         out[pairs[outside]] *= (bound[outside] / size[outside])[:, None]
-    # round cones
+    # Project round cones.
     for block in np.flatnonzero(tangents > 2).tolist():
         tangent_rows = slice(first[block] + 1, first[block] + 1 + tangents[block])
         radius, length = bounds(block, first[block] + 1), np.hypot.reduce(out[tangent_rows])

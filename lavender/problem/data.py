@@ -37,7 +37,8 @@ from lavender_ext.core.problem import make_generalized_data
 from lavender_ext.judge import measure
 
 FRICTION_LAWS = tuple(FRICTION_NUMBER)
-# A solver that supports a law supports the laws that it contains: linear < lcp < coulomb | cone.
+# Friction laws. A law contains the laws before it, but neither of the last two contains the other. A solver that
+# supports a law supports the laws that it contains.
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # Forms of A: rows of bodies, a matrix, or J and M in generalised coordinates.
 OPERATORS = ("rows", "matrix", "generalized")
@@ -99,7 +100,7 @@ class ProblemData:
     qp: Any = field(default=None, repr=False, compare=False)
     derived: Derived = field(init=False, repr=False)
 
-    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
+    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
 
         def __init__(
             self, b: ArrayLike, cones: Cones, matrix: Any = ..., rows: Rows | None = ..., friction: str = ...,
@@ -229,7 +230,7 @@ class ProblemData:
 
     @property
     def has_singular_program(self) -> bool:
-        """Whether this is a quadratic program with a singular P, which only solvers of quadratic programs take."""
+        """Whether this is a quadratic program with a singular P, which only solvers of quadratic programs accept."""
         return self.qp is not None and self.qp.is_singular
 
     @property
@@ -359,7 +360,7 @@ def _check_rhs(b: FloatArray) -> None:
         )
 
 
-ProblemData.__init__.__qualname__ = "Problem.__init__"  # A TypeError then names the class that users call.
+ProblemData.__init__.__qualname__ = "Problem.__init__"  # Makes a TypeError name the class that users call.
 
 
 def check_problem(problem: Any) -> None:

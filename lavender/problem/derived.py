@@ -15,17 +15,17 @@ T = TypeVar("T")
 
 
 class Derived:
-    """Values computed from a problem's data; copies of a problem do not share them.
+    """Values that are computed from a problem's data and cached; copies of a problem do not share them.
 
-    Every entry is written complete by one assignment, so another thread reads a complete value or None. Two threads
-    that read None compute identical bits.
+    Every entry is set by one assignment of a complete value, so another thread reads a complete value or None. Two
+    threads that read None compute identical bits.
 
     Attributes
     ----------
     lock : RLock
         Held while a `computed_once` property is computed in the process `process`.
     view : Data or None
-        Arrays that kernels read in generalised coordinates, set with the problem.
+        Arrays that kernels read in generalised coordinates; set when the problem is created.
     start : (m,) or None, N s
         The zero impulse clipped to the bounds.
     cache : dict
@@ -41,7 +41,8 @@ class Derived:
         self.cache: dict[str, Any] = {}
 
 
-# Identity of this process. A forked process gets another one: the threads that hold locks do not exist in it.
+# Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
+# locks do not exist in it.
 _process = object()
 
 
@@ -50,16 +51,16 @@ def _replace_process_after_fork() -> None:
     _process = object()
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
+if hasattr(os, "register_at_fork"):  # Windows has no fork.
     os.register_at_fork(after_in_child=_replace_process_after_fork)
 
 
 class cached_property(Generic[T]):
     """A property that is computed at its first use and then stored as an attribute of the object.
 
-    Two threads may compute it at the same time, with identical bits. `functools.cached_property` holds one lock for all
-    objects before Python 3.12: threads wait for the properties of other problems, and a process that is forked
-    meanwhile waits forever.
+    Two threads may compute it at the same time, with identical bits. `functools.cached_property` is not used: before
+    Python 3.12 it holds one lock for all objects, so that threads wait for properties of other problems, and a process
+    that is forked at that moment waits forever.
     """
 
     def __init__(self, function: Callable[[Any], T]) -> None:

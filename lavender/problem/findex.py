@@ -16,7 +16,7 @@ from lavender.problem.cones import Cones, get_kinds
 
 
 def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
-    """Return the row of the arrays for each row of the problem (m,): each normal is followed by its friction rows."""
+    """Return, for each row of the problem (m,), its row in the arrays; friction rows follow their normal row."""
     findex = as_array("findex", findex, (count,), dtype=np.int32)
     m = len(findex)
     rows = np.flatnonzero(findex >= 0)
@@ -70,7 +70,7 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
             f"findex of {count[bad[0]]} rows is {bad[0]}; a normal has at most two such rows, its tangents: give the "
             "others constant bounds, or spin as patch_radius of Cones.contacts"
         )
-    first = order[~is_friction[order]]  # First row of each block, as an index of the arrays.
+    first = order[~is_friction[order]]  # First row of each block, as an index into the arrays.
     size = 1 + count[first]
     ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
     k = len(first)
@@ -103,7 +103,7 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     first_tangent = cones.ptr[:-1][cones.is_box] + 1
     coefficient[first_tangent] = cones.coefficients[
         cones.is_box, 0
-    ]  # exactly 0 for a tangent without friction
+    ]  # A tangent without friction gets exactly 0.
     upper[rows] = coefficient[rows]
     lower[rows] = -coefficient[rows]
     findex[rows] = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))[rows]

@@ -11,8 +11,9 @@ from lavender.base.errors import InputError, check_name
 
 # Shapes of the bound of two tangents: their norm is bounded, or each tangent separately.
 SHAPES = ("disk", "box")
-# In a box, mu_1 = 0 with mu_2 > 0 is stored as this multiple of mu_2, because only mu_2 / mu_1 is stored: impulses so
-# small vanish by rounding in any sum with impulses along the second tangent. The ratio of an ellipse must be larger.
+# In a box, mu_1 = 0 with mu_2 > 0 is stored as this multiple of mu_2, because the ratio mu_2 / mu_1 is stored.
+# Impulses of that size vanish by rounding when they are added to impulses along the second tangent. An ellipse with a
+# smaller ratio of its coefficients is rejected.
 MIN_COEFFICIENT_RATIO = 2.0**-60
 
 

@@ -2,9 +2,9 @@
 
     w = J v+ - target + compliance lambda,   v+ = v* + M^-1 J^T lambda,   A = J M^-1 J^T + diag(compliance)
 
-M is factored once, M = L^T D L, rows from the last to the first. In the order of a kinematic tree, with parents before
-their children, leaves are eliminated first and there is no fill-in. Other matrices are reordered to reduce fill-in;
-see `lavender_ext/core/generalized.pxd`.
+M is factored once, M = L^T D L, from the last row to the first. If the velocities have the order of a kinematic tree,
+with parents before their children, leaves are eliminated first, and there is no fill-in. Other matrices are reordered
+to reduce fill-in; see `lavender_ext/core/generalized.pxd`.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stac
 from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
 from lavender_ext.factor.graph import least_degree
 
-# |M_ij - M_ji| above this fraction of sqrt(M_ii M_jj) is an error: rounding of sums over bodies in float64 causes
-# less.
+# M is rejected if |M_ij - M_ji| exceeds this fraction of sqrt(M_ii M_jj); rounding of sums in float64 causes less.
 MAX_ASYMMETRY = 1e-12
-MAX_ASYMMETRY_FLOAT32 = 2.0**-16  # The same if M has dtype float32; its lower triangle is used.
+# Value of MAX_ASYMMETRY for a float32 M, of which the lower triangle is used.
+MAX_ASYMMETRY_FLOAT32 = 2.0**-16
 # With fewer velocities, a factorisation costs less than the search of an order.
 MIN_TREE_ORDERING_VELOCITIES = 400
 # If the factor of M in the original order has more entries, another order is used.
 MAX_FACTOR_ENTRIES = 50_000_000
-# Skip the search of an order of trees if each tree shares rows with more than this many trees on average: J^T J then
+# No order of trees is searched if each tree shares rows with more than this many trees on average, because J^T J then
 # fills in under every order.
 MAX_MEAN_TREE_COUPLINGS = 100
 Compressed = tuple[IntArray, IntArray, FloatArray]
-ANY_LENGTH = (None,)  # shape of an array of any length
+ANY_LENGTH = (None,)  # Shape of a one-dimensional array of any length.
 
 
 class Generalized:
@@ -99,9 +99,9 @@ class Generalized:
         names: Sequence[str] | None = None,
         like: kernels.Operator | None = None,
     ) -> Generalized:
-        """Build from compressed rows of J and of the lower triangle of M, without copies.
+        """Build the object from compressed rows of J and of the lower triangle of M, without copies.
 
-        For adapters of engines that have these arrays. Only finiteness and definiteness are checked.
+        It is meant for adapters of engines that have these arrays. Only finiteness and definiteness are checked.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class Generalized:
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
             if as_plain_array(x, ANY_LENGTH, True, False) is None:
-                as_array(name, x, ANY_LENGTH, copy=False)  # Raises an InputError with a message.
+                as_array(name, x, ANY_LENGTH, copy=False)  # Raises an InputError that names the entry.
         free = as_plain_array(v_free, (n,), True, False)
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
@@ -127,7 +127,10 @@ class Generalized:
 
     @classmethod
     def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
-        """Build from checked arrays, as `compressed`, without the factor of M and v*, which `shifted` computes."""
+        """Build the object from checked arrays in the form of `compressed`, without v* and without factoring M.
+
+        `shifted` computes v* and the factor.
+        """
         new = object.__new__(cls)
         new._make_operator(jac, mass, len(mass[0]) - 1)
         new.__dict__["names"] = None
@@ -154,7 +157,7 @@ class Generalized:
         indptr, indices, data = self.operator.jac
         data = data * np.repeat(scale, np.diff(indptr))
         is_nonzero = data != 0.0
-        if not is_nonzero.all():  # Products can underflow to zero.
+        if not is_nonzero.all():  # Remove entries that underflowed to zero when they were scaled.
             indptr = np.append(0, np.cumsum(is_nonzero))[indptr].astype(np.int32)
             indices, data = indices[is_nonzero], data[is_nonzero]
         new = object.__new__(Generalized)
@@ -256,7 +259,7 @@ class Generalized:
         """J (m, nv) in compressed rows, in the original order, without entries that are zero."""
         indptr, indices, data = self.operator.jac
         if self.order is not None:
-            # `sort_indices` works in place: copy the data, because kernels read this array.
+            # Copy the data, because kernels read this array and `sort_indices` works in place.
             original = sp.csr_array((data.copy(), self.order[indices], indptr), shape=(self.m, self.nv))
             original.sort_indices()
             indices, data = original.indices, original.data
@@ -333,9 +336,9 @@ class Generalized:
         return out
 
     def restrict(self, rows: Any, velocities: Any) -> Generalized:
-        """Return the system of these rows and velocities only.
+        """Return J and M restricted to the given rows and velocities.
 
-        It is exact if neither M nor these rows of J couple the velocities to others.
+        The restriction loses nothing if neither M nor these rows of J couple these velocities to others.
         """
         rows, velocities = np.asarray(rows, np.intp), np.asarray(velocities, np.intp)
         names = None if self.names is None else [self.names[i] for i in velocities]
@@ -381,7 +384,7 @@ def _convert_mass(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, i
     max_asymmetry = MAX_ASYMMETRY_FLOAT32 if get_common_precision(*blocks) == "float32" else MAX_ASYMMETRY
     if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
         arrays = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
-        # SciPy 1.18 warns about dense blocks.
+        # Convert the blocks to sparse arrays, because SciPy 1.18 warns about dense blocks.
         mass = sp.block_diag([sp.coo_array(block) for block in arrays], format="csr")
     lower = extract_lower_triangle(
         "M", mass, "give both triangles (Pinocchio's crba fills the upper one)", max_asymmetry, names
@@ -432,7 +435,7 @@ def convert_to_compressed_rows(name: str, matrix: Any, sign: float = 1.0) -> Com
         )
         if arrays is not None:
             return arrays
-    csr = as_csr(name, matrix)  # Converts other types, or raises an InputError.
+    csr = as_csr(name, matrix)  # Convert other sparse types; raises InputError for invalid data.
     return stack_csr_matrices(n, [(csr.indptr, csr.indices, csr.data, False, sign, m)])
 
 
@@ -478,7 +481,7 @@ def _order_by_degree(graph: sp.csr_array) -> IntArray:
 
 
 def _label_trees(parent: IntArray) -> IntArray:
-    """Return the tree of each velocity from its parent, which precedes it or is -1 at a root; numbered in order."""
+    """Return the number of each velocity's tree; parents (n,) precede their children and are -1 at roots."""
     tree = (np.cumsum(parent < 0) - 1).tolist()
     for i, p in enumerate(parent.tolist()):
         if p >= 0:
@@ -487,10 +490,10 @@ def _label_trees(parent: IntArray) -> IntArray:
 
 
 def _order_trees(jac: Compressed, parent: IntArray) -> IntArray | None:
-    """Return an order of velocities with whole trees permuted, or None if it does not reduce fill-in.
+    """Return an order of velocities that permutes whole trees to reduce fill-in, or None if it does not.
 
-    The order of trees does not change the fill-in of M. But Newton's matrix N = M + J^T V J couples trees that share a
-    row, for example the vertices of a flex, each of which is a tree.
+    The order of trees does not change the fill-in of M, but that of Newton's matrix N = M + J^T V J, which couples
+    trees that share a row (for example the vertices of a flex, each of which is a tree).
     """
     roots, tree = np.flatnonzero(parent < 0), _label_trees(parent)
     indptr, indices, _ = jac

@@ -21,8 +21,8 @@ from lavender_ext.factor import sparse
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.judge import measure
 
-# A matrix counts as positive semidefinite if A + SEMIDEFINITE_SHIFT D has a Cholesky factor, D = diag(d). Rounding of
-# the entries causes negative eigenvalues of about -m 2^-53 in the metric of D.
+# [-] A matrix counts as positive semidefinite if A + SEMIDEFINITE_SHIFT D has a Cholesky factor, with D = diag(d).
+# Rounding of the entries can cause negative eigenvalues of about -m 2^-53 in the metric of D.
 SEMIDEFINITE_SHIFT = 1e-12
 # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 MAX_SAFE_ENTRY = 1e15
@@ -39,7 +39,7 @@ class Operators(ProblemData):
 
     @classmethod
     def _from_engine_arrays(cls, **fields: Any) -> Any:
-        """Build a problem over J and M from fields that `export.numbers` has checked, without copies.
+        """Build a problem over J and M without copies, from fields that `lavender_ext.io.mujoco_rows` has checked.
 
         The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`.
         """
@@ -96,7 +96,7 @@ class Operators(ProblemData):
             return True
         if not self.is_symmetric:
             return False
-        with np.errstate(all="ignore"):  # no warning on overflow
+        with np.errstate(all="ignore"):  # Overflow raises no warning.
             scale = sp.diags_array(1.0 / np.sqrt(self.d))
             return has_shifted_cholesky(scale @ self.csr @ scale)
 
@@ -192,7 +192,7 @@ class Operators(ProblemData):
             return self._form_generalized()
         if self.rows is not None:
             bound, start, blocks = assemble.bound_delassus_entries(self.data)
-            bound = min(bound, self.m**2)  # Blocks that share both bodies count twice.
+            bound = min(bound, self.m**2)  # Pairs of blocks that share both bodies were counted twice.
             if bound >= MAX_INDEXABLE_ENTRIES:
                 raise TooLarge(
                     f"A would have up to {bound} entries, more than 32-bit indices reach: "
@@ -204,7 +204,7 @@ class Operators(ProblemData):
 
     def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
-        # Rows of J without entries have a diagonal entry: their compliance.
+        # Add m to the bound, because rows of J without entries have a diagonal entry, their compliance.
         bound = min(self.metric.entries_of_matrix + self.m, self.m**2)
         if bound >= MAX_INDEXABLE_ENTRIES:
             raise TooLarge(
@@ -214,7 +214,7 @@ class Operators(ProblemData):
         assert self.generalized is not None
         y = (
             self.metric.whitened()
-        )  # SciPy is not used: the first solve with a time limit has no time to import it.
+        )  # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
         indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
@@ -261,14 +261,14 @@ class Operators(ProblemData):
 
     @computed_once
     def vanished_rows(self) -> IntArray:
-        """Rows with A_ii = 0 by underflow only: J_i M^-1 J_i^T has products of nonzero entries."""
+        """Rows with A_ii = 0 only by underflow, since J_i M^-1 J_i^T has products of nonzero entries."""
         empty: IntArray = self.metric.empty
         if not len(empty):
             return empty
         if self.generalized is not None:
             pattern = self.generalized.jac[
                 empty
-            ]  # M is positive definite, so every nonzero row of J has A_ii > 0.
+            ]  # Since M is positive definite, A_ii = 0 of a nonzero row of J is an underflow.
         elif self.rows is not None:
             inverse = self.rows.inverse_mass_matrix().astype(bool).astype(float)
             pattern = self.rows.jacobian(self.cones)[empty].astype(bool).astype(float) @ inverse
@@ -318,7 +318,7 @@ class Operators(ProblemData):
 
     @property
     def _start(self) -> FloatArray:
-        """Pi(0) (m,) [N s], shared."""
+        """Pi(0) (m,) [N s], a cached array that callers must not change."""
         derived = self.derived
         if derived.start is None:
             derived.start = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
@@ -364,7 +364,7 @@ def analyse_symmetric_matrix(a: Any) -> tuple[LinearSystem, FloatArray]:
     TooLarge
         The factor would have 2^31 entries or more.
     """
-    a = sp.csr_array(0.5 * (a + a.T))  # The pattern and rounded entries become symmetric.
+    a = sp.csr_array(0.5 * (a + a.T))  # Make the pattern, and entries that differ by rounding, symmetric.
     a.sort_indices()
     try:
         system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))

@@ -31,7 +31,7 @@ from lavender_ext.core.order import (
 )
 from lavender_ext.factor.graph import matrix_components
 
-# The engine creates contacts in the order of its bodies, so it does not need "local".
+# Orders of LavenderSim, which creates contacts in the order of its bodies and so does not need "local".
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
 SWEEP_ORDERS = (*ENGINE_ORDERS, "local")
 
@@ -79,7 +79,8 @@ def compute_block_order(
     seed : int
         Only with "random".
     ground : int array, optional
-        Blocks that touch the ground, for "bottom_up" and "top_down" on a matrix. Rows contain the static bodies.
+        Blocks that touch the ground, needed for "bottom_up" and "top_down" on a matrix. With bodies, the static bodies
+        are known.
 
     Returns
     -------
@@ -92,7 +93,7 @@ def compute_block_order(
     InputError
         The array is not a permutation; `ground` is out of range, or given with an order that does not use it.
     CapabilityError
-        Levels of a matrix without `ground`.
+        The order "bottom_up" or "top_down" was requested for a matrix without `ground`.
     """
     k = problem.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
@@ -131,7 +132,7 @@ def compute_block_order(
 
 
 def _sort_by_key(key: IntArray, split: int) -> IntArray:
-    """Sort blocks (k,) by key: joints first, equal keys in their present order."""
+    """Return an order of blocks (k,): joints before contacts, each sorted stably by `key`."""
     is_contact = np.arange(len(key)) >= split
     return np.lexsort((key, is_contact)).astype(np.int32)
 
@@ -165,8 +166,9 @@ def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
     return level
 
 
-# Bodies are renumbered if the numbers of two touching bodies differ by more than this on average. Velocities take 48
-# bytes each: with smaller differences, the velocities in use fit into a second-level cache.
+# Bodies are renumbered if the numbers of two touching bodies differ by more than this on average. The velocities of a
+# body take 48 bytes; with smaller differences, the velocities that a sweep uses at a time fit into a second-level
+# cache.
 MAX_MEAN_BODY_DISTANCE = 4_096
 
 
@@ -189,7 +191,10 @@ def rank_bodies(problem: Problem) -> IntArray:
 
 
 def compute_local_order(problem: Problem) -> IntArray:
-    """Sort blocks (k,), joints first, by the `rank_bodies` of their bodies; a matrix by reverse Cuthill-McKee."""
+    """Return an order of blocks (k,) in which blocks of neighbouring bodies are close together, joints first.
+
+    Blocks are sorted by the `rank_bodies` of their bodies; blocks of a matrix are in reverse Cuthill-McKee order.
+    """
     if problem.rows is None:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
@@ -198,7 +203,7 @@ def compute_local_order(problem: Problem) -> IntArray:
     rank = np.append(rank_bodies(problem), np.int32(-1))
     pair = rank[problem.rows.block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
-    low = np.where(low < 0, high, low)  # Contacts with a static body are sorted by the moving body.
+    low = np.where(low < 0, high, low)  # For a static body, -1, use the number of the moving body.
     is_contact = np.arange(problem.n_blocks) >= problem.rows.n_joints
     return np.lexsort((high, low, is_contact)).astype(np.int32)
 

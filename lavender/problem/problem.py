@@ -1,4 +1,4 @@
-"""`Problem`: the complete class, with warm starts from the step before, and conversions to other forms."""
+"""`Problem`: the complete class, with warm starts from the previous step and conversions to other forms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lavender_ext.core.checks import MIN_MAGNITUDE
 
 @dataclass(frozen=True, eq=False)
 class VelocityForm:
-    """min 1/2 |y|^2 + 1/2 z^T diag(theta) z over y [sqrt J], z = scaled impulse, in the metric of d.
+    """A problem in mass-scaled velocities y [sqrt J] and scaled impulses z [sqrt J], in the metric of d.
 
         K y + diag(theta) z - g  is complementary to  z,     y = K^T z,
         K = D^-1/2 J M^-1/2,  theta = compliance / d,  g = D^-1/2 b,  lambda = D^-1/2 z
@@ -60,9 +60,10 @@ class Problem(Builders):
     cones : Cones
         Blocks and bounds.
     matrix : (m, m) array or sparse, 1/kg
-        A, stored without changes (it may be asymmetric, indefinite or singular); or
+        A, stored without changes; it may be asymmetric, indefinite or singular. Exactly one of `matrix`, `rows` and
+        `generalized` is given.
     rows : Rows
-        J and M^-1 of bodies; A = J M^-1 J^T + diag(compliance) is formed only if needed; or
+        J and M^-1 of bodies; A = J M^-1 J^T + diag(compliance) is formed only if needed.
     generalized : Generalized
         J and M in generalised coordinates; as with rows, A is formed only if needed.
     friction : {"coulomb", "cone"}
@@ -77,19 +78,19 @@ class Problem(Builders):
         Names of the blocks, e.g. "hinge 7"; see `row_name`.
     name : str
     copy : bool
-        True copies the arrays. False uses b, matrix, compliance and guess without a copy if their type fits; they are
-        then shared with the caller and marked read-only.
+        Whether to copy the arrays. If false, b, matrix, compliance and guess are used without a copy if their type
+        fits; they are then shared with the caller and marked read-only.
     precision : {"float64", "float32"}, optional
-        Precision in which an engine computed these numbers and computes its answers; `lavender.residual` derives from
-        it the error that rounding alone explains. Default: the precision of `rows`. Problems are always solved in
-        float64.
+        Precision in which an engine computed these numbers and its answers. `lavender.residual` derives from it the
+        error that rounding alone can cause. Default: the precision of `rows`. Problems are always solved in float64.
     qp : QuadraticProgram, optional
         Quadratic program from which `Problem.from_qp` built this problem; files contain it only if P is singular.
 
     Raises
     ------
     InputError
-        A wrong shape; NaN or infinity; none or several of matrix, rows and generalized; nnz >= 2^31.
+        An array has a wrong shape, a NaN or an infinity; none or several of matrix, rows and generalized are given; or
+        A has 2^31 or more entries.
     """
 
     def carry(self, previous: Any, keys: Any = None) -> FloatArray:
@@ -113,7 +114,8 @@ class Problem(Builders):
         Raises
         ------
         InputError
-            `previous` is not a solution; `keys` has another length; `keys` is given and `previous` has none.
+            `previous` is not a solution; `keys` does not have k entries; or `keys` is given, and `previous` has no
+            keys.
 
         Examples
         --------
@@ -165,7 +167,7 @@ class Problem(Builders):
         Raises
         ------
         InputError
-            "coulomb" with round cones of more than two tangents.
+            `friction` is "coulomb", and the problem has round cones of more than two tangents.
         """
         return replace(self, friction=friction, copy=False)
 
@@ -173,8 +175,8 @@ class Problem(Builders):
     def disk(self) -> Problem:
         """The problem itself, or if it has ellipses an equivalent one in stretched tangents, whose contacts are disks.
 
-        Its mu is max(mu_1, mu_2), its rows are multiplied by `cones.stretch` and its impulses divided by it. The
-        friction laws of both problems are equivalent: friction maximises dissipation,
+        The mu of a disk is max(mu_1, mu_2). The rows of the equivalent problem are multiplied by `cones.stretch`, its
+        impulses are divided by it. The friction laws of both problems are equivalent: friction maximises dissipation,
         lambda_t = -mu^2 w_t lambda_n / |mu w_t| with mu = diag(mu_1, mu_2). Solvers and the judge use the disks. Their
         results are converted to the rows of this problem.
 
@@ -197,7 +199,7 @@ class Problem(Builders):
         """Convert impulses (m,) [N s] of this problem to impulses of `disk`."""
         if not self.cones.has_ellipse:
             return impulse
-        with np.errstate(over="ignore"):  # An impulse may have any size.
+        with np.errstate(over="ignore"):  # Large impulses may overflow without a warning.
             return impulse / self.cones.stretch
 
     @computed_once
@@ -278,7 +280,8 @@ class Problem(Builders):
             return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
         rows = self.rows
         assert rows is not None
-        # M^-1 = L L^T by blocks. A singular inverse inertia (a fixed axis) has a square root but no Cholesky factor.
+        # Compute M^-1 = L L^T body by body, by eigenvalues, because the singular inverse inertia of a body with a
+        # fixed axis has no Cholesky factor.
         value, vector = np.linalg.eigh(rows.inv_inertia)
         root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
         half = replace(

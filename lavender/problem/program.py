@@ -2,13 +2,13 @@
 
     min 1/2 x.P x + q.x   subject to   A x = b,  G x <= h,  lb <= x <= ub                                 (1)
 
-With the rows J x = target (the first ones) and J x >= target (the others),
+It is written with equations J x = target (the first rows) and inequalities J x >= target (the other rows), where
 
     J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]                                    (2)
 
-f: variables with lb = ub; l, u: other finite bounds; G without rows with infinite h. Numbers of at least 1e20 in
-absolute value count as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others,
-and
+f are the variables with lb = ub, l and u the other variables with a finite lower or upper bound; rows of G with
+infinite h are left out. Numbers of at least 1e20 in absolute value count as infinite. The multipliers lambda are free
+on the equations (A and f) and >= 0 on the inequalities, and
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
@@ -61,14 +61,17 @@ from lavender_ext.judge.measure import all_finite, compute_program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
-# P is singular if a pivot of its Cholesky factor does not exceed this share of the diagonal entry.
+# P counts as singular if a pivot of its Cholesky factor is at most this fraction of the diagonal entry.
 MAX_SINGULAR_PIVOT = 1e-13
-# P is semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor: rounding may cause negative eigenvalues.
+# P counts as semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor. The shift covers negative
+# eigenvalues that rounding causes.
 SEMIDEFINITE_SHIFT = 1e-12
-# If q is 0, all forces may vanish at the solution. They are then compared with this share of the terms of P x.
+# If q is 0, q, P x and J^T lambda may all vanish at the solution. The dual error is then relative to at least this
+# fraction of the largest row of |P| |x|.
 CURVATURE_SHARE = 1e-3
-INFINITE = 1e20  # A right-hand side or bound of this size counts as infinite, as in other packages.
-MAX_EIGENVALUE_SIZE = 1000  # Up to this size, the message about an indefinite P has its smallest eigenvalue.
+INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
+# Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
+MAX_EIGENVALUE_SIZE = 1000
 ProgramArrays = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
 
@@ -102,7 +105,8 @@ class QPSolution:
     z_box: FloatArray | None
     solution: Any
     ray: FloatArray | None
-    impulse: FloatArray = field(repr=False)  # (m,) lambda, or (n + m,) x and lambda of a singular P
+    # Impulses of the constraint problem: lambda (m,), or x and lambda (n + m,) if P is singular.
+    impulse: FloatArray = field(repr=False)
     qp: QuadraticProgram = field(repr=False)
     tol: float = 1e-6
 
@@ -111,7 +115,7 @@ class QPSolution:
             return (
                 f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
             )
-        # The status belongs to the constraint problem; the verdict on the program is `found`.
+        # Show the status, which belongs to the constraint problem, only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
         if self.solution is not None and self.solution.claim_check == "not proven":
             status = f"{self.solution.status.name} (not proven), "
@@ -129,7 +133,7 @@ class QPSolution:
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
-        """r_p, r_d, gap, the same three relative to their terms, and the largest relative one."""
+        """Primal, dual and gap residual; the three residuals relative to their terms; the largest relative residual."""
         qp, multipliers, min_force = self.qp, self.qp.select_row_multipliers(self.impulse), 0.0
         if max_abs_of_array(qp.q) == 0.0:
             min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
@@ -165,13 +169,13 @@ class QPSolution:
     def error(self) -> float:
         """Largest of the three residuals, each relative to its own terms; 0 for an exact solution.
 
-        - Primal: the violation of each row relative to the maximum of |J_ij x_j| and |target_i| of this row, but at
-          most to the maximum of |J x|, |target| and |x| over all active rows, as in OSQP and Clarabel. If the row's
-          terms vanish, as in x >= 0, it is relative to the size of its variables in the active rows.
-        - Dual: relative to the maximum of |q|, |P x| and |J^T lambda|; if q is 0, to at least 1e-3 of the largest row
+        - Primal: the violation of each row, divided by the maximum of |J_ij x_j| and |target_i| of this row. The
+          divisor is at most the maximum of |J x|, |target| and |x| over all active rows, as in OSQP and Clarabel. If
+          the row's terms vanish, as in x >= 0, the divisor is the size of its variables in the active rows.
+        - Dual: divided by the maximum of |q|, |P x| and |J^T lambda|; if q is 0, by at least 1e-3 of the largest row
           of |P| |x|.
-        - Gap: relative to |objective|, or to 1e-3 of the sum of its terms if these cancel further. Gaps of rows with
-          opposite signs are added, not subtracted.
+        - Gap: the sum of the absolute gaps of all rows, divided by |objective|, or by 1e-3 of the sum of the absolute
+          values of the objective's terms if that is larger.
 
         Inactive rows do not contribute to these scales: rows that are satisfied and have no multiplier, and rows that
         are far from their bound.
@@ -209,7 +213,7 @@ class QuadraticProgram:
     generalized : Generalized or None
         J of (2) and M = P; None if P is singular.
     singular : (P, J) or None
-        Both as (indptr, indices, data) if P is singular, P with both triangles.
+        If P is singular: P with both triangles, and J, each as (indptr, indices, data).
     n_equalities, n_inequalities : int or None
         Number of rows of A and of G; None without A or G.
     kept : (mi,) int or None
@@ -253,7 +257,7 @@ class QuadraticProgram:
         return replace(self, q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()))
 
     def with_saddle(self) -> QuadraticProgram:
-        """Return the same program in the form (5), whatever P is."""
+        """Return this program in the form (5), which is used for a singular P, also if P is definite."""
         if self.generalized is None:
             return self
         general = self.generalized
@@ -299,7 +303,7 @@ class QuadraticProgram:
         return self.generalized.force(multipliers)
 
     def estimate_variable_sizes(self) -> FloatArray:
-        """Compute the size of each variable (n,) without rows, |q_i| / P_ii or |v*_i|, in the order of J's columns."""
+        """Compute the size of each variable (n,) without constraints, |q_i| / P_ii or |v*_i|, in the order of J."""
         general = self.generalized
         if general is None:
             diagonal = self.hessian.diagonal()
@@ -327,8 +331,8 @@ class QuadraticProgram:
     ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
         """Return (y, z, z_box) of impulses (m,), or (n + m,) if P is singular.
 
-        From a certificate they prove that the program has no feasible point: A^T y + G^T z + z_box = 0 and
-        b.y + h.z + (ub or lb).z_box < 0.
+        If `impulse` is a certificate of infeasibility, the result proves that the program has no feasible point:
+        A^T y + G^T z + z_box = 0 and b.y + h.z + (ub or lb).z_box < 0.
         """
         y = z = box = None
         impulse = self.select_row_multipliers(impulse)
@@ -353,7 +357,7 @@ class QuadraticProgram:
     def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
         """Return x, y, z and z_box of a `Solution` of this problem, or of its impulses.
 
-        It is `found` if the error does not exceed `tol`.
+        `QPSolution.found` is true if the error does not exceed `tol`.
         """
         impulse = getattr(solution, "impulse", None)
         of_solution = None if impulse is None else solution
@@ -368,7 +372,7 @@ class QuadraticProgram:
         )  # fmt: skip
 
 
-@lru_cache(maxsize=8)  # All programs of one controller have the same cones.
+@lru_cache(maxsize=8)  # A controller solves many programs with equal cones.
 def _make_one_sided_cones(free: int, m: int) -> Cones:
     """Return cones of m rows, the first ones free and the others nonnegative."""
     low = np.zeros(m)
@@ -414,7 +418,7 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
 def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -> QuadraticProgram:
     """Return the program of n variables from the matrix, right-hand side and bounds of its problem (5).
 
-    Its equations count as A x = b, its other rows as G x <= h.
+    The equations of the problem become A x = b of the program, its other rows become G x <= h.
 
     Raises
     ------
@@ -589,7 +593,7 @@ def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray
 
 
 def _are_rows_empty(lower: Compressed, is_zero: FloatArray) -> bool:
-    """Return whether rows and columns with a zero diagonal have no entries; otherwise P is indefinite."""
+    """Return whether rows and columns of P with a zero diagonal entry are empty; if they are not, P is indefinite."""
     ptr, idx, val = lower
     is_entry = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)
     return not is_entry.any()

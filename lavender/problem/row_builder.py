@@ -10,9 +10,9 @@ is J v+ + compliance lambda = target, within the bounds of its impulse lambda:
     contact  as a limit with g the gap, or -e u if the bodies approach at speed -u             (5)
 
 (1) is Baumgarte's correction (Baumgarte 1972); beta is the error reduction parameter `ERP` of the ODE manual, section
-3.7. (2) is a spring with a damper integrated by implicit Euler; ODE manual, section 3.8, and Catto, "Soft Constraints"
-(GDC 2011). (3) to (5) follow Catto, "Understanding Constraints" (GDC 2014): (4) lets a joint or contact close
-its remaining distance within the step, but not more.
+3.7. (2) is a spring of stiffness k with a damper c, integrated by implicit Euler (ODE manual, section 3.8; Catto,
+"Soft Constraints", GDC 2011). (3) to (5) follow Catto, "Understanding Constraints" (GDC 2014): (4) lets a joint or
+contact close its remaining distance within the step, but not more.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ BLOCK_TYPES = (
 )  # fmt: skip
 MAX_KEYED_BODIES = 2**22 - 1  # More bodies do not fit into the 22 bits of a key.
 MAX_FEATURE = 2**16 - 1  # Larger features do not fit into the 16 bits of a key.
-NORMAL_LENGTH_TOLERANCE = 1e-5  # Above it a normal is rejected; float32 leaves 1e-7.
+# [-] A normal is rejected if its length differs from 1 by more; float32 causes 1e-7.
+NORMAL_LENGTH_TOLERANCE = 1e-5
 PLANAR_VELOCITIES = (
     0,
     1,
@@ -62,7 +63,7 @@ Result = TypeVar("Result")
 
 
 def check_arguments(method: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate a method to raise an InputError that suggests an argument if one has an unknown name."""
+    """Decorate a method so that an unknown argument name raises an InputError that suggests a valid name."""
     code = method.__code__
     valid = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
 
@@ -146,7 +147,7 @@ class RowBuilder:
     Raises
     ------
     InputError
-        An argument that does not fit; the message names it. All methods raise it as well: for a body that does not
+        An argument is invalid; the message names it. All methods raise InputError, too: for a body that does not
         exist, two static bodies, a vector of the wrong dimension or of length 0, or a number out of range.
 
     Examples
@@ -216,7 +217,7 @@ class RowBuilder:
         self._keys: set[int] = set()
         self._next_feature: dict[tuple[str, int, int], int] = {}
 
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
+    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             raise build_attribute_error("RowBuilder", "'RowBuilder'", name)
@@ -269,9 +270,9 @@ class RowBuilder:
         a, b, anchor, anchor_b, feature, name
             As in `ball`.
         axis : array-like (3,)
-            Axis in world coordinates, as fixed to a. Its length has no meaning.
+            Hinge axis that is fixed to a, in world coordinates. Its length does not matter.
         axis_b : array-like (3,), optional
-            The same axis as fixed to b. Default: `axis`.
+            Hinge axis that is fixed to b, in world coordinates. Default: `axis`.
 
         Returns
         -------
@@ -326,7 +327,7 @@ class RowBuilder:
         a, b, anchor, feature, name
             As in `ball`.
         axis : array-like (2,) or (3,)
-            Direction of travel in world coordinates, fixed to a. Its length has no meaning.
+            Direction of travel in world coordinates, fixed to a. Its length does not matter.
         anchor_b : array-like, m, optional
             Point of b that travels along the line through `anchor`. Default: `anchor`. Its distance from the line is
             the error of the joint.
@@ -342,7 +343,7 @@ class RowBuilder:
         point_a, point_b = self._get_anchors(anchor, anchor_b)
         direction, offset = self._check_direction("axis", axis), _subtract(point_b, point_a)
         sides = [_cross(Z_AXIS, direction)] if self._is_planar else _make_side_vectors(direction)
-        # The line is fixed to a: its rotation moves the point of a that coincides with point_b.
+        # The line is fixed to a: use the velocity of the point of a that coincides with point_b.
         rows = [self._make_linear_row(pair, side, point_b, point_b, _dot(side, offset)) for side in sides]
         return self._add_joint(
             "slider", pair, rows + self._make_orientation_rows(pair, angle_error), feature, name
@@ -469,8 +470,8 @@ class RowBuilder:
         a, b, feature, name
             As in `ball`.
         axis : array-like (2,) or (3,)
-            Axis of rotation, or direction of travel, in world coordinates. In two dimensions limits of an angle have no
-            axis.
+            Axis of rotation, or direction of travel, in world coordinates. In two dimensions limits of an angle have
+            no axis.
         value : float, rad or m
             Present angle of b relative to a about the axis, or travel of b along it.
         lower, upper : float, rad or m
@@ -732,7 +733,7 @@ class RowBuilder:
 
     def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> Vector:
         """Return a vector of the builder's dimension with three components."""
-        if get_shape(name, value) == ():  # `as_array` would fill the vector with a scalar.
+        if get_shape(name, value) == ():  # Reject a scalar here, as `as_array` would repeat it.
             raise InputError(f"{name} is {value!r:.60}; a vector ({self._dimensions},) is needed")
         x = as_array(name, value, (self._dimensions,), unit=unit).tolist()
         return x[0], x[1], x[2] if len(x) == 3 else 0.0
@@ -884,7 +885,7 @@ class RowBuilder:
         return self._make_linear_row(pair, self._check_direction("axis", axis), point, point, 0.0)
 
     def _compute_stop_velocity(self, travel: float) -> float:
-        """Return the smallest velocity away from a limit, of which `travel` remains (eq. 4)."""
+        """Return the smallest velocity away from a limit [m/s or rad/s] if `travel` remains up to it (eq. 4)."""
         return (-travel if travel > 0.0 else -self._baumgarte * travel) / self._dt
 
     def _compute_normal_target(self, contact: Contact) -> float:
@@ -898,7 +899,7 @@ class RowBuilder:
                 v = self._velocity[body].tolist()
                 moment = _cross(arm, contact.normal)
                 approach += sign * (_dot(v[:3], contact.normal) + _dot(v[3:], moment))
-        # A body that does not reach the surface within the step does not bounce in it.
+        # The contact bounces only if the bodies touch within the step.
         reaches = contact.target >= 0.0 or approach < contact.target
         if approach < -contact.threshold and reaches:
             return max(contact.target, -contact.restitution * approach)

@@ -23,9 +23,10 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
 from lavender_ext.core import checks
 
-# Unit vectors and inertias that are off by up to this are not corrected; rounding in float64 causes less.
+# [-] Unit vectors with errors of length or orthogonality, and inertias with a relative asymmetry, up to this are not
+# corrected; rounding in float64 causes less.
 MAX_UNCORRECTED_ERROR = 1e-9
-# Unit vectors and inertias that are off by more than this raise an error; float32 with several rotations causes less.
+# [-] Larger errors of unit vectors and inertias are rejected; float32 with several rotations causes less.
 MAX_CORRECTED_ERROR = 1e-5
 UNITS = {
     "inv_mass": "1/kg", "inv_inertia": "1/(kg m^2)", "v_free": "m/s, rad/s", "jac": "-", "normal": "-", "tangent": "-",
@@ -70,8 +71,8 @@ class Rows:
     contact_body : array-like (c, 2) of int, optional
         Bodies a and b of each contact.
     copy : bool, default True
-        True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
-        caller and marked read-only, and inertias are not symmetrised.
+        Whether to copy the arrays. If false, arrays are used without a copy if their type fits; they are then shared
+        with the caller and marked read-only, and inertias are not symmetrised.
 
     An empty list means no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
     tangents that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are
@@ -82,8 +83,8 @@ class Rows:
     ------
     InputError
         The shapes disagree; a body does not exist; a row joins a body to itself, or two static bodies; an inverse mass
-        is negative; an inertia is not positive semidefinite; a normal or tangent is not a unit vector; a tangent is not
-        orthogonal to its normal.
+        is negative; an inertia is not positive semidefinite; a normal or tangent is not a unit vector; a tangent is
+        not orthogonal to its normal.
 
     Examples
     --------
@@ -124,9 +125,10 @@ class Rows:
     arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
     copy: bool = field(default=True, repr=False)
-    precision = "float64"  # Not a field: instances made from float32 have an attribute of this name.
+    # Default, not a field; instances made from float32 arrays set an attribute of this name.
+    precision = "float64"
 
-    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
+    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
 
         def __init__(
             self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = ...,
@@ -169,7 +171,8 @@ class Rows:
         )
         if fault:
             self._resolve_fault(fault, index)
-        object.__setattr__(self, "copy", True)  # `copy` applies to this call only
+        # `copy=False` applies to this call only, not to later `replace` calls.
+        object.__setattr__(self, "copy", True)
 
     def _resolve_fault(self, fault: str, index: int) -> None:
         """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""
@@ -200,7 +203,7 @@ class Rows:
         with np.errstate(over="ignore", invalid="ignore"):
             cosine = np.einsum("ij,ij->i", n, t)
             errors = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, cosine]
-            # NaN comes from inf - inf.
+            # A NaN comes from inf - inf and counts as an infinite error.
             error = np.nan_to_num(np.abs(np.stack(errors)).max(axis=0), nan=np.inf, posinf=np.inf)
         if error.max() > MAX_CORRECTED_ERROR:
             i = int(np.argmax(error))
@@ -256,21 +259,21 @@ class Rows:
         dense[:mj] = self.jac
         body[:mj] = np.repeat(self.joint_body, np.diff(self.joint_ptr), axis=0)
         body[mj:] = np.repeat(self.contact_body, np.diff(cones.ptr[self.n_joints :]), axis=0)
-        # normal and tangent rows
+        # Fill normal and tangent rows.
         t2 = np.cross(self.normal, self.tangent)
         for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
             contacts = np.flatnonzero(tangents >= row)
-            with np.errstate(over="ignore", invalid="ignore"):  # arms near the largest float64
+            with np.errstate(over="ignore", invalid="ignore"):  # Products with very large arms may overflow.
                 angular_a = np.cross(self.arm_a[contacts], axis[contacts])
                 angular_b = np.cross(self.arm_b[contacts], axis[contacts])
             dense[first[contacts] + row] = np.hstack([-axis[contacts], -angular_a, axis[contacts], angular_b])
-        # spin and rolling rows
+        # Fill spin and rolling rows.
         spin, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
         for axis, rows in ((self.normal, spin), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
             contacts = np.flatnonzero(rows >= 0)
             dense[rows[contacts]] = 0.0
             dense[rows[contacts], 3:6], dense[rows[contacts], 9:12] = -axis[contacts], axis[contacts]
-        # nonzero entries in columns of moving bodies
+        # Keep the nonzero entries in columns of moving bodies.
         is_stored = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
         indptr = np.concatenate([[0], np.cumsum(is_stored.sum(axis=1))])
@@ -298,7 +301,7 @@ class Rows:
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Arrays stay read-only in copies and pickles.
+        # Copies and pickles are built by the constructor, which marks their arrays read-only.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
 
 

@@ -1,9 +1,9 @@
 """`solve_qp`: quadratic programs through `solve`, to an error of the program itself.
 
-`solve` ends at a residual relative to the zero impulse's; `QPSolution.error` is relative to the terms of the
-program. While the error is above tol, the solve is continued from its result with a smaller tol. If this does not
-reach tol with `auto` and a positive definite P, the program in the form (5) of `problem/program.py` is given to the
-backend that solves programs with a singular P.
+`solve` stops at a residual relative to that of the zero impulse, while `QPSolution.error` is relative to the terms of
+the program. While the error is above tol, the solve is continued from its result with a smaller tol. If `auto` does
+not reach tol in this way for a positive definite P, the backend for a singular P solves the program in the form (5) of
+`problem/program.py`.
 """
 
 from __future__ import annotations
@@ -30,14 +30,16 @@ from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
-MIN_TOL = 1e-15  # The smallest tol of such a solve.
-# The next tol is this fraction of the tol expected to suffice if error and tol are proportional.
+MIN_TOL = 1e-15  # Smallest tol of a solve of the constraint problem.
+# The next tol is this fraction of the tol that would suffice if the program's error were proportional to tol.
 TOL_RATIO = 0.1
-# The backend is called first if n 2^-53 cond(M) is above this share of tol, as the judge then refines M^-1.
+# The backend is called first if n 2^-53 cond(M) is above this fraction of tol: solving with M then loses digits that
+# tol needs.
 MAX_LOSS = 0.1
-# After any other status the budget is used up, or a smaller tol does not change the result.
+# A solve that ended with one of these statuses is continued. After any other status the budget is used up, or a
+# smaller tol does not change the result.
 CONTINUED = (Status.CONVERGED, Status.STALLED)
-# A claim about the constraint problem holds for every error of the program.
+# Statuses of the constraint problem that are returned unchanged, whatever the program's error is.
 FINAL_STATUSES = (Status.ROUNDOFF_LIMIT, Status.INTERRUPTED)
 FEASIBLE_TOL = 1e-7  # An unbounded program counts as feasible at a point of at most this relative residual.
 
@@ -61,7 +63,7 @@ def solve_qp(
         `QPSolution.error` to reach.
     time_limit : float, optional, s
     **options
-        Of the solver; impulse= starts from the impulses of an earlier program (`answer.solution.impulse`).
+        Options of the solver. `impulse` starts from the impulses of an earlier program (`answer.solution.impulse`).
 
     Returns
     -------
@@ -74,9 +76,9 @@ def solve_qp(
     Raises
     ------
     InputError
-        A problem that `Problem.from_qp` did not make.
+        `problem` was not made by `Problem.from_qp`.
     CapabilityError
-        P is singular, and the solver needs a positive definite one.
+        P is singular, and the solver needs a positive definite P.
 
     Examples
     --------
@@ -109,9 +111,9 @@ def solve_qp(
 
 
 def _set_time_and_status(answer: QPSolution, seconds: float) -> None:
-    """Set the time of the whole call, and CONVERGED if the program's error is within `tol`, in the answer's solution.
+    """Set the time of the whole call [s], and the status, in the answer's solution.
 
-    Residuals of the constraint problem are relative to the zero impulse's; the program's error decides.
+    The status is CONVERGED if the program's error is within `tol`, whatever the residual of the constraint problem is.
     """
     solution: Solution = answer.solution
     values = solution.__dict__
@@ -154,7 +156,7 @@ def _is_proved_infeasible(answer: QPSolution) -> bool:
 
 
 def _should_continue(answer: QPSolution, end: float) -> bool:
-    """Whether another solve may lower the error, and has time."""
+    """Return whether another solve may lower the error, and time remains for it."""
     return answer.solution.status in CONTINUED and perf_counter() < end
 
 
@@ -216,8 +218,9 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
 def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
     """Return the answer with its ray, if a certificate shows that the objective decreases without end.
 
-    A certificate of (5) has a part along x and one along the multipliers. If the second does not prove by itself that
-    the rows contradict each other, the first is a ray, and the program is unbounded if it has a feasible point.
+    A certificate of (5) consists of a direction of x and of multipliers. If the multipliers do not prove by themselves
+    that the rows contradict each other, the direction is a ray, and the program is unbounded if it has a feasible
+    point.
     """
     solution, qp = answer.solution, problem.qp
     if not _is_proved_infeasible(answer) or solution.certificate is None:
@@ -225,7 +228,8 @@ def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> Q
     direction, rows = solution.certificate[: len(qp.q)], qp.select_row_multipliers(solution.certificate)
     if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:
         return answer
-    unit = problem.d[: len(qp.q)]  # The objective is the sum of unit_i x_i^2, under the same constraints.
+    # Search a feasible point: minimise the sum of unit_i x_i^2 under the program's constraints.
+    unit = problem.d[: len(qp.q)]
     general = Generalized(qp.jacobian, sp.diags_array(unit), np.zeros(len(unit)))
     cones = problem.cones.select(np.arange(len(qp.q), problem.n_blocks))
     nearest = Problem(qp.target, cones, generalized=general, copy=False)

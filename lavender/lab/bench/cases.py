@@ -509,8 +509,7 @@ def classify_structure(problem: Problem) -> tuple[str, ...]:
     - "redundant": there are fewer independent rows than rows, if the rank is cheap to compute or the counts prove it.
     - "friction": the law. "ellipses": contacts with two coefficients. "large mass ratio": 1000 or more.
     - "asymmetric": A is not symmetric. A matrix that is not nearly symmetric comes from no scene of bodies, and gets
-    no
-      word for its graph or masses.
+      no word for its graph or masses.
     """
     check_problem(problem)
     if problem.m == 0:
