@@ -46,10 +46,10 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     import lavender as lv
     from benchmarks.core_problems import forms, stacks
     from lavender.base.deadline import Deadline
-    from lavender.judge.residuals import get_reference
+    from lavender.judge.residuals import get_zero_impulse_reference
     from lavender.problem import Problem
-    from lavender.solvers.auto import Tree
-    from lavender.solvers.small import time_fraction
+    from lavender.solvers.auto import DecisionTree
+    from lavender.solvers.small import get_call_time_fraction
 
     def pile(n: int) -> Problem:
         return lv.suite.granular(n=n, friction="coulomb").problem
@@ -78,21 +78,21 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     counted = {}
     for label, make in problems.items():
         problem = make().disk
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
         solution = lv.solve(problem)
-        tree, work = Tree(problem), solution.work
+        tree, work = DecisionTree(problem), solution.work
         factorisation = next((s.cost / s.steps for s in tree.states.values()), 0.0)
         sweeps = work.get("sweeps", 0) + 2 * work.get("solves", 0)
         counted[label] = sweeps * tree.sweep + work.get("factorisations", 0) * factorisation
-        limited = Tree(problem, Deadline(1e9))
+        limited = DecisionTree(problem, Deadline(1e9))
         for limit in (1e-3, 1e-2, 1e-1):  # [s]
             limited.deadline = Deadline(limit)
-            fits = limited.deadline.remaining() is not None and not limited.is_late
-            counted[f"{label}, {limit:g} s"] = 1.0 + fits + 2.0 * time_fraction(problem, limit)
+            fits = limited.deadline.get_remaining_seconds() is not None and not limited.is_late
+            counted[f"{label}, {limit:g} s"] = 1.0 + fits + 2.0 * get_call_time_fraction(problem, limit)
         counted[f"{label}, stages"] = math.fsum(
             min(stage.iterations, 1e9) * (1 + i) for i, stage in enumerate(lv.explain(problem).stages)
         )
-        halving = Tree(problem)
+        halving = DecisionTree(problem)
         halving.best, total = 1.0, 0.0
         for stage in halving:
             halving.best *= 0.5

@@ -27,11 +27,11 @@ from benchmarks.core_problems import forms, fresh, stacks
 from benchmarks.limits import CASES, least, problem_of
 from benchmarks.output import markdown
 from lavender import suite
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge import residuals
 from lavender.problem import Problem
 from lavender.solvers import costs
-from lavender.solvers._accelerated import count_sweep_work
+from lavender.solvers._accelerated import estimate_sweep_work
 from lavender.solvers.registry import get
 
 RATES_PATH = Path(costs.__file__).with_name("rates.json")
@@ -166,9 +166,9 @@ def sweep_lines() -> Iterator[Line]:
 
             p = fresh(problem)
             time = 1e9 * (run(p, MEASURED_SWEEPS) - run(p, 1)) / (MEASURED_SWEEPS - 1)
-            rate = costs.get_sweep_rate(p)
+            rate = costs.get_sweep_rate_name(p)
             rate = "sweep entry" if rate == "entry" else rate
-            yield label, {"sweep row": p.m, rate: count_sweep_work(p)}, time
+            yield label, {"sweep row": p.m, rate: estimate_sweep_work(p)}, time
 
 
 def with_ellipses(problem: Problem) -> Problem:
@@ -185,7 +185,7 @@ def measure_setups(name: str) -> Iterator[tuple[str, Callable[[], float], float]
 
     def ready() -> Problem:
         problem = make()
-        residuals.get_reference(problem)
+        residuals.get_zero_impulse_reference(problem)
         return problem
 
     problem, cold = ready(), make()
@@ -245,7 +245,7 @@ def measure_rates() -> dict[str, Any]:
 @click.option("--write", is_flag=True, help=f"Replace {RATES_PATH.name} by the measured rates.")
 def command(write: bool) -> None:
     """Measure the rates of the operations whose counts are the estimated costs."""
-    import_numerics()
+    import_numerical_modules()
     lv.solve(problem_of("dense 30 x 20")(), time_limit=1e-2)
     measured = measure_rates()
     lines = []

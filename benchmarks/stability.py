@@ -148,7 +148,7 @@ def modes(
     def after(z: FloatArray) -> FloatArray:
         work.copy_from(state)
         _write(work, n, z)
-        work.kernel.substeps(substeps)
+        work.kernel.run_substeps(substeps)
         return _read(work, n)
 
     matrix = np.empty((len(rest), len(rest)))

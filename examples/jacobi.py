@@ -26,7 +26,7 @@ import numpy as np
 from panels import Numbers, put_legend_right, show
 
 import lavender as lv
-from lavender.problem.ordering import compute_colors
+from lavender.problem.ordering import compute_block_colors
 
 N = 32  # contacts of the stack
 GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
@@ -57,7 +57,7 @@ def make_repeated(k=3):
 def compare_orders():
     """Return how many different impulses (in bits) shuffled orders give: within the colours, and of all rows."""
     stack, rng = make_stack(), np.random.default_rng(0)
-    color = compute_colors(stack)
+    color = compute_block_colors(stack)
 
     def sweep(order):
         return lv.solve(stack, "pgs", order=order, tol=0.0, max_iter=BUDGET).impulse.tobytes()

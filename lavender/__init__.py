@@ -21,7 +21,7 @@ import lavender.base.early_sigint  # noqa: I001 - first: handles Ctrl-C from her
 from typing import TYPE_CHECKING
 
 import lavender.base.check_build
-from lavender.base.lazy_import import import_locked
+from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.renamed import build_attribute_error
 from lavender._version import __version__
 from lavender.problem.cones import (
@@ -197,9 +197,9 @@ if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they rep
 
     def __getattr__(name):
         if name in _LAZY_MODULES:
-            value = import_locked(_LAZY_MODULES[name])
+            value = import_module_under_lock(_LAZY_MODULES[name])
         elif name in _MODULE_OF_NAME:
-            value = getattr(import_locked(_MODULE_OF_NAME[name]), name)
+            value = getattr(import_module_under_lock(_MODULE_OF_NAME[name]), name)
         else:
             raise build_attribute_error("lavender", "module 'lavender'", name)
         globals()[name] = value

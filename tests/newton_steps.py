@@ -27,13 +27,13 @@ class NewtonSteps:
     def step(self):
         """One step; the eight values of the solver after it."""
         for _ in range(self.substeps):
-            while self.state.kernel.prepare() == NEED_CAPACITY:
+            while self.state.kernel.prepare_substep() == NEED_CAPACITY:
                 self._take(self.state.with_larger_buffers())
             self.state.kernel.solve(False)
             self.told = self.solver.solve(self.tol)
             self.ended.append(self.told[0])
             self.trace = self.solver.trace
-            assert self.state.kernel.finish() == OK
+            assert self.state.kernel.finish_substep() == OK
         return self.values()
 
     def values(self):

@@ -36,7 +36,7 @@ from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, explain_refusal
 from lavender.external.running import Limits
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
@@ -203,7 +203,10 @@ def _pinocchio(lanczos: int | None) -> Contestant:
 
         m, c = problem.m, problem.n_blocks
         order = (np.arange(c)[:, None] * 3 + np.array([1, 2, 0])).ravel()
-        unit, speed = float(np.mean(problem.d)), max(get_reference(problem)[1], 1e-300)  # 1/kg, m/s
+        unit, speed = (
+            float(np.mean(problem.d)),
+            max(get_zero_impulse_reference(problem)[1], 1e-300),
+        )  # 1/kg, m/s
         a = sp.csc_matrix(problem.csr[order][:, order] / unit)
         g = -problem.b[order] / speed
         model = pin.Model()
@@ -420,14 +423,14 @@ def _ours(name: str, scratch: bool) -> Contestant:
             start = process_time()
             prepared = prepare(given, name)
             seconds = process_time() - start
-            get_reference(given)  # compute the judge's reference before timing
+            get_zero_impulse_reference(given)  # compute the judge's reference before timing
             first = given.start()
             start = process_time()
             impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
             return seconds + process_time() - start, impulse
 
         if not scratch:
-            get_reference(problem)
+            get_zero_impulse_reference(problem)
             if problem.csr_data.d.size and "rows" in registry.get(name).operators:
                 _ = problem.data
         for tol in TARGETS:

@@ -27,7 +27,7 @@ class Stopwatch:
         self._start = perf_counter()
 
     @property
-    def seconds(self) -> float:
+    def elapsed_seconds(self) -> float:
         """Seconds since the creation of this object."""
         return perf_counter() - self._start
 
@@ -55,19 +55,19 @@ class Deadline:
         """Whether there is a time limit."""
         return self._end < math.inf
 
-    def reserve(self, seconds: float) -> None:
+    def reserve_seconds(self, seconds: float) -> None:
         """Move the deadline `seconds` earlier, to reserve time for work that follows the solve."""
         self._end -= seconds
 
-    def passed(self, step: float = 0.0) -> bool:
+    def has_passed(self, step: float = 0.0) -> bool:
         """Return whether a step of `step` seconds that starts now would end after the deadline."""
         return self._end < math.inf and perf_counter() + step >= self._end
 
-    def nanoseconds(self) -> float:
+    def get_remaining_nanoseconds(self) -> float:
         """Return the remaining time [ns], the unit of estimated costs; inf without a limit."""
         return 1e9 * (self._end - perf_counter())
 
-    def remaining(self, minimum: float = 0.0) -> float | None:
+    def get_remaining_seconds(self, minimum: float = 0.0) -> float | None:
         """Return the remaining time [s], at least `minimum`; None without a limit."""
         return None if self._end == math.inf else max(self._end - perf_counter(), minimum)
 

@@ -1,7 +1,7 @@
 """Import modules at their first use, in any thread.
 
 `from lavender.base.lazy_import import sparse as sp` replaces `import scipy.sparse as sp`: these parts of SciPy would
-double the time of `import lavender`. `import_numerics` imports them before the clock of a solve starts.
+double the time of `import lavender`. `import_numerical_modules` imports them before the clock of a solve starts.
 
 The package `lazy_loader` (SPEC 1) is not used because it is not thread-safe. When four threads used three lazy modules
 of SciPy at once, 8 of 12 processes on Python 3.11 raised AttributeError, and its function `attach` deadlocked in 1 of
@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 __all__ = [
     "import_lock",
-    "import_locked",
     "import_module_lazily",
-    "import_numerics",
+    "import_module_under_lock",
+    "import_numerical_modules",
     "issparse",
     "lapack",
     "sparse",
@@ -34,7 +34,7 @@ def import_lock() -> RLock:
     return _lock
 
 
-def import_locked(name: str) -> Any:
+def import_module_under_lock(name: str) -> Any:
     """Import a module, under the lock, and return it.
 
     Python's own import system locks each module separately. If two threads import different modules of one package at
@@ -63,7 +63,7 @@ class _LazyModule:
     def __getattr__(self, name: str) -> Any:
         if name == "_name" or name.startswith("__"):  # `copy` reads these names of an uninitialised object.
             raise AttributeError(name)
-        value = getattr(import_locked(self._name), name)
+        value = getattr(import_module_under_lock(self._name), name)
         setattr(self, name, value)
         return value
 
@@ -83,10 +83,10 @@ def import_module_lazily(name: str) -> Any:
     return _LazyModule(name)
 
 
-def import_numerics(*names: str) -> None:
+def import_numerical_modules(*names: str) -> None:
     """Import SciPy's sparse arrays, their graphs and LAPACK, and the modules `names`."""
     for name in ("scipy.sparse", "scipy.sparse.csgraph", "scipy.linalg.lapack", *names):
-        import_locked(name)
+        import_module_under_lock(name)
 
 
 def issparse(value: object) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Collection
 INSTEAD = {
     "Cones": {
         "apart_rows": "separate_rows",
+        "disks": "ellipses_replaced_by_disks",
         "has_more_parts": "has_more_components",
         "parts": "friction_components",
         "reach": "friction_coefficient",
@@ -74,7 +75,7 @@ ARGUMENT_HINTS = {
 SOLVER_HINTS = {"lcp": "lemke", "none": "auto", "qp": "osqp"}
 
 
-def suggest_argument(name: str, valid: Collection[str]) -> str:
+def suggest_argument_name(name: str, valid: Collection[str]) -> str:
     """Return the argument of `valid` that has the meaning of the unknown argument `name`, or an empty string."""
     return next((word for word in ARGUMENT_HINTS.get(name.lower(), ()) if word in valid), "")
 

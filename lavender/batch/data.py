@@ -426,15 +426,15 @@ class Batch(Sequence[Problem]):
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
         worlds = Worlds(self.at, impulse, velocity, cold)
         if self._bodies is not None and (body_arrays := self._get_body_arrays()):
-            worlds.of_bodies(*body_arrays)
+            worlds.set_from_bodies(*body_arrays)
         elif self._arrays is None or self.cones.has_ellipse:
-            worlds.of_objects([], [None] * len(self), [])
+            worlds.set_from_problems([], [None] * len(self), [])
         else:
             mass = self._arrays[1]
             max_asymmetry = (
                 MAX_ASYMMETRY_FLOAT32 if mass is not None and mass.dtype == np.float32 else MAX_ASYMMETRY
             )
-            worlds.of_arrays(
+            worlds.set_from_arrays(
                 self._arrays,
                 (self._jac_row, self._mass_row),
                 self._pattern,

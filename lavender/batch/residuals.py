@@ -78,7 +78,7 @@ class WorldResults:
         at[:, PLACE["rows"]], at[:, PLACE["row"]] = self._sizes, self._first
         self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
         self._worlds = Worlds(at, self._impulse, np.zeros(0), cold)
-        self._worlds.of_objects(problems, self._data, starts)
+        self._worlds.set_from_problems(problems, self._data, starts)
 
     @property
     def relative(self) -> FloatArray:
@@ -351,7 +351,7 @@ def residual_many(
         residuals.store_residual(i, residual(worlds[i], impulse, precisions[i], threshold))
 
     residuals._process_worlds(
-        lambda hand: int(hand.judge(TOL, is_single_precision)), judge_single, threads, errors
+        lambda hand: int(hand.judge_worlds(TOL, is_single_precision)), judge_single, threads, errors
     )
     for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.
         if precision == "float32" and not is_single_precision and i not in residuals.faults:

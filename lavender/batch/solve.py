@@ -270,7 +270,7 @@ class Solutions(WorldResults, Sequence[Solution]):
         impulse, late = self._impulse[self._get_rows(i)].copy(), self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
-        return Solution.late(
+        return Solution.with_late_fields(
             impulse,
             status,
             self.tol,
@@ -375,7 +375,7 @@ def solve_many(
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     if deadline.is_set:
-        deadline.reserve(1e-9 * solutions._estimate_late_judging_cost())
+        deadline.reserve_seconds(1e-9 * solutions._estimate_late_judging_cost())
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
@@ -386,11 +386,15 @@ def solve_many(
 
     def process_until_deferred(hand: Worker) -> int:
         if not deadline.is_set:
-            return int(hand.solve(tol, *limits))
-        if deadline.passed(0.0):
-            return int(hand.judge(tol, False, True))
+            return int(hand.solve_worlds(tol, *limits))
+        if deadline.has_passed(0.0):
+            return int(hand.judge_worlds(tol, False, True))
         return int(
-            hand.solve(tol, *limits, COST_PER_SECOND * (deadline.remaining(MIN_TIME_LIMIT) or MIN_TIME_LIMIT))
+            hand.solve_worlds(
+                tol,
+                *limits,
+                COST_PER_SECOND * (deadline.get_remaining_seconds(MIN_TIME_LIMIT) or MIN_TIME_LIMIT),
+            )
         )
 
     def solve_single(i: int) -> None:
@@ -399,25 +403,25 @@ def solve_many(
         is_further_world = (
             isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
         )
-        if is_further_world and deadline.passed():
+        if is_further_world and deadline.has_passed():
             solutions.store_late_start(i)
             return
         problem, start = worlds[i], solutions.get_start(i)
         has_failed = solutions._worlds.code[i] == CODE["tried"]
         if deadline.is_set:
             if not isinstance(worlds, Batch):
-                deadline.reserve(-1e-9 * RATES["late world"])
-            if deadline.passed():
+                deadline.reserve_seconds(-1e-9 * RATES["late world"])
+            if deadline.has_passed():
                 check_accepted(problem, spec, deadline)
                 unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")
                 solutions.store_late_solution(i, unsolved)
                 return
         if has_failed:
-            own = Deadline(deadline.remaining(MIN_TIME_LIMIT))
+            own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT))
             counts = solutions._get_counts(problem, i)
             solution = solve_prepared(problem, spec, named, start, tol, max_iter, own, failed_call=counts)
         else:
-            left = deadline.remaining(MIN_TIME_LIMIT)
+            left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
             solution = solve(problem, solver, impulse=start, time_limit=left, **more)
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
         store = solutions.store_solution if is_judged else solutions.store_late_solution

@@ -62,7 +62,7 @@ def problems(
     names = [group.removeprefix("@") for group in groups]
     for name in names:
         if not is_path(name):
-            suite.names(f"@{name}")  # An unknown set is an error before any work starts.
+            suite.get_case_names_of_set(f"@{name}")  # An unknown set is an error before any work starts.
         elif certify is None:
             raise InputError(
                 f"{name} is a file or folder, which only --certify accepts; give sets, such as @hard"

@@ -49,7 +49,7 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 
 PROGRAM_FORMS = ("impulse", "velocity", "auto")
@@ -393,7 +393,7 @@ def compute_backend_tolerance(problem: Problem, tol: float) -> float:
 
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
-    energy, velocity = get_reference(problem)
+    energy, velocity = get_zero_impulse_reference(problem)
     sigma = _compute_energy_scale(problem)
     limits = [
         start / (size * sigma)
@@ -759,7 +759,7 @@ def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[In
 
 def _compute_energy_scale(problem: Problem) -> float:
     """Compute sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) [J^1/2]; 1 if it is 0 or not finite."""
-    energy, velocity = get_reference(problem)
+    energy, velocity = get_zero_impulse_reference(problem)
     if problem.has_singular_program:
         heaviest = 0.0
     elif problem.rows is None:

@@ -17,7 +17,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_float, mark_read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.judge.residuals import get_reference, residual
+from lavender.judge.residuals import get_zero_impulse_reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.registry import Cost, Solver
@@ -203,5 +203,5 @@ def _copy_problem(problem: Problem) -> Problem:
         generalized=deepcopy(problem.generalized),
         copy=True,
     )
-    get_reference(copied)  # Compute the judge's norms before the solver has access to the copy.
+    get_zero_impulse_reference(copied)  # Compute the judge's norms before the solver has access to the copy.
     return copied

@@ -11,7 +11,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.as_qp import (
     QP,
     build_impulse_form,
@@ -22,8 +22,8 @@ from lavender.external.as_qp import (
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import call_backend_until_accepted
-from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, sum_work
+from lavender.judge.residuals import compute_stopping_residual
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
@@ -114,7 +114,7 @@ class QPSolver(Solver):
         )
         if (
             len(qp.assumed)
-            and not deadline.passed()
+            and not deadline.has_passed()
             and _violates_inactive_row_assumption(qp, impulse, claim)
         ):
             first_claim, impulse[:] = claim, start
@@ -122,9 +122,9 @@ class QPSolver(Solver):
             qp = self._build_program(qp.problem, False)
             call = isolated or b.run
             claim = call_backend_until_accepted(
-                qp, impulse, call, remaining, tol, deadline.remaining(), self.settings, b.noisy
+                qp, impulse, call, remaining, tol, deadline.get_remaining_seconds(), self.settings, b.noisy
             )
-            work = sum_work((first_claim.work, claim.work))
+            work = sum_work_counts((first_claim.work, claim.work))
             claim = replace(claim, work=work, iterations=first_claim.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
@@ -136,7 +136,7 @@ class QPSolver(Solver):
         if self.isolate:
             start_process(self.backend)
         else:
-            import_numerics(*self.backend.modules)
+            import_numerical_modules(*self.backend.modules)
 
 
 def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
@@ -144,7 +144,7 @@ def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim)
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
-    compute_relative(qp.problem, impulse, w, error)
+    compute_stopping_residual(qp.problem, impulse, w, error)
     return bool(np.any(error[qp.assumed] != 0.0))
 
 

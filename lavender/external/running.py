@@ -19,10 +19,10 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.external.as_qp import QP, compute_backend_tolerance
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, sum_work
+from lavender.judge.residuals import compute_stopping_residual
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
-from lavender.solvers.certify import check_infeasible
+from lavender.solvers.certify import check_infeasibility_claim
 
 # Smallest tolerance passed to a backend; rounding in its arithmetic prevents smaller residuals.
 MIN_TOLERANCE = 1e-14
@@ -171,13 +171,13 @@ def call_backend_until_accepted(
     start, best = impulse.copy(), None
     work: dict[str, int] = {"backend_calls": 0}
     w, e = np.empty(problem.m), np.empty(problem.m)
-    if tol > 0.0 and compute_relative(problem, impulse, w, e)[0] == 0.0:
+    if tol > 0.0 and compute_stopping_residual(problem, impulse, w, e)[0] == 0.0:
         return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
     limits = _make_limits(problem, tol, max_iter, time_limit)
     while limits:
         last = _call_backend_once(qp, impulse, call, limits.pop(0), settings, noisy)
-        work = sum_work((work, last.work))
-        relative, above = compute_relative(problem, impulse, w, e, floor=True)
+        work = sum_work_counts((work, last.work))
+        relative, above = compute_stopping_residual(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy(), above)
         remaining = max_iter - work.get("iterations", 0)
@@ -185,21 +185,21 @@ def call_backend_until_accepted(
             last.status is not Status.CONVERGED
             or above <= tol
             or remaining <= 0
-            or deadline.passed()
+            or deadline.has_passed()
             # If a row that was assumed at its bound leaves it, the caller solves a program with all rows.
             or np.any(e[qp.assumed] != 0.0)
         ):
             break
         limits = [
-            replace(limit, max_iter=remaining, time_limit=deadline.remaining(), repeated=True)
+            replace(limit, max_iter=remaining, time_limit=deadline.get_remaining_seconds(), repeated=True)
             for limit in limits
         ]
         if limits:
             impulse[:] = start
     assert best is not None
-    # Not in the program form: `check_infeasible` may run `auto`, which calls this backend again.
+    # Not in the program form: `check_infeasibility_claim` may run `auto`, which calls this backend again.
     if last is not best[1] and last.status is Status.INFEASIBLE and qp.form != "program":
-        infeasible, proved, _ = check_infeasible(problem, last, tol, deadline)
+        infeasible, proved, _ = check_infeasibility_claim(problem, last, tol, deadline)
         if proved:
             return replace(infeasible, work=work, iterations=work.get("iterations", 0))
     relative, claim, impulse[:], above = best
@@ -217,7 +217,7 @@ def call_backend_until_accepted(
         # The backend's tests use other norms than the judge, so its claim is not false if no stricter call was
         # possible.
         if limits:
-            status = Status.TIME_LIMIT if deadline.passed() else Status.MAX_ITERATIONS
+            status = Status.TIME_LIMIT if deadline.has_passed() else Status.MAX_ITERATIONS
             message = f"{message}; no iterations or time remained for stricter tolerances"
         elif relative <= MAX_GAP_RESIDUAL:
             status, message = Status.STALLED, f"{message}; its own tests passed at the strictest tolerances"

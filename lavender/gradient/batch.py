@@ -13,7 +13,7 @@ from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import Linears
@@ -208,5 +208,5 @@ def _get_data(problem: Problem) -> Any:
     view = problem.derived.view
     assert view is not None
     if view.reference_energy < 0.0:
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
     return view

@@ -15,7 +15,7 @@ from lavender.gradient.chains import BodyChain, CoefficientRows
 from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
 from lavender.judge.residuals import residual
-from lavender.judge.states import States, compute_states, linearise_at
+from lavender.judge.states import States, compute_states, judge_and_linearise_impulse
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import multiply_body_jacobian
@@ -633,7 +633,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     """
     check_problem(problem)
     impulse = problem.impulse_array(getattr(solution, "impulse", solution))
-    linear = linearise_at(problem, impulse, MAX_KERNEL_ROWS)
+    linear = judge_and_linearise_impulse(problem, impulse, MAX_KERNEL_ROWS)
     if not linear.above_floor <= MAX_ACCEPTED_RESIDUAL:
         error = residual(problem, impulse, "float64")
         if not (error.nothing_to_do and error.rounds):

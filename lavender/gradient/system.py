@@ -16,7 +16,7 @@ from lavender.solvers.factors import USE_WIDE_LANES
 from lavender.solvers.newton_systems.systems import is_dense_faster
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.linear import LinearSystem
-from lavender_ext.factor.sparse import free_part
+from lavender_ext.factor.sparse import extract_free_part
 
 # G counts as singular if its smallest pivot divided by its largest pivot is below this.
 MIN_PIVOT_RATIO = 1e-12
@@ -83,7 +83,7 @@ class System:
     def _form_h(self) -> tuple[Any, Any, FloatArray]:
         """Form H on the rows of the system; return the arrays of its compressed rows."""
         a, linear = self.problem.csr, self.linear
-        indptr, indices, data = free_part(a.indptr, a.indices, a.data, linear.system_row, self.n)
+        indptr, indices, data = extract_free_part(a.indptr, a.indices, a.data, linear.system_row, self.n)
         root = linear.root[linear.system_row >= 0]
         return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
 

@@ -34,7 +34,7 @@ from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
 from lavender.problem import FRICTION_LAWS
-from lavender.problem.cones import Cones, get_kinds
+from lavender.problem.cones import Cones, get_block_kinds
 from lavender_ext.judge.measure import all_finite
 
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
@@ -502,7 +502,7 @@ def _make_blocks(
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
     tangents = tangents[used_rows][first]
-    kinds = get_kinds(tangents > 0, tangents=tangents)
+    kinds = get_block_kinds(tangents > 0, tangents=tangents)
     return Cones(
         ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[used_rows][first], patch_radius=none
     ), scale

@@ -490,8 +490,8 @@ def make_contents(
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     if form is None:
-        is_soft = problem.generalized is not None and np.any(problem.compliance)
-        form = "local" if problem.matrix is not None or is_soft else "global"
+        has_row_with_compliance = problem.generalized is not None and np.any(problem.compliance)
+        form = "local" if problem.matrix is not None or has_row_with_compliance else "global"
     check_choice("form", form, ("local", "global"))
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:

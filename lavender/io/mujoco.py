@@ -160,7 +160,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     names = Names(
         cones.n_blocks, lambda: _make_block_names(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m)
     )
-    general = Generalized.compressed(jac, mass, v_free, like=like)
+    general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
     if like is None:
         seen.first_operator = general.operator
     build = (
@@ -288,7 +288,7 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
     """
     if seen.n and not data.M[0]:  # M was not computed: its first diagonal entry would be positive.
         raise InputError("M of this MjData is 0: mj_forward(model, data) was not called")
-    result = mujoco_rows.lower_triangle_of_mass(
+    result = mujoco_rows.extract_lower_triangle_of_mass(
         *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
     )
     if result is None:
@@ -383,7 +383,7 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     """
     parent, bodies = seen.tree
     axis, spatial, v = data.cdof, data.cvel, data.qvel
-    gap, size = mujoco_rows.compare_spatial_velocities(parent, bodies, axis, spatial, v)
+    gap, size = mujoco_rows.compute_spatial_velocity_difference(parent, bodies, axis, spatial, v)
     if gap < 0.0:
         raise InputError(
             f"dof_bodyid and body_parentid do not describe a tree of these bodies. {OTHER_MODEL_ADVICE}"
@@ -395,7 +395,7 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     v = mujoco_rows.recover_joint_velocity(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
     if (
         v is None
-        or not mujoco_rows.compare_spatial_velocities(parent, bodies, axis, spatial, v)[0]
+        or not mujoco_rows.compute_spatial_velocity_difference(parent, bodies, axis, spatial, v)[0]
         <= SUM_TOLERANCE * size
     ):
         raise CapabilityError(

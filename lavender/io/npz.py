@@ -28,7 +28,7 @@ from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.cones import Cones, get_kinds
+from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import recover_program
 from lavender.problem.rows import Rows
@@ -421,7 +421,7 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
     contact[at], friction[at] = True, mu
     return Cones(
         ptr=np.append(first, m),
-        kind=get_kinds(contact),
+        kind=get_block_kinds(contact),
         lower=lower,
         upper=upper,
         mu=friction,

@@ -41,7 +41,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, TooLate
-from lavender.judge.residuals import divide_by_reference, get_reference
+from lavender.judge.residuals import divide_by_reference, get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender_ext.factor.linear import LinearSystem
 
@@ -156,7 +156,7 @@ def prove_infeasibility(
     stored: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
     if stored is not None and stored[0] == key:
         skipped_time = stored[1].skipped_time
-        if not skipped_time or deadline is None or deadline.passed(skipped_time):
+        if not skipped_time or deadline is None or deadline.has_passed(skipped_time):
             return stored[1]
     proof = _prove_with_polished_directions(problem, y, tol, deadline or NEVER)
     problem.derived.cache[__name__] = key, proof
@@ -170,11 +170,11 @@ def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float,
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
             reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
             return Proof(y, 0.0, reason)
-        proof = _check_direction(inner, problem.on_disk(y), tol)
+        proof = _check_infeasibility_direction(inner, problem.on_disk(y), tol)
         if 0.0 < proof.impulse_bound < math.inf and (proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS):
             try:
                 for polished in _polish_direction(inner, proof.y, deadline):
-                    candidate = _check_direction(inner, polished, tol)
+                    candidate = _check_infeasibility_direction(inner, polished, tol)
                     if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
                         proof = candidate
                         break
@@ -199,11 +199,11 @@ def list_conflicting_blocks(problem: Problem, y: Any) -> tuple[tuple[int, ...], 
 
 def _describe_conflict(problem: Problem, y: FloatArray) -> str:
     """Name the conflicting blocks, e.g. "joints 7 and 9 against contact 11"."""
-    sides = (_name_blocks(problem, blocks) for blocks in list_conflicting_blocks(problem, y))
+    sides = (_format_block_names(problem, blocks) for blocks in list_conflicting_blocks(problem, y))
     return " against ".join(side for side in sides if side)
 
 
-def _name_blocks(problem: Problem, blocks: tuple[int, ...]) -> str:
+def _format_block_names(problem: Problem, blocks: tuple[int, ...]) -> str:
     """Return the names of blocks as one text, shortened if all are of one kind."""
     names = [problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in blocks]
     # Remove repeated names: each free row of a joint is a block of that name.
@@ -222,7 +222,7 @@ def _join_names(names: list[str], count: int) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else ""
 
 
-def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
+def _check_infeasibility_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     """Check y (m,) by (1) to (5) on a problem without ellipses."""
     # Read only rows with y != 0, because numbers of other rows may have overflown.
     rows = np.flatnonzero(y)
@@ -242,7 +242,7 @@ def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Proof(y, 0.0, "A^T y overflows")
     rounding_factor = min((len(rows) + 2.0) * UNIT_ROUNDOFF, MAX_ROUNDING_SLACK * gain / gain_size)
-    support, slack, rounding = _compute_support(problem, low, high, rounding_factor * size)
+    support, slack, rounding = _compute_support_function(problem, low, high, rounding_factor * size)
     # (1)
     net, sum_rounding = gain - float(support.sum()), (len(rows) + 4.0) * UNIT_ROUNDOFF
     if not net > sum_rounding * (gain_size + float(np.abs(support).sum())):
@@ -324,7 +324,7 @@ def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, Float
     return normal, coefficient, np.array([np.hypot.reduce(x[rows]) for _, rows in components])
 
 
-def _compute_support(
+def _compute_support_function(
     problem: Problem, low: FloatArray, high: FloatArray, rounding: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute support, slack and rounding of the slack, all (m,), for low <= z <= high.
@@ -359,7 +359,7 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     If b was computed, its rounding is the rounding of target and J v*.
     """
     data, size = problem.metric, np.abs(problem.b)
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     energy = net / (_compute_energy_norm(data, y * data.d) + _compute_energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
     if not energy + velocity < math.inf:
@@ -407,7 +407,7 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
         if np.any(np.abs(z[required]) > max_z) or len(columns) * len(rows) > MAX_POLISHED_ROWS**2:
             return
         seconds = LEAST_SQUARES_TIME * len(columns) * len(rows) * min(len(columns), len(rows))
-        if deadline.passed(seconds):
+        if deadline.has_passed(seconds):
             raise TooLate(seconds)
         system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
         y[rows] -= _solve_least_squares(system, z[columns]) / length[rows]

@@ -285,7 +285,7 @@ class _Island:
         possible = np.isfinite(self.margin)
         uncertain, x = np.zeros(len(self.f), bool), np.zeros(len(self.f))
         for step in range(2 * MAX_UNCERTAINTY_STEPS):
-            outcome = self._bound_with_uncertain(uncertain, x)
+            outcome = self._bound_with_uncertain_rows(uncertain, x)
             if outcome is None:
                 return None
             errors, x, more = outcome
@@ -316,7 +316,7 @@ class _Island:
                 out[block[0]] = max(block_norm, x[block[0]] + friction)
         return out
 
-    def _choose_groups(self, uncertain: Any, x: FloatArray) -> tuple[FloatArray, list[_Group]]:
+    def _build_error_groups(self, uncertain: Any, x: FloatArray) -> tuple[FloatArray, list[_Group]]:
         """Choose P0 of (1), and the groups of L and R, for the set of uncertain rows and |dy| <= x (n,)."""
         p, groups = self.p.copy(), list[_Group]()
         half = np.eye(1)
@@ -338,10 +338,10 @@ class _Island:
                 if uncertain[c.rows[0]]:
                     groups += self._make_stick_or_slide_groups(c, x, p)
                 elif self.case[c.rows[0]] == CASES["slides"] and len(c.rows) > 1:
-                    groups.append(self._make_turning_group(c, False))
+                    groups.append(self._make_sliding_group(c, False))
         return p, groups
 
-    def _make_turning_group(self, c: _Component, is_uncertain: bool) -> _Group:
+    def _make_sliding_group(self, c: _Component, is_uncertain: bool) -> _Group:
         """Build the group of (5) of a sliding component."""
         if self.is_cone:
             unit = np.eye(len(c.block))
@@ -391,7 +391,7 @@ class _Island:
         u, length = self.y[c.rows] / t, float(np.sqrt(1.0 + a * a))
         across = np.concatenate([[a], -u])[:, None] / length
         rows = np.concatenate([c.block[:1], c.rows])
-        turning = [self._make_turning_group(c, True)] if len(c.rows) > 1 else []
+        turning = [self._make_sliding_group(c, True)] if len(c.rows) > 1 else []
         if self.is_cone:
             p[np.ix_(c.block, c.block)] = unit
             p[np.ix_(rows, rows)] -= 0.5 * across @ across.T
@@ -431,7 +431,7 @@ class _Island:
             kappa, turn = 1.0, turn + (abs(t - a * normal) + x_t + a * x_n) / (t - x_t)
         return float((a * x_n + kappa * x_t) / (t - x_t) + (kappa + a) * turn)
 
-    def _bound_with_uncertain(
+    def _bound_with_uncertain_rows(
         self, uncertain: Any, guess: FloatArray
     ) -> tuple[FloatArray | None, FloatArray, Any] | None:
         """Bound |dz| and |dy| if the rows `uncertain` (n,) are uncertain, starting from |dy| <= `guess` (n,).
@@ -444,7 +444,7 @@ class _Island:
             singular, None replaces the tuple.
         """
         n = len(self.f)
-        p, groups = self._choose_groups(uncertain, guess)
+        p, groups = self._build_error_groups(uncertain, guess)
         g = np.eye(n) - p + p @ self.h
         inverse = _invert(g)
         if inverse is None:

@@ -264,7 +264,7 @@ class Residual:
     def islands(self) -> Islands:
         """Error of each island, in the order of their first blocks."""
         problem = self._problem.disk
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
         label, table = measure.residuals_by_island(problem.metric, self._impulse)
         return Islands(label, *table.T)
 
@@ -317,7 +317,7 @@ def divide_by_reference(data: Any, energy: float, velocity: float) -> float:
     return measure.make_relative_score(energy, velocity, data.reference_energy, data.reference_velocity)
 
 
-def get_reference(problem: Problem) -> tuple[float, float]:
+def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.reference_energy < 0.0:
@@ -335,7 +335,7 @@ def is_solved_by_zero(problem: Problem) -> bool:
     The relative residual of such a problem compares rounding with rounding, so read its errors in units.
     """
     problem = problem.disk
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     data = problem.metric
     return bool(data.relative_at_zero < 0.5 or data.reference_velocity < MAX_REST_VELOCITY)
 
@@ -344,7 +344,7 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
     """Judge an impulse (m,) [N s]. The result refers to the array, which must not change afterwards."""
     data = problem.metric
     if data.reference_energy < 0.0:
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
     return measure.Judged(data, impulse)
 
 
@@ -356,12 +356,14 @@ def combine_best_islands(
     In each island, the start with the lowest relative residual is chosen first. An impulse replaces it if the impulse
     solves the island, or if its energy error there is lower and its relative residual not larger.
     """
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     best: FloatArray = measure.combine_best_islands(problem.metric, list(starts), list(impulses), tol)
     return best
 
 
-def judge_once(problem: Problem, impulse: FloatArray, judged: measure.Judged | None = None) -> measure.Judged:
+def reuse_or_judge_impulse(
+    problem: Problem, impulse: FloatArray, judged: measure.Judged | None = None
+) -> measure.Judged:
     """Return `judged` if it belongs to this problem and impulse, bit for bit; else judge a copy of the impulse."""
     if (
         judged is None
@@ -378,14 +380,14 @@ def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None
     return relative if relative >= 0.0 and measure.are_bit_identical(problem._start, impulse) else None
 
 
-def compute_relative(
+def compute_stopping_residual(
     problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
 ) -> tuple[float, float]:
     """Compute (relative, above_floor) of `Residual` for a solver's stopping test; w and e (m,) are workspace.
 
     If `floor` is false, the floor is not computed, and above_floor is the relative residual.
     """
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     _, _, relative, above = measure.judge_impulse(problem.metric, impulse, w, e, floor)
     return relative, above
 
@@ -440,7 +442,7 @@ def residual(
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        return convert_from_disk(
+        return convert_residual_from_disk(
             problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         )
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
@@ -451,7 +453,7 @@ def residual(
     return result if precision == "float64" else _apply_float32_floor(problem, result, impulse)
 
 
-def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
+def convert_residual_from_disk(problem: Problem, of_disk: Residual) -> Residual:
     """Convert the residual of `problem.disk` to one of `problem`, which has ellipses."""
     s = problem.cones.stretch
     with np.errstate(over="ignore"):
@@ -463,7 +465,7 @@ def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray
     """Replace the floor of a residual by the floor of float32."""
     # For an impulse that is not finite, the floor is not finite.
     with np.errstate(over="ignore", invalid="ignore"):
-        of_impulse, of_data, of_velocities = estimate_float32_errors(problem, impulse)
+        of_impulse, of_data, of_velocities = estimate_float32_slack_errors(problem, impulse)
         relative = [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
         squares = of_impulse, of_data, of_velocities, of_impulse + of_data + of_velocities
     floors = [measure.relative_size_by_island(problem.metric, x) for x in squares]
@@ -477,7 +479,7 @@ def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray
     return replace(result, precision="float32", roundoff_floor=floor, above_floor=above, rounding=rounding)
 
 
-def estimate_float32_errors(
+def estimate_float32_slack_errors(
     problem: Problem, impulse: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the squared changes of w (m,) [m^2/s^2] by float32: terms (1), (2, 3 or 4) and (5) of the module."""

@@ -280,14 +280,14 @@ class Solution:
     velocity_tol: float | None = None
 
     @classmethod
-    def of(cls, values: dict[str, Any]) -> Solution:
+    def from_fields(cls, values: dict[str, Any]) -> Solution:
         """Build a solution from all its fields by name, without copying or checking them."""
         solution: Solution = object.__new__(cls)
         solution.__dict__.update(values)
         return solution
 
     @classmethod
-    def late(
+    def with_late_fields(
         cls,
         impulse: FloatArray,
         status: Status,
@@ -367,7 +367,7 @@ class Solution:
             return self.residual.velocity <= self.velocity_tol
         return self.residual.relative <= self.tol
 
-    def unstretched(self, problem: Problem) -> Solution:
+    def convert_from_disk(self, problem: Problem) -> Solution:
         """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
         s = problem.cones.stretch
         impulse, proof = mark_read_only(s * self.impulse), self.certificate
@@ -449,7 +449,7 @@ def format_work_count(n: int, kind: str) -> str:
     return f"{n} {kind.removesuffix('s') if n == 1 else kind}"
 
 
-def sum_work(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def sum_work_counts(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add the work of several claims or stages, kind by kind."""
     out: dict[str, int] = {}
     for work in works:
@@ -467,4 +467,4 @@ def raise_if_interrupted(solution: Solution) -> Solution:
 
 def _rebuild_solution(values: dict[str, Any]) -> Solution:
     """Rebuild a pickled solution."""
-    return Solution.of(values | {"work": MappingProxyType(values["work"])})
+    return Solution.from_fields(values | {"work": MappingProxyType(values["work"])})

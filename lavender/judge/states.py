@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
 from lavender.judge.error_bound import bound_errors
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES, Linear, Linears
@@ -81,7 +81,7 @@ class States(Sequence[State]):
     problem : Problem
     impulse : (m,), N s
     linear : Linear
-        Result of `linearise_at(problem, impulse)`.
+        Result of `judge_and_linearise_impulse(problem, impulse)`.
 
     Attributes
     ----------
@@ -157,14 +157,16 @@ class States(Sequence[State]):
         return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
 
 
-def linearise_at(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
+def judge_and_linearise_impulse(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
     """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `max_rows`: see `Linears`."""
     data = problem.disk.metric
     if data.reference_energy < 0.0:
-        get_reference(problem.disk)
+        get_zero_impulse_reference(problem.disk)
     return Linears([data], [problem.on_disk(impulse)], max_rows).item(0)
 
 
 def compute_states(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
-    """Return the states at an impulse (m,) [N s]; `linear` is `linearise_at(problem, impulse)` if it is known."""
-    return States(problem, impulse, linearise_at(problem, impulse) if linear is None else linear)
+    """Return the states at an impulse (m,) [N s]; `linear`: the linearisation at that impulse, if known."""
+    return States(
+        problem, impulse, judge_and_linearise_impulse(problem, impulse) if linear is None else linear
+    )

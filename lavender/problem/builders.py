@@ -20,14 +20,14 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
-from lavender.base.renamed import suggest_argument
-from lavender.problem.cones import Cones, get_kinds
+from lavender.base.renamed import suggest_argument_name
+from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.data import Names, check_matrix
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
-from lavender.problem.program import make_quadratic_program, unpack_program
+from lavender.problem.program import make_quadratic_program, unpack_qp_arguments
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import multiply_body_jacobian
 
@@ -68,7 +68,7 @@ def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()
     for name in keywords:
         if name not in PROBLEM_KEYWORDS:
             valid = (*own, *PROBLEM_KEYWORDS)
-            successor = suggest_argument(name, valid)
+            successor = suggest_argument_name(name, valid)
             words = (
                 f"use {successor}=" if successor else f"it takes {', '.join(f'{word}=' for word in valid)}"
             )
@@ -492,7 +492,7 @@ class Builders(Operators):
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
         check_keywords("from_qp", more, ("P", "q", "G", "h", "A", "b", "lb", "ub"))
-        qp = make_quadratic_program(unpack_program((P, q, G, h, A, b, lb, ub)))
+        qp = make_quadratic_program(unpack_qp_arguments((P, q, G, h, A, b, lb, ub)))
         if qp.is_singular:
             n, m = len(qp.q), len(qp.target)
             more.setdefault("names", Names(n + m, partial(_make_program_names, n, m)))
@@ -594,7 +594,7 @@ def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rollin
     if min_tangents == max_tangents:
         return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + has_spin + 2 * has_rolling)]).astype(np.int32)
-    kind = get_kinds(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
+    kind = get_block_kinds(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
     infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(c)
     cones = Cones(
         ptr=ptr, kind=kind, lower=-infinite, upper=infinite, mu=mu,

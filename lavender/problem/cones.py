@@ -47,7 +47,7 @@ from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
     SHAPES,
     check_coefficients,
-    check_combination,
+    check_friction_combination,
     check_shape,
     convert_box_coefficients,
     convert_ellipse_coefficients,
@@ -65,7 +65,7 @@ __all__ = [
     "ROW",
     "SHAPES",
     "Cones",
-    "get_kinds",
+    "get_block_kinds",
     "project_impulse",
 ]
 
@@ -147,12 +147,12 @@ class Cones:
         rolling: Any = self.rolling
         if isinstance(rolling, tuple) and not rolling:
             self.__dict__["rolling"] = np.zeros(np.size(self.kind))
-        blocks = kernels.copy_to_blocks(
+        blocks = kernels.make_blocks_from_copied_arrays(
             self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
         )
         if blocks is None or blocks.fault:
             fields = self._convert_fields()
-            blocks = kernels.copy_to_blocks(*fields)
+            blocks = kernels.make_blocks_from_copied_arrays(*fields)
             if blocks.fault:
                 _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), fields)
         self._set_blocks(blocks)
@@ -200,7 +200,7 @@ class Cones:
                 f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
                 f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
             )
-        kind = _check_kinds(kind, np.diff(ptr))
+        kind = _check_block_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
         upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
         check_not_nan("lower", lower)
@@ -293,7 +293,9 @@ class Cones:
         is_box = check_shape("shape", shape) == "box"
         is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
         if patch_radius is not None or rolling is not None or tangents != 2:
-            check_combination(mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair)
+            check_friction_combination(
+                mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair
+            )
         ratio, pair_kind = None, 0
         if is_box and tangents == 2:
             pair_kind = CONTACT_BOX
@@ -390,7 +392,7 @@ class Cones:
         return factor
 
     @property
-    def disks(self) -> Cones:
+    def ellipses_replaced_by_disks(self) -> Cones:
         """These blocks, with each ellipse replaced by a disk of its larger coefficient."""
         ellipse = self.kind == CONTACT_ELLIPSE
         return replace(
@@ -575,7 +577,7 @@ class Cones:
         return type(self), self._blocks.arrays
 
 
-def get_kinds(
+def get_block_kinds(
     is_contact: Any, *, tangents: Any = 0, box: Any = False, spin: Any = False, rolling: Any = False
 ) -> IntArray:
     """Return the kind of each block (k,); blocks that are not contacts are ROW.
@@ -618,7 +620,7 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     raise InputError(f"block {index} is invalid: {fault}")
 
 
-def _check_kinds(kind: IntArray, size: IntArray) -> IntArray:
+def _check_block_kinds(kind: IntArray, size: IntArray) -> IntArray:
     """Return the kinds of blocks after a check of their numbers of rows.
 
     A round cone of up to two tangents, or a box of one, becomes a CONTACT.
@@ -641,7 +643,7 @@ def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:
     the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
     """
     if cones.has_ellipse:
-        return cones.stretch * project_impulse(cones.disks, impulse / cones.stretch)
+        return cones.stretch * project_impulse(cones.ellipses_replaced_by_disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
     first, tangents = cones.ptr[:-1], cones.n_together
 

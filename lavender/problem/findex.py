@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array
 from lavender.base.errors import InputError
-from lavender.problem.cones import Cones, get_kinds
+from lavender.problem.cones import Cones, get_block_kinds
 
 
 def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
@@ -81,7 +81,7 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
     box, is_box = Cones.contacts(mu, shape="box"), size == 3
     return order, Cones(
         ptr=ptr,
-        kind=get_kinds(size > 1, box=is_box),
+        kind=get_block_kinds(size > 1, box=is_box),
         lower=np.where(is_friction, -high, low)[order],
         upper=high[order],
         mu=np.where(is_box, box.mu, mu[:, 0]),

@@ -30,7 +30,9 @@ def check_coefficients(name: str, value: Any, k: int, unit: str = "") -> FloatAr
     return array
 
 
-def check_combination(mu: Any, tangents: int, spin: bool, rolling: bool, is_box: bool, is_pair: bool) -> None:
+def check_friction_combination(
+    mu: Any, tangents: int, spin: bool, rolling: bool, is_box: bool, is_pair: bool
+) -> None:
     """Raise InputError if no kind of contact has this combination of rows."""
     if is_box and (spin or rolling or tangents > 2):
         raise InputError(
@@ -53,7 +55,7 @@ def check_combination(mu: Any, tangents: int, spin: bool, rolling: bool, is_box:
         )
 
 
-def _check_pairs(mu: Any) -> FloatArray:
+def _convert_coefficient_pairs(mu: Any) -> FloatArray:
     """Convert coefficients of two tangents to a checked array (k, 2)."""
     array = as_array("mu", mu, (None,) * np.ndim(mu))
     check_nonnegative_magnitudes("mu", array, "-")
@@ -66,7 +68,7 @@ def convert_box_coefficients(mu: Any) -> tuple[Any, FloatArray]:
     """Return mu_1 (float or (k,)) and mu_2 / mu_1 (1,) or (k,) of boxes with mu scalar, (k,) or (k, 2)."""
     if np.ndim(mu) < 2:
         return mu, np.ones(1)
-    first, second = _check_pairs(mu).T
+    first, second = _convert_coefficient_pairs(mu).T
     smallest = MIN_COEFFICIENT_RATIO * second
     first = np.where((first <= smallest) & (second > 0.0), smallest, first)
     return first, np.divide(second, first, out=np.zeros(len(first)), where=first > 0.0)
@@ -74,7 +76,7 @@ def convert_box_coefficients(mu: Any) -> tuple[Any, FloatArray]:
 
 def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None]:
     """Return mu_1 (k,) and mu_2 / mu_1 (k,) of ellipses with mu (k, 2); the ratio is None if all are disks."""
-    pairs = _check_pairs(mu)
+    pairs = _convert_coefficient_pairs(mu)
     smaller, larger = pairs.min(axis=1), pairs.max(axis=1)
     bad = np.flatnonzero((smaller < 2.0 * MIN_COEFFICIENT_RATIO * larger) & (larger > 0.0))
     if len(bad):

@@ -33,7 +33,7 @@ from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
 from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
-from lavender_ext.factor.graph import least_degree
+from lavender_ext.factor.graph import order_by_minimum_degree
 
 # M is rejected if |M_ij - M_ji| exceeds this fraction of sqrt(M_ii M_jj); rounding of sums in float64 causes less.
 MAX_ASYMMETRY = 1e-12
@@ -91,7 +91,7 @@ class Generalized:
         self._initialize(j, m_lower, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
 
     @classmethod
-    def compressed(
+    def from_compressed_rows(
         cls,
         jac: Compressed,
         mass: Compressed,
@@ -127,9 +127,9 @@ class Generalized:
 
     @classmethod
     def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
-        """Build the object from checked arrays in the form of `compressed`, without v* and without factoring M.
+        """Build the object from checked compressed rows, without v* and without factoring M.
 
-        `shifted` computes v* and the factor.
+        `with_diagonal_shift` computes v* and the factor.
         """
         new = object.__new__(cls)
         new._make_operator(jac, mass, len(mass[0]) - 1)
@@ -166,7 +166,7 @@ class Generalized:
         new.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
         return new
 
-    def shifted(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
+    def with_diagonal_shift(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
         """Return a copy with M + diag(d), d (nv,), in the same order of elimination.
 
         With `momentum` (nv,) [kg m/s], v* is the solution of (M + diag(d)) v* = momentum.
@@ -335,7 +335,7 @@ class Generalized:
         out[self.order] = x
         return out
 
-    def restrict(self, rows: Any, velocities: Any) -> Generalized:
+    def restrict_to_rows_and_velocities(self, rows: Any, velocities: Any) -> Generalized:
         """Return J and M restricted to the given rows and velocities.
 
         The restriction loses nothing if neither M nor these rows of J couple these velocities to others.
@@ -476,7 +476,9 @@ def _order_by_degree(graph: sp.csr_array) -> IntArray:
     graph.setdiag(0)
     graph.eliminate_zeros()
     graph.sort_indices()
-    order: IntArray = least_degree(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[::-1]
+    order: IntArray = order_by_minimum_degree(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[
+        ::-1
+    ]
     return order
 
 

@@ -140,7 +140,7 @@ class Operators(ProblemData):
         if view is None:
             return self.data
         try:
-            view.prepare()
+            view.compute_derived_numbers()
         except OverflowError as error:
             raise TooLarge(f"the problem is too large: {error}") from None
         self._check_diagonal(view)

@@ -29,7 +29,7 @@ from lavender_ext.core.order import (
     compute_body_colors,
     compute_matrix_colors,
 )
-from lavender_ext.factor.graph import matrix_components
+from lavender_ext.factor.graph import find_matrix_components
 
 # Orders of LavenderSim, which creates contacts in the order of its bodies and so does not need "local".
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
@@ -119,14 +119,14 @@ def compute_block_order(
     if order == "reverse":
         blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
     elif order in ("bottom_up", "top_down"):
-        level = compute_levels(problem, ground)
+        level = compute_block_levels_from_ground(problem, ground)
         if order == "top_down":
             level = level.max(initial=0) - level
         blocks = _sort_by_key(level, split)
     elif order == "local":
-        blocks = compute_local_order(problem)
+        blocks = compute_small_bandwidth_block_order(problem)
     elif order == "colored":
-        blocks = _sort_by_key(compute_colors(problem), split)
+        blocks = _sort_by_key(compute_block_colors(problem), split)
     mode = SYMMETRIC if order == "symmetric" else RANDOM if order == "random" else GIVEN
     return Order(np.ascontiguousarray(blocks, np.int32), split, mode, rng)
 
@@ -137,7 +137,7 @@ def _sort_by_key(key: IntArray, split: int) -> IntArray:
     return np.lexsort((key, is_contact)).astype(np.int32)
 
 
-def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
+def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> IntArray:
     """Compute the level (k,) of each block: its distance from static bodies, or in A's graph from `ground`."""
     k = problem.n_blocks
     if problem.rows is not None:
@@ -172,7 +172,7 @@ def compute_levels(problem: Problem, ground: Any = None) -> IntArray:
 MAX_MEAN_BODY_DISTANCE = 4_096
 
 
-def rank_bodies(problem: Problem) -> IntArray:
+def number_bodies_by_adjacency(problem: Problem) -> IntArray:
     """Return a numbering (n,) of bodies in which touching bodies have close numbers.
 
     It is the present numbering if that is close enough, else reverse Cuthill-McKee.
@@ -190,17 +190,17 @@ def rank_bodies(problem: Problem) -> IntArray:
     return rank
 
 
-def compute_local_order(problem: Problem) -> IntArray:
+def compute_small_bandwidth_block_order(problem: Problem) -> IntArray:
     """Return an order of blocks (k,) in which blocks of neighbouring bodies are close together, joints first.
 
-    Blocks are sorted by the `rank_bodies` of their bodies; blocks of a matrix are in reverse Cuthill-McKee order.
+    The key is `number_bodies_by_adjacency`; blocks of a matrix are in reverse Cuthill-McKee order.
     """
     if problem.rows is None:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
         graph = sp.csr_matrix(_build_block_graph(problem))
         return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
-    rank = np.append(rank_bodies(problem), np.int32(-1))
+    rank = np.append(number_bodies_by_adjacency(problem), np.int32(-1))
     pair = rank[problem.rows.block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
     low = np.where(low < 0, high, low)  # For a static body, -1, use the number of the moving body.
@@ -208,7 +208,7 @@ def compute_local_order(problem: Problem) -> IntArray:
     return np.lexsort((high, low, is_contact)).astype(np.int32)
 
 
-def compute_colors(problem: Problem) -> IntArray:
+def compute_block_colors(problem: Problem) -> IntArray:
     """Compute the colour (k,) of each block by a greedy search in the order of the problem.
 
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
@@ -229,7 +229,7 @@ def group_rows_by_island(problem: Problem, ptr: IntArray) -> list[IntArray]:
     """Return the rows of each island of A, in order; rows ptr[i] to ptr[i + 1] - 1 are never separated."""
     group = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
     indptr, indices, _ = problem._compressed
-    count, label = matrix_components(ptr, group, indptr, indices)
+    count, label = find_matrix_components(ptr, group, indptr, indices)
     return group_blocks_by_island(count, label[group])
 
 

@@ -205,7 +205,7 @@ class Problem(Builders):
     @computed_once
     def _disk(self) -> Problem:
         """Problem in stretched tangents: A' = S A S, b' = S b, lambda = S lambda', w' = S w with S = diag(stretch)."""
-        s, cones = self.cones.stretch, self.cones.disks
+        s, cones = self.cones.stretch, self.cones.ellipses_replaced_by_disks
         guess = None if self.guess is None else self.on_disk(self.guess)
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
         more |= {"friction": self.friction, "precision": self.precision}

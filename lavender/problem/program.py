@@ -256,7 +256,7 @@ class QuadraticProgram:
         n = len(self.q)
         return replace(self, q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()))
 
-    def with_saddle(self) -> QuadraticProgram:
+    def convert_to_saddle_form(self) -> QuadraticProgram:
         """Return this program in the form (5), which is used for a singular P, also if P is definite."""
         if self.generalized is None:
             return self
@@ -446,7 +446,7 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
 # -- conversion of arguments --------------------------------------------------------------------------
 
 
-def unpack_program(arguments: ProgramArrays) -> ProgramArrays:
+def unpack_qp_arguments(arguments: ProgramArrays) -> ProgramArrays:
     """Return the eight arrays; the first argument may be a `qpsolvers.Problem`, or an object with its attributes."""
     P = arguments[0]
     if arguments[1] is not None and not hasattr(P, "ub"):
@@ -578,7 +578,10 @@ def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Gener
     diagonal = lower[2][lower[0][1:] - 1]
     is_zero = diagonal == 0.0
     shift = np.where(is_zero, diagonal.max(initial=0.0) or 1.0, SEMIDEFINITE_SHIFT * diagonal)
-    if not _are_rows_empty(lower, is_zero) or _factor_shifted(unfactored, shift, momentum) is None:
+    if (
+        not _has_empty_zero_diagonal_rows(lower, is_zero)
+        or _factor_shifted(unfactored, shift, momentum) is None
+    ):
         check_nonnegative_magnitudes("the diagonal of P", np.abs(diagonal))
         raise InputError(f"P is not positive semidefinite: {_describe_indefinite(lower, diagonal)}")
     return None
@@ -587,12 +590,12 @@ def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Gener
 def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
     """Return J and P + diag(d), or None if that is not positive definite."""
     try:
-        return unfactored.shifted(d, momentum)
+        return unfactored.with_diagonal_shift(d, momentum)
     except InputError:
         return None
 
 
-def _are_rows_empty(lower: Compressed, is_zero: FloatArray) -> bool:
+def _has_empty_zero_diagonal_rows(lower: Compressed, is_zero: FloatArray) -> bool:
     """Return whether rows and columns of P with a zero diagonal entry are empty; if they are not, P is indefinite."""
     ptr, idx, val = lower
     is_entry = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)

@@ -34,9 +34,9 @@ from lavender.base.arrays import (
     get_shape,
 )
 from lavender.base.errors import InputError
-from lavender.base.renamed import build_attribute_error, suggest_argument
+from lavender.base.renamed import build_attribute_error, suggest_argument_name
 from lavender.problem.problem import Problem
-from lavender.problem.rows import Rows, check_inertia
+from lavender.problem.rows import Rows, check_and_symmetrise_inertia
 from lavender_ext.core.checks import MIN_MAGNITUDE
 
 Vector = tuple[float, float, float]
@@ -71,7 +71,7 @@ def check_arguments(method: Callable[Arguments, Result]) -> Callable[Arguments, 
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         for name in kwargs:
             if name not in valid:
-                successor = suggest_argument(name, valid)
+                successor = suggest_argument_name(name, valid)
                 words = f"use {successor}=" if successor else f"it takes {', '.join(f'{v}=' for v in valid)}"
                 raise InputError(f"RowBuilder.{method.__name__} has no argument {name}=; {words}")
         return method(*args, **kwargs)
@@ -207,7 +207,7 @@ class RowBuilder:
             self._velocity[:, PLANAR_VELOCITIES] = as_array("velocity", velocity, (n, 3), unit="m/s, rad/s")
         else:
             tensors = as_array("inv_inertia", inv_inertia, (n, 3, 3), unit="1/(kg m^2)")
-            self._inv_inertia = check_inertia("inv_inertia", tensors)
+            self._inv_inertia = check_and_symmetrise_inertia("inv_inertia", tensors)
             self._velocity = as_array("velocity", velocity, (n, 6), unit="m/s, rad/s")
         self._dt = check_float("dt", dt, above=0.0)
         self._baumgarte = check_float("baumgarte", baumgarte, low=0.0, high=1.0)
@@ -285,7 +285,7 @@ class RowBuilder:
         axis_on_b = axis_on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
         if not self._is_planar:
             error = _cross(axis_on_a, axis_on_b)
-            for side in _make_side_vectors(axis_on_a):
+            for side in _complete_orthonormal_frame(axis_on_a):
                 rows.append(self._make_angular_row(pair, side, side, _dot(side, error)))
         return self._add_joint("hinge", pair, rows, feature, name)
 
@@ -342,7 +342,7 @@ class RowBuilder:
         pair = self._check_pair(a, b)
         point_a, point_b = self._get_anchors(anchor, anchor_b)
         direction, offset = self._check_direction("axis", axis), _subtract(point_b, point_a)
-        sides = [_cross(Z_AXIS, direction)] if self._is_planar else _make_side_vectors(direction)
+        sides = [_cross(Z_AXIS, direction)] if self._is_planar else _complete_orthonormal_frame(direction)
         # The line is fixed to a: use the velocity of the point of a that coincides with point_b.
         rows = [self._make_linear_row(pair, side, point_b, point_b, _dot(side, offset)) for side in sides]
         return self._add_joint(
@@ -371,7 +371,7 @@ class RowBuilder:
             Key of the block.
         """
         pair = self._check_pair(a, b)
-        direction, present, point_a, point_b = self._measure_line(anchor_a, anchor_b)
+        direction, present, point_a, point_b = self._compute_line_between_anchors(anchor_a, anchor_b)
         wanted = present if length is None else check_float("length", length, low=0.0)
         row = self._make_linear_row(pair, direction, point_a, point_b, present - wanted)
         return self._add_joint("distance", pair, [row], feature, name)
@@ -402,7 +402,7 @@ class RowBuilder:
             Key of the block.
         """
         pair = self._check_pair(a, b)
-        direction, present, point_a, point_b = self._measure_line(anchor_a, anchor_b)
+        direction, present, point_a, point_b = self._compute_line_between_anchors(anchor_a, anchor_b)
         rest = check_float("length", length, low=0.0)
         k, c = check_float("stiffness", stiffness, low=0.0), check_float("damping", damping, low=0.0)
         resistance = c + self._dt * k
@@ -761,7 +761,9 @@ class RowBuilder:
         point = self._check_vector("anchor", anchor, "m")
         return point, point if anchor_b is None else self._check_vector("anchor_b", anchor_b, "m")
 
-    def _measure_line(self, anchor_a: ArrayLike, anchor_b: ArrayLike) -> tuple[Vector, float, Vector, Vector]:
+    def _compute_line_between_anchors(
+        self, anchor_a: ArrayLike, anchor_b: ArrayLike
+    ) -> tuple[Vector, float, Vector, Vector]:
         """Return unit vector, distance and both ends of the line between two anchors."""
         point_a, point_b = (
             self._check_vector("anchor_a", anchor_a, "m"),
@@ -782,7 +784,7 @@ class RowBuilder:
                 )
             return _cross(Z_AXIS, normal)
         if tangent is None:
-            return _make_side_vectors(normal)[0]
+            return _complete_orthonormal_frame(normal)[0]
         along = self._check_direction("tangent", tangent)
         across = _subtract(along, _scale(_dot(along, normal), normal))
         if hypot(*across) < NORMAL_LENGTH_TOLERANCE:
@@ -934,7 +936,7 @@ def _normalise(name: str, x: Vector) -> Vector:
     return x[0] / size, x[1] / size, x[2] / size
 
 
-def _make_side_vectors(axis: Vector) -> list[Vector]:
+def _complete_orthonormal_frame(axis: Vector) -> list[Vector]:
     """Return two unit vectors that form a right-handed frame with a unit vector: side, axis x side."""
     smallest = min(range(3), key=lambda i: abs(axis[i]))
     side = _normalise("axis", _cross(axis, (X_AXIS, Y_AXIS, Z_AXIS)[smallest]))

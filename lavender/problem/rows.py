@@ -170,11 +170,11 @@ class Rows:
             self.copy,
         )
         if fault:
-            self._resolve_fault(fault, index)
+            self._correct_rounding_or_raise(fault, index)
         # `copy=False` applies to this call only, not to later `replace` calls.
         object.__setattr__(self, "copy", True)
 
-    def _resolve_fault(self, fault: str, index: int) -> None:
+    def _correct_rounding_or_raise(self, fault: str, index: int) -> None:
         """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""
         name, _, kind = fault.rpartition("_")
         if kind == "body":
@@ -193,11 +193,13 @@ class Rows:
             "largest entry of inv_inertia", compute_max_abs_entries(self.inv_inertia), UNITS["inv_inertia"]
         )
         if self.copy:
-            object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
+            object.__setattr__(
+                self, "inv_inertia", check_and_symmetrise_inertia("inv_inertia", self.inv_inertia)
+            )
         if self.n_contacts:
-            self._correct_frames()
+            self._orthonormalise_frames()
 
-    def _correct_frames(self) -> None:
+    def _orthonormalise_frames(self) -> None:
         """Orthonormalise normals and tangents that float32 has rounded; raise InputError for larger errors."""
         n, t = self.normal, self.tangent
         with np.errstate(over="ignore", invalid="ignore"):
@@ -310,7 +312,7 @@ def compute_max_abs_entries(tensors: FloatArray) -> FloatArray:
     return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
 
-def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
+def check_and_symmetrise_inertia(name: str, tensors: FloatArray) -> FloatArray:
     """Return inverse inertias (n, 3, 3), made symmetric positive semidefinite if they are not by rounding to float32.
 
     Raises

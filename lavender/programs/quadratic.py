@@ -19,7 +19,7 @@ import numpy as np
 from lavender.base.arrays import check_float, mark_read_only
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, sum_work
+from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, sum_work_counts
 from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import QuadraticProgram
@@ -180,7 +180,7 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     if other.error < answer.error or _is_proved_infeasible(other):
         answer = other
     stages = tuple(stage for solution in ran for stage in solution.stages)
-    work = MappingProxyType(sum_work(solution.work for solution in ran))
+    work = MappingProxyType(sum_work_counts(solution.work for solution in ran))
     message = f"{describe_stages(stages)}; {answer.solution.message}".rstrip("; ")
     solution = replace(answer.solution, stages=stages, work=work, message=message)
     return replace(answer, solution=solution)
@@ -192,7 +192,7 @@ def _solve_over_velocities(problem: Problem, tol: float, end: float, impulse: An
 
 def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
     """Solve the program in the form (5) by a backend, which works on P instead of its inverse."""
-    qp: QuadraticProgram = problem.qp.with_saddle()
+    qp: QuadraticProgram = problem.qp.convert_to_saddle_form()
     program = Problem(**qp.problem_fields(), qp=qp, copy=False)
     start = None
     if impulse is not None:

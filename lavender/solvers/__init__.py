@@ -6,7 +6,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from lavender.base.lazy_import import import_locked
+from lavender.base.lazy_import import import_module_under_lock
 from lavender.solvers.registry import SolverSpec
 
 __all__ = ["SPECS", "get_spec"]
@@ -33,7 +33,7 @@ SPECS: tuple[SolverSpec, ...]  # The specs of all solvers; `__getattr__` imports
 
 def get_spec(name: str) -> SolverSpec | None:
     """Return the spec of one solver, importing its file if necessary; None if it is not in the table."""
-    return import_locked(f"{__name__}.{name}").SPEC if name in _TABLE else None
+    return import_module_under_lock(f"{__name__}.{name}").SPEC if name in _TABLE else None
 
 
 def __getattr__(name: str) -> Any:

@@ -78,7 +78,7 @@ class Accelerated(Sweeping):
     def cost(self, problem: Problem, state: Any = None) -> Cost:
         """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
         setup = partial(self._estimate_setup_cost, problem)
-        return Cost(setup, lambda: estimate_sweep_cost(problem, count_sweep_work(problem)))
+        return Cost(setup, lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
 
     def _check(self, problem: Problem) -> None:
         """Raise InputError if the options `sweep` and `convex` are not valid for the problem."""
@@ -99,7 +99,7 @@ class Accelerated(Sweeping):
         convex = self.convex if problem.law == "coulomb" else 0
         return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
 
-    def _complete_claim(self, state: AcceleratedState, claim: Claim, restarts: int) -> Claim:
+    def _add_work_to_claim(self, state: AcceleratedState, claim: Claim, restarts: int) -> Claim:
         """Add the counts of sweeps and restarts, and the name of the form, to a claim."""
         done = claim.iterations
         work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": restarts}
@@ -120,7 +120,7 @@ def choose_sweep_operator(problem: Problem) -> Any:
     return choose_sweep_data(problem) if _max_entries(problem) is None else problem.csr_data
 
 
-def count_sweep_work(problem: Problem) -> int:
+def estimate_sweep_work(problem: Problem) -> int:
     """Estimate the multiply-adds of one sweep over the data of `choose_sweep_operator`, without forming A."""
     entries = _max_entries(problem)
     if entries is None and problem.generalized is not None and not is_sweep_over_jacobian_cheaper(problem):

@@ -22,9 +22,9 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import BREAKDOWN, InputError
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import MAX_MEMORY
@@ -43,13 +43,13 @@ from lavender.solvers.factors import (
     PIVOT_TOLERANCE,
     USE_WIDE_LANES,
     get_sorted_csr_arrays,
-    mirror_pattern,
+    make_pattern_symmetric,
 )
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.sweeping import create_stopping_test, make_claim
 from lavender_ext.accelerate import admm
 from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
-from lavender_ext.newton.coupled import scaled_entries
+from lavender_ext.newton.coupled import scale_matrix_entries
 from lavender_ext.newton.solve import Layout
 
 _START_RHO = 0.1  # First penalty rho. B has unit diagonal, so its scale is 1. The value was measured.
@@ -72,7 +72,7 @@ class AdmmState:
     """Scaled problem, factorisation for the current rho, and the vectors of the run; `open` builds them."""
 
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
         self.deadline = Deadline()  # No step starts that is expected to end after this deadline.
         # Number of factorisations, and their number in earlier claims.
@@ -86,7 +86,7 @@ class AdmmState:
         if self.next_cost <= MAX_SETUP_SCALING_COST:
             self._scale_problem()
 
-    def open(self) -> None:
+    def scale_and_factor(self) -> None:
         """Scale, analyse and factor; raise TooLate before a step that is expected to end after the deadline."""
         if not self.is_scaled:
             self._check_deadline()
@@ -99,7 +99,7 @@ class AdmmState:
             self.factor = self._factor()
 
     def _check_deadline(self) -> None:
-        if self.deadline.passed(1e-9 * self.next_cost):
+        if self.deadline.has_passed(1e-9 * self.next_cost):
             raise TooLate
 
     def _scale_problem(self) -> None:
@@ -121,12 +121,12 @@ class AdmmState:
             )  # There is no matrix to analyse before the first factor.
             return
         a = problem.csr
-        values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
+        values = scale_matrix_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
         self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
         self.lu = not problem.is_symmetric
         self.is_over_bodies = False
         if problem.m:
-            self.matrix = mirror_pattern(self.matrix)
+            self.matrix = make_pattern_symmetric(self.matrix)
             self.system = LinearSystem(get_sorted_csr_arrays(self.matrix)[:2], USE_WIDE_LANES)
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
@@ -159,12 +159,12 @@ class AdmmState:
         """Return the factor for the present rho in the format of the kernel, and measure the time to compute it."""
         self._check_deadline()
         watch = Stopwatch()
-        factor = self._make_factor()
+        factor = self._factor_with_fallbacks()
         self.factorisations += 1
-        self.next_cost = 1e9 * watch.seconds
+        self.next_cost = 1e9 * watch.elapsed_seconds
         return factor
 
-    def _make_factor(self) -> tuple[Any, ...]:
+    def _factor_with_fallbacks(self) -> tuple[Any, ...]:
         """Factor the matrix. If that breaks down, try L U, then L U of the full matrix, if these are allowed.
 
         Raises
@@ -182,23 +182,23 @@ class AdmmState:
         if self.is_over_bodies:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
-            matrix, shift = mirror_pattern(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
+            matrix, shift = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # The pattern is analysed for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
             extra = (*get_sorted_csr_arrays(k), e)
-        done = _factor_system(system, matrix, shift, self.lu)
+        done = _factor_shifted_matrix(system, matrix, shift, self.lu)
         if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
             # L L^T needs a definite matrix, and a linear system may be indefinite.
             self.lu = True
-            done = _factor_system(system, matrix, shift, True)
+            done = _factor_shifted_matrix(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # L U by supernodes cannot exchange rows across supernodes, which is needed here.
-            if self.deadline.passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
+            if self.deadline.has_passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
                 raise TooLate
             self.full = True
             self.matrix = matrix = matrix.toarray()
             self.system = system = LinearSystem(m, USE_WIDE_LANES)
-            done = _factor_system(system, matrix, shift, True)
+            done = _factor_shifted_matrix(system, matrix, shift, True)
         if not done:
             raise _Breakdown(f"the factor of A + rho D broke down at rho = {rho:.1e}")
         return system, *extra
@@ -236,7 +236,7 @@ def _analyse_panels(system: LinearSystem) -> LinearSystem:
     return system
 
 
-def _factor_system(system: LinearSystem, matrix: Any, shift: float, lu: bool) -> bool:
+def _factor_shifted_matrix(system: LinearSystem, matrix: Any, shift: float, lu: bool) -> bool:
     """Factor M = matrix + shift; return whether the factorisation succeeded.
 
     L U must also solve a test system with a backward error within `BACKWARD_TOLERANCE`:
@@ -277,7 +277,7 @@ class ADMM(Solver):
 
     def prepare(self, problem: Problem) -> AdmmState:
         """Build the state, and scale the problem unless scaling costs more than `MAX_SETUP_SCALING_COST`."""
-        import_numerics()
+        import_numerical_modules()
         return AdmmState(problem, self.memory, self.relaxation)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -285,7 +285,7 @@ class ADMM(Solver):
         """Start no step that is expected to end after `deadline`. Do the set-up now if it ends before."""
         state.deadline = deadline
         with suppress(TooLate, _Breakdown, *BREAKDOWN):  # `run` meets the same error and reports it.
-            state.open()
+            state.scale_and_factor()
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
@@ -298,7 +298,7 @@ class ADMM(Solver):
     ) -> Claim:
         """Run `max_iter` iterations, or fewer if a check, a breakdown or the deadline ends them."""
         try:
-            state.open()
+            state.scale_and_factor()
         except _Breakdown as failure:
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
         except TooLate:

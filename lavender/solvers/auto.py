@@ -56,7 +56,7 @@ from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.recording import Recorder
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
-from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, time_fraction
+from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, get_call_time_fraction
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import (
     METHODS,
@@ -103,7 +103,7 @@ class Stage:
     least: float = inf
 
 
-class Tree:
+class DecisionTree:
     """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
 
     The caller sets `best`, the relative residual so far, and adds the cost of stages that it skips to `remaining_cost`.
@@ -149,7 +149,7 @@ class Tree:
             return inf
         return estimate_cost("newton over rows", p).total
 
-    def add_row_form(self, max_cost: float) -> bool:
+    def analyse_row_form_if_cheaper(self, max_cost: float) -> bool:
         """Analyse A of J and M, too, if its Newton's method costs less than `max_cost` [ns] and has time.
 
         Return whether a form was added.
@@ -159,7 +159,7 @@ class Tree:
             return False
         if self.deadline.is_set:
             cost = estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
-            if self.deadline.passed(1e-9 * cost):
+            if self.deadline.has_passed(1e-9 * cost):
                 return False
         self.states = states | self.prepare_newton("newton over rows")
         return len(self.states) > len(states)
@@ -182,7 +182,7 @@ class Tree:
         if self.formation > DECISIONS.first_sweeps * self.sweep:
             return False
         return not (
-            self.deadline.is_set and self.deadline.passed(1e-9 * self.formation / DECISIONS.time_share)
+            self.deadline.is_set and self.deadline.has_passed(1e-9 * self.formation / DECISIONS.time_share)
         )
 
     @cached_property
@@ -211,10 +211,10 @@ class Tree:
             return True
         needed = before + cost
         if name == "newton" and "states" in vars(self):
-            return not self.deadline.passed(1e-9 * needed)
-        if not self.deadline.passed(1e-9 * (get_loose_limit(self.problem) + needed)):
+            return not self.deadline.has_passed(1e-9 * needed)
+        if not self.deadline.has_passed(1e-9 * (get_loose_limit(self.problem) + needed)):
             return True
-        return not self.deadline.passed(1e-9 * (estimate_cost(name, self.problem).setup + needed))
+        return not self.deadline.has_passed(1e-9 * (estimate_cost(name, self.problem).setup + needed))
 
     @cached_property
     def factorises_first(self) -> bool:
@@ -247,34 +247,34 @@ class Tree:
             )
         elif not self.factorises_first:
             yield self.sweeps(first, "the first sweeps, before any analysis")
-        self.add_row_form(ratio * self.newton if self.compiled_call_failed else self.newton)
+        self.analyse_row_form_if_cheaper(ratio * self.newton if self.compiled_call_failed else self.newton)
         if not self.factorises_first and first < self.newton < inf:
             why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
         if p.generalized is not None and not np.all(p.compliance):
-            yield from islice(self.factorisations(0.25 * ratio), 1)
+            yield from islice(self.iterate_factorising_stages(0.25 * ratio), 1)
             state = self.states.get("newton")  # The smallest violation is found over velocities.
             cost = self.newton if state is None else state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        yield from self.factorisations(ratio)
-        self.add_row_form(ratio * self.newton)
+        yield from self.iterate_factorising_stages(ratio)
+        self.analyse_row_form_if_cheaper(ratio * self.newton)
         if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
             yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
-        yield from self.alternation()
+        yield from self.iterate_alternating_stages()
 
-    def alternation(self) -> Iterator[Stage]:
+    def iterate_alternating_stages(self) -> Iterator[Stage]:
         """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
         self.remaining_cost = DECISIONS.total_ratio * self.unit
         for k in range(MAX_ALTERNATIONS):
             before = self.best
-            for stage in self.alternate(2.0**k):
+            for stage in self.iterate_one_round(2.0**k):
                 if self.remaining_cost < 1.0:  # [ns]
                     return
                 fraction = min(1.0, self.remaining_cost / stage.cost)
                 self.remaining_cost -= fraction * stage.cost
                 yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
             no_gain = k > 0 and self.best >= before
-            if no_gain and not self.add_row_form(DECISIONS.total_ratio * self.unit):
+            if no_gain and not self.analyse_row_form_if_cheaper(DECISIONS.total_ratio * self.unit):
                 return
 
     @property
@@ -282,7 +282,7 @@ class Tree:
         """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
         return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
 
-    def factorisations(self, times: float) -> Iterator[Stage]:
+    def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
         """Yield stages of the factorising solvers; each costs up to this multiple of the cheapest solver's cost."""
         budget = times * self.newton
         for name, cost in self.solver_costs.items():
@@ -303,7 +303,7 @@ class Tree:
         """Return a stage of this cost [ns] of a solver whose iterations cost as much as two sweeps."""
         return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
-    def alternate(self, times: float) -> Iterator[Stage]:
+    def iterate_one_round(self, times: float) -> Iterator[Stage]:
         """Yield one round, in which each solver costs this multiple of the factorising solvers' first budget."""
         times *= DECISIONS.budget_ratio
         cost = times * self.unit
@@ -362,7 +362,7 @@ class Auto(Solver):
         if state.loop is None:
             return self._run(state, impulse, max_iter, tol, time_limit)
         recorder = Recorder(state.loop)
-        recorder.record("start", 0, impulse)
+        recorder.record_impulse("start", 0, impulse)
         claim = self._run(state, impulse, max_iter, tol, time_limit, recorder)
         recorder.finish(claim, impulse)
         return claim
@@ -379,42 +379,44 @@ class Auto(Solver):
         """Run as `run`, and write the history with the recorder."""
         problem, deadline = state.problem, Deadline(time_limit)
         if problem.has_singular_program:
-            return run_backends(problem, impulse, max_iter, tol, deadline)
+            return run_singular_program_backends(problem, impulse, max_iter, tol, deadline)
         counts: tuple[int, ...] | None = state.failed_call
         if counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL:
-            fraction = time_fraction(problem, deadline.remaining() or inf)
+            fraction = get_call_time_fraction(problem, deadline.get_remaining_seconds() or inf)
             if fraction > 0.0:
-                result, counts = AUTO.attempt(problem, impulse, tol, fraction * deadline.nanoseconds())
+                result, counts = AUTO.solve_and_judge(
+                    problem, impulse, tol, fraction * deadline.get_remaining_nanoseconds()
+                )
                 if result is not None and result.relative <= tol:
-                    claim = AUTO.claim(problem, counts, impulse, result.relative)
+                    claim = AUTO.make_claim(problem, counts, impulse, result.relative)
                     if claim.iterations <= max_iter:
                         if recorder is not None:
-                            recorder.add_call(AUTO, impulse, tol, claim)
+                            recorder.record_compiled_call(AUTO, impulse, tol, claim)
                         impulse[:] = result.impulse
                         return replace(claim, judged=result)
-        failed = AUTO.failed_claims(problem, counts)
+        failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        if deadline.passed(1e-9 * estimate_first_sweep_cost(problem)):
+        if deadline.has_passed(1e-9 * estimate_first_sweep_cost(problem)):
             impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
-        tree = Tree(problem, deadline)
+        tree = DecisionTree(problem, deadline)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
         log = SolveLog(problem, tol, max_iter, deadline)
-        log.begin(impulse)
+        log.start_from_better_impulse(impulse)
         log.recorder = recorder
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
-                    log.note(name, claim, log.best)
+                    log.record_stage(name, claim, log.best)
                 solve(log, tree)
         except KeyboardInterrupt:
             log.interrupted = True  # The best impulse is returned even after an interruption.
         except BREAKDOWN as error:
             log.failure = format_error(error)
         impulse[:] = log.result if log.best > tol else log.impulse
-        return log.claim()
+        return log.make_claim()
 
 
 def program_backends() -> list[SolverSpec]:
@@ -423,7 +425,7 @@ def program_backends() -> list[SolverSpec]:
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def run_backends(
+def run_singular_program_backends(
     problem: Problem, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
 ) -> Claim:
     """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
@@ -431,7 +433,7 @@ def run_backends(
     If none reaches tol, the result is the one with the smallest error of the program.
     """
     log, start = SolveLog(problem, tol, max_iter, deadline), impulse.copy()
-    log.offer(impulse)
+    log.judge_and_store_best(impulse)
     error, best = program_error(problem, log.impulse), log.impulse
     try:
         for spec in program_backends():
@@ -440,8 +442,8 @@ def run_backends(
             solver, before, trial = spec.load()(), log.best, start.copy()
             state = solver.prepare(problem)
             claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
-            log.offer(trial)
-            log.note(spec.name, claim, before)
+            log.judge_and_store_best(trial)
+            log.record_stage(spec.name, claim, before)
             for result in (trial, log.impulse if log.best <= tol else log.result):
                 if program_error(problem, result) < error:
                     error, best = program_error(problem, result), result.copy()
@@ -453,7 +455,7 @@ def run_backends(
         log.interrupted = True
     except BREAKDOWN as failure:
         log.failure = format_error(failure)
-    claim = log.claim()
+    claim = log.make_claim()
     if log.best <= tol:
         impulse[:] = log.impulse
     else:
@@ -470,11 +472,11 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def solve(log: SolveLog, tree: Tree) -> None:
+def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
-        Sweeps("anderson", log).finish()
+        Sweeps("anderson", log).sweep_until_deadline()
         return
     lines = iter(tree)
     while not log.done():  # This is checked before the tree computes the costs of the next stage.
@@ -482,7 +484,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
         if stage is None:
             break
         if stage.solver == "certificate":
-            if not log.ends_late(stage.cost):
+            if not log.ends_after_deadline(stage.cost):
                 (
                     certify_by_linear_programs
                     if log.problem.generalized is None
@@ -491,13 +493,15 @@ def solve(log: SolveLog, tree: Tree) -> None:
             continue
         step = steps.get(stage.solver)
         if step is None:
-            step = steps[stage.solver] = make_step(stage.solver, log, tree)
+            step = steps[stage.solver] = create_solver_step(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
-                if not tree_goes_on(
-                    tree, steps, min(stage.cost, DECISIONS.time_share * log.deadline.nanoseconds())
+                if not can_factorise_later(
+                    tree,
+                    steps,
+                    min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds()),
                 ):
-                    step.finish()
+                    step.sweep_until_deadline()
                     return
             elif step.name == "direct" or isinstance(step, Newton):
                 step.over = step.late = not tree.has_time(
@@ -505,7 +509,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
                 )
             elif step.state is None:
                 setup = estimate_cost(stage.solver, log.problem).setup
-                step.over = log.deadline.passed(1e-9 * setup / DECISIONS.time_share)
+                step.over = log.deadline.has_passed(1e-9 * setup / DECISIONS.time_share)
         is_hopeless = isinstance(step, Sweeps) and step.predicted > stage.least
         if step.over or is_hopeless:
             tree.remaining_cost += stage.cost
@@ -521,7 +525,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
         certify_infeasibility(log)
 
 
-def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
+def can_factorise_later(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
     """Return whether, after work of this cost [ns], a factorising solver can end in time, or all have ended."""
     if "states" not in vars(tree):
         return tree.has_time("newton", tree.min_newton_cost, cost)
@@ -531,7 +535,7 @@ def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
     return bool(unfinished) and tree.has_time("newton", tree.newton, cost)
 
 
-def make_step(name: str, log: SolveLog, tree: Tree) -> Step:
+def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of this name; Newton's method gets the state of the tree."""
     kinds = {"anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton}
     step = kinds.get(name, Iterations)(name, log)

@@ -45,7 +45,7 @@ class BlockGaussSeidel(Sweeping):
         data = choose_sweep_data(problem)
         return SweepState(problem, data, order, serial.Sweeps(data, *make_order_plan(order), exact=True))
 
-    def _complete_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
+    def _add_work_to_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))
 
 

@@ -132,7 +132,7 @@ def _run_newton(
     problem: Problem, steps: int, tol: float, deadline: Deadline | None
 ) -> tuple[float, Claim | None]:
     """Run Newton's method from zero; return (relative residual, claim), or (inf, None) if it refuses the problem."""
-    spec, left = get("newton"), None if deadline is None else deadline.remaining()
+    spec, left = get("newton"), None if deadline is None else deadline.get_remaining_seconds()
     if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
         return np.inf, None
     solver, impulse = spec.load()(), problem.start()
@@ -182,13 +182,13 @@ def certify_by_least_violation(log: SolveLog) -> None:
         soft = replace(
             rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
         )  # Negligible rows are empty.
-        kernel = general.prepare(soft)
-        if kernel is None or log.ends_late(RATES["linear program"]):
+        kernel = general.prepare_islands(soft)
+        if kernel is None or log.ends_after_deadline(RATES["linear program"]):
             return
         before, lam = lam, lam.copy()
         steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
         if (
-            general.run(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.time_left).status
+            general.run_newton_steps(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.time_left).status
             is Status.INTERRUPTED
         ):
             raise KeyboardInterrupt
@@ -201,7 +201,9 @@ def certify_by_least_violation(log: SolveLog) -> None:
         y[outside] = 0.0
         if not prove_infeasibility(problem, y, log.tol, log.deadline).reason:
             break
-    log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
+    log.record_stage(
+        "least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best
+    )
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -222,12 +224,14 @@ def certify_infeasibility(log: SolveLog) -> None:
 def certify_by_linear_programs(log: SolveLog) -> None:
     """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_late(RATES["linear program"] + estimate_import_cost("scipy.optimize")):
+    if log.best < 1e-6 or log.ends_after_deadline(
+        RATES["linear program"] + estimate_import_cost("scipy.optimize")
+    ):
         return
     total_rows = 0
     for part, rows in _list_unsolved_islands(log):
         total_rows += part.m
-        if total_rows > CERTIFICATE_ROWS or log.ends_late(RATES["linear program"]):
+        if total_rows > CERTIFICATE_ROWS or log.ends_after_deadline(RATES["linear program"]):
             return
         if not _has_simple_bounds(part):
             continue
@@ -237,7 +241,7 @@ def certify_by_linear_programs(log: SolveLog) -> None:
             proof = np.zeros(problem.m)
             proof[rows] = y
         claim = Claim(Status.STALLED, 0, {"certificates": 1}, certificate=proof)
-        log.note(LINEAR_PROGRAM_STAGE, claim, log.best)
+        log.record_stage(LINEAR_PROGRAM_STAGE, claim, log.best)
         if log.certificate is not None:
             return
 
@@ -307,7 +311,7 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": SIMPLEX_STEPS_PER_ROW * problem.m}
     if deadline.is_set:
-        options["time_limit"] = deadline.remaining(1e-3)
+        options["time_limit"] = deadline.get_remaining_seconds(1e-3)
     result = linprog(
         -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
         bounds=np.stack([low, high], 1), method="highs", options=options,
@@ -319,7 +323,7 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     return y
 
 
-def check_infeasible(
+def check_infeasibility_claim(
     problem: Problem, claim: Claim, tol: float, deadline: Deadline
 ) -> tuple[Claim, bool, str]:
     """Check the claim of another package's solver or of a plug-in that a problem has no solution.
@@ -340,7 +344,7 @@ def check_infeasible(
         and not prove_infeasibility(problem, claim.certificate, tol, deadline).reason
     ):
         return claim, True, ""
-    spec, left = get("auto"), deadline.remaining()
+    spec, left = get("auto"), deadline.get_remaining_seconds()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
         return claim, False, ""
     solver, impulse = spec.load()(), problem.start()

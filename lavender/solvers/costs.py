@@ -45,6 +45,7 @@ __all__ = [
     "estimate_direct_cost",
     "estimate_disk_cost",
     "estimate_elimination_cost",
+    "estimate_factorisation_count",
     "estimate_first_factor_cost",
     "estimate_first_sweep_cost",
     "estimate_formation_cost",
@@ -61,9 +62,8 @@ __all__ = [
     "estimate_sparse_work",
     "estimate_sweep_cost",
     "estimate_symmetry_cost",
-    "get_factorisation_count",
     "get_loose_limit",
-    "get_sweep_rate",
+    "get_sweep_rate_name",
     "is_formed",
 ]
 
@@ -152,7 +152,7 @@ class Count:
 # -- iterations ----------------------------------------------------------------------------------
 
 
-def get_factorisation_count(problem: Problem) -> float:
+def estimate_factorisation_count(problem: Problem) -> float:
     """Return the expected number of factorisations of Newton's method: 1 for linear problems."""
     if problem.law == "linear":
         return 1.0
@@ -164,7 +164,7 @@ def estimate_newton_cost(count: Count, problem: Problem) -> float:
     """Estimate the cost of Newton's method over rows or bodies [ns], (1)."""
     r = RATES
     step_cost = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
-    return float(r["start"] + count.set_up + get_factorisation_count(problem) * step_cost)
+    return float(r["start"] + count.set_up + estimate_factorisation_count(problem) * step_cost)
 
 
 def estimate_direct_cost(problem: Problem) -> float:
@@ -178,10 +178,10 @@ def estimate_direct_cost(problem: Problem) -> float:
 
 def estimate_sweep_cost(problem: Problem, work: float) -> float:
     """Estimate the cost of one sweep of `work` multiply-adds [ns], (2)."""
-    return float(RATES["sweep row"] * problem.m + RATES[get_sweep_rate(problem)] * work)
+    return float(RATES["sweep row"] * problem.m + RATES[get_sweep_rate_name(problem)] * work)
 
 
-def get_sweep_rate(problem: Problem) -> str:
+def get_sweep_rate_name(problem: Problem) -> str:
     """Return the name of the rate of a sweep's multiply-adds."""
     if problem.matrix is not None:
         return "entry"

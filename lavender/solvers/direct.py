@@ -33,7 +33,7 @@ from lavender.base.deadline import Deadline
 from lavender.judge.certificates import MAX_POLISHED_SLACK as CERTIFICATE_TOLERANCE
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse
-from lavender.judge.solution import Claim, Status, sum_work
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.costs import (
     Cost,
@@ -41,7 +41,7 @@ from lavender.solvers.costs import (
     estimate_first_factor_cost,
     estimate_matrix_setup_cost,
 )
-from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, GeneralFactor, PanelsLU
+from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, PanelsLU, RankRevealingFactor
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.small import DIRECT
@@ -70,7 +70,7 @@ class DirectState:
     problem : Problem
     pivot : PivotState, optional
         Rows of a boxed or symmetric problem.
-    general : GeneralFactor or PanelsLU, optional
+    general : RankRevealingFactor or PanelsLU, optional
         Factor of an asymmetric or indefinite linear system.
     failed_factorisations : int
         Factorisations before `general` that failed.
@@ -82,7 +82,7 @@ class DirectState:
 
     problem: Problem
     pivot: PivotState | None = None
-    general: GeneralFactor | PanelsLU | None = None
+    general: RankRevealingFactor | PanelsLU | None = None
     failed_factorisations: int = 0
     is_running: bool = False
     note: str = ""
@@ -119,11 +119,11 @@ class Direct(Solver):
         if linear and state.pivot is not None:
             outcome = state.pivot.rows.factor_all()
             if outcome == INDEFINITE:
-                return _factor_general(problem, "A is indefinite")
+                return _factor_by_rank_revealing_lu(problem, "A is indefinite")
             if not problem.is_symmetric:
                 state.note = "A is not symmetric"
                 if outcome != SOLVED:
-                    return _factor_general(problem, state.note)
+                    return _factor_by_rank_revealing_lu(problem, state.note)
         return state
 
     def update(self, state: DirectState, problem: Problem) -> DirectState:
@@ -139,15 +139,15 @@ class Direct(Solver):
     ) -> Claim:
         run = _Run(state, impulse, max_iter, tol, Deadline(time_limit), self)
         if state.problem.m == 0:
-            return run.claim(Status.CONVERGED)
+            return run.make_claim(Status.CONVERGED)
         if max_iter == 0:
-            return run.claim(Status.MAX_ITERATIONS)
+            return run.make_claim(Status.MAX_ITERATIONS)
         try:
             if state.general is not None:
                 claim = run.solve_linear_with_lu(state.general)
             else:
                 assert state.pivot is not None
-                claim = run.pivoting(state.pivot)
+                claim = run.run_pivoting_rounds(state.pivot)
         finally:
             run.store_best()
         return replace(claim, judged=run.best_pass)
@@ -165,17 +165,19 @@ def _factor_asymmetric(problem: Problem) -> DirectState:
     """Factor an asymmetric A by panels if it is sparse and that succeeds, else by LU with pivoting."""
     why = "A is not symmetric"
     if not PanelsLU.accepts(problem):
-        return _factor_general(problem, why)
+        return _factor_by_rank_revealing_lu(problem, why)
     factor = PanelsLU(problem)
     if factor.usable:
         return DirectState(problem, general=factor, note=why)
-    return replace(_factor_general(problem, f"{why}; LU by panels lost a pivot"), failed_factorisations=1)
+    return replace(
+        _factor_by_rank_revealing_lu(problem, f"{why}; LU by panels lost a pivot"), failed_factorisations=1
+    )
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def _factor_general(problem: Problem, why: str) -> DirectState:
+def _factor_by_rank_revealing_lu(problem: Problem, why: str) -> DirectState:
     """Factor A by LU that reveals the rank; `why` begins the message."""
-    factor = GeneralFactor(problem)
+    factor = RankRevealingFactor(problem)
     if not factor.usable:
         why += "; LU is singular and A too large for a decomposition that reveals its rank"
     elif factor.rank < problem.m:
@@ -210,14 +212,14 @@ class _Run:
 
     # -- judging ---------------------------------------------------------------------------------
 
-    def judge(self, x: FloatArray) -> float:
+    def judge_iterate(self, x: FloatArray) -> float:
         """Return the relative residual of x (m,), which must not change afterwards; the best x becomes the result."""
         result = judge_impulse(self.problem, x)
-        self.offer(result)
+        self.store_if_best(result)
         relative: float = result.relative
         return relative
 
-    def offer(self, result: measure.Judged | None) -> None:
+    def store_if_best(self, result: measure.Judged | None) -> None:
         """Store a judged iterate if it has the smallest residual so far."""
         if result is not None and result.relative < self.best:
             self.best_pass = result
@@ -237,7 +239,7 @@ class _Run:
         pivot = self.state.pivot
         if pivot is not None and pivot.rows.relative < self.best:
             # This iterate is left if an error or Ctrl-C ended the run between two rounds.
-            self.offer(pivot.rows.best)
+            self.store_if_best(pivot.rows.best)
         if self.best_pass is not None:
             self.impulse[:] = self.best_pass.impulse
 
@@ -251,7 +253,7 @@ class _Run:
     @property
     def out_of_time(self) -> bool:
         pivot = self.state.pivot
-        return self.late or (pivot is not None and pivot.rows.late) or self.deadline.passed()
+        return self.late or (pivot is not None and pivot.rows.late) or self.deadline.has_passed()
 
     @property
     def pivot_work(self) -> dict[str, int]:
@@ -261,30 +263,30 @@ class _Run:
             kind: n - self.reported.get(kind, 0) for kind, n in work.items() if n > self.reported.get(kind, 0)
         }
 
-    def claim(self, status: Status, **more: Any) -> Claim:
+    def make_claim(self, status: Status, **more: Any) -> Claim:
         """Return a claim with this status, the work and the notes."""
         state = self.state
         work, form = self.work | self.pivot_work, "LU" if state.pivot is None else state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
-    def make_final_claim(self) -> Claim:
+    def make_claim_for_best_iterate(self) -> Claim:
         """Return the claim for the best iterate when no step remains."""
         if self.best <= self.tol:
-            return self.claim(Status.CONVERGED)
+            return self.make_claim(Status.CONVERGED)
         if self.is_at_floor():
-            return self.claim(Status.ROUNDOFF_LIMIT)
-        return self.claim(Status.STALLED)
+            return self.make_claim(Status.ROUNDOFF_LIMIT)
+        return self.make_claim(Status.STALLED)
 
     # -- linear systems that are not symmetric definite -------------------------------------------
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
-    def solve_linear_with_lu(self, factor: GeneralFactor | PanelsLU) -> Claim:
+    def solve_linear_with_lu(self, factor: RankRevealingFactor | PanelsLU) -> Claim:
         """Solve and refine a linear system with an LU factor; search for a certificate if A is singular."""
         problem = self.problem
         self.iterations = 1
         self.work = {"factorisations": 1 + self.state.failed_factorisations}
         if not factor.usable:
-            return self.claim(Status.NUMERICAL_ERROR)
+            return self.make_claim(Status.NUMERICAL_ERROR)
         singular = factor.rank < problem.m
         x = np.zeros(problem.m)
         if singular:
@@ -294,7 +296,7 @@ class _Run:
         for k in range(8):
             measure.compute_slack(problem.csr_data, x, w)
             x = x - factor.solve(w)
-            relative = self.judge(x)
+            relative = self.judge_iterate(x)
             self.work["refinements"] = k
             if self.is_good() or not relative < 0.5 * previous:
                 break
@@ -302,29 +304,31 @@ class _Run:
         if isinstance(factor, PanelsLU):
             rounded = self.is_good() or self.is_at_floor()
             if not rounded and not self.out_of_time:
-                return self.general(f"{self.notes[0]}; LU by panels did not refine")
+                return self.solve_with_rank_revealing_lu(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.is_good() and singular:
             # The residual of least squares in the metric of D is orthogonal to the range of A.
             measure.compute_slack(problem.csr_data, x, w)
-            proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
+            proof = self.make_infeasibility_claim(-w / problem.csr_data.d) or self.make_infeasibility_claim(
+                factor.compute_left_null_part(problem.b)
+            )
             if proof is not None:
                 return proof
-        return self.make_final_claim()
+        return self.make_claim_for_best_iterate()
 
-    def general(self, why: str) -> Claim:
+    def solve_with_rank_revealing_lu(self, why: str) -> Claim:
         """Solve a linear system again by an LU factorisation that reveals the rank."""
         before = self.work | self.pivot_work
         before.pop("rank", None)  # The rank is not a count; the new decomposition gives it.
-        self.state = _factor_general(self.problem, why)
+        self.state = _factor_by_rank_revealing_lu(self.problem, why)
         self.notes = [self.state.note]
-        assert isinstance(self.state.general, GeneralFactor)
+        assert isinstance(self.state.general, RankRevealingFactor)
         claim = self.solve_linear_with_lu(self.state.general)
-        return replace(claim, work=sum_work((claim.work, before)))
+        return replace(claim, work=sum_work_counts((claim.work, before)))
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
-    def pivoting(self, pivot: PivotState) -> Claim:
+    def run_pivoting_rounds(self, pivot: PivotState) -> Claim:
         """Run rounds of the kernel, continuing where the last run of this state stopped."""
         rows, before = pivot.rows, pivot.rows.n_rounds
         pivot.set_deadline(self.deadline)
@@ -333,59 +337,65 @@ class _Run:
             self.reported = rows.work
         else:
             late = pivot.is_too_late_to_sweep(self.deadline)
-            rows.begin(self.impulse, self.sufficient_residual, 0 if late else pivot.sweeps)
+            rows.set_start(self.impulse, self.sufficient_residual, 0 if late else pivot.sweeps)
             self.state.is_running = True
         while True:
             max_rounds = 0 if late else min(ROUNDS_PER_CHECK, self.max_iter - self.iterations)
-            code, self.late = pivot.advance(self.deadline, max_rounds)
+            code, self.late = pivot.run_rounds(self.deadline, max_rounds)
             self.iterations = rows.n_rounds - before
             if code == SMALL_PIVOT and rows.passes == 0:
                 self.add_singularity_note(pivot, self.patient or pivot.symmetric)
-            proof = self.certificate(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
+            proof = self.make_infeasibility_claim(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
             if proof is not None:
                 return proof
             if rows.is_over or self.must_give_up(code, rows.passes > 0 or not pivot.symmetric):
-                self.offer(rows.best)
-                return self.end(pivot, code)
+                self.store_if_best(rows.best)
+                return self.make_claim_of_final_code(pivot, code)
             if self.iterations >= self.max_iter or self.out_of_time:
-                self.offer(rows.best)
+                self.store_if_best(rows.best)
                 return self.make_out_of_budget_claim()
 
     def must_give_up(self, code: int, is_shifted: bool) -> bool:
         """Return whether the solver stops because it is not patient and pivoting makes no progress."""
         return not self.patient and (code == STUCK or (code == SMALL_PIVOT and is_shifted))
 
-    def end(self, pivot: PivotState, code: int) -> Claim:
+    def make_claim_of_final_code(self, pivot: PivotState, code: int) -> Claim:
         """Return the claim after the final code of the kernel."""
         if code == CYCLING:
-            return self.end_in_cycle()
+            return self.make_cycling_claim()
         if self.problem.law != "linear":
             return (
-                self.make_indefinite_claim(pivot.symmetric) if code == INDEFINITE else self.make_final_claim()
+                self.make_indefinite_claim(pivot.symmetric)
+                if code == INDEFINITE
+                else self.make_claim_for_best_iterate()
             )
         met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
         if code == SOLVED or (code == PASSES_USED and pivot.symmetric and met):
-            return self.make_final_claim()
-        return self.general("A is indefinite" if pivot.symmetric else "A is not symmetric")
+            return self.make_claim_for_best_iterate()
+        return self.solve_with_rank_revealing_lu(
+            "A is indefinite" if pivot.symmetric else "A is not symmetric"
+        )
 
-    def end_in_cycle(self) -> Claim:
+    def make_cycling_claim(self) -> Claim:
         """Return the claim after exchanges that cycle."""
         self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
         if not self.best <= 1.0:
-            self.judge(self.problem.start())
-        return self.make_final_claim()
+            self.judge_iterate(self.problem.start())
+        return self.make_claim_for_best_iterate()
 
     def make_out_of_budget_claim(self) -> Claim:
         """Return the claim after the last iteration or the deadline."""
         if not self.best <= 1.0:
-            self.judge(self.problem.start())
-        return self.claim(Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS)
+            self.judge_iterate(self.problem.start())
+        return self.make_claim(
+            Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS
+        )
 
     def make_indefinite_claim(self, symmetric: bool = True) -> Claim:
         """Return the claim for bounded rows with an A that cannot be factored."""
         why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"
         self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
-        return self.claim(Status.NUMERICAL_ERROR)
+        return self.make_claim(Status.NUMERICAL_ERROR)
 
     def add_singularity_note(self, pivot: PivotState, shifted: bool) -> None:
         """Add a note that A is singular, with its rank for linear systems."""
@@ -396,7 +406,7 @@ class _Run:
         else:
             self.notes.append("A is singular on the free rows" + ": shifted and refined" * shifted)
 
-    def certificate(self, step: FloatArray) -> Claim | None:
+    def make_infeasibility_claim(self, step: FloatArray) -> Claim | None:
         """Return an INFEASIBLE claim if `step` (m,), restricted to the directions that the bounds allow, proves it."""
         c = self.problem.cones
         y = np.where(np.isfinite(c.upper), np.minimum(step, 0.0), step)
@@ -413,7 +423,7 @@ class _Run:
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")
-        return self.claim(Status.INFEASIBLE, certificate=y)
+        return self.make_claim(Status.INFEASIBLE, certificate=y)
 
 
 SPEC = SolverSpec(

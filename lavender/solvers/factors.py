@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.lazy_import import import_numerics, lapack
+from lavender.base.lazy_import import import_numerical_modules, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
@@ -29,7 +29,7 @@ from lavender.solvers.costs import (
     estimate_panel_factor_cost,
 )
 from lavender_ext.factor.linear import LinearSystem
-from lavender_ext.factor.sparse import free_part, is_mirrored
+from lavender_ext.factor.sparse import extract_free_part, has_symmetric_pattern
 
 PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
 # Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
@@ -75,7 +75,7 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
     # A row of a narrow band has at most 2 band + 1 nonzeros.
     if np.diff(problem._compressed[0]).max() <= 2 * MAX_COMPILED_BAND + 1:
         order = find_small_bandwidth_order(problem)
-        band = half_bandwidth_in_order(problem, order)
+        band = compute_half_bandwidth_in_order(problem, order)
         if band <= MAX_COMPILED_BAND:
             return "band", band, order
     return "sparse", m - 1, None
@@ -89,7 +89,7 @@ def find_small_bandwidth_order(problem: Problem) -> IntArray:
     return np.ascontiguousarray(order, np.int32)
 
 
-def half_bandwidth_in_order(problem: Problem, order: IntArray) -> int:
+def compute_half_bandwidth_in_order(problem: Problem, order: IntArray) -> int:
     """Return the half bandwidth of A with its rows in that order."""
     position = np.empty(problem.m, np.int64)
     position[order] = np.arange(problem.m)
@@ -136,14 +136,14 @@ class SparseFactor:
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
-        self.pattern = get_sorted_csr_arrays(mirror_pattern(problem.csr))
+        self.pattern = get_sorted_csr_arrays(make_pattern_symmetric(problem.csr))
         self.all_rows = LinearSystem(self.pattern[:2], USE_WIDE_LANES)
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         indptr, indices, data = self.pattern
         self.system, d = self.all_rows, self.d
         if n_free < self.m:
-            indptr, indices, data = free_part(indptr, indices, data, place, n_free)
+            indptr, indices, data = extract_free_part(indptr, indices, data, place, n_free)
             self.system, d = LinearSystem((indptr, indices), USE_WIDE_LANES), d[place >= 0]
         return self.system.factor(data, d, shift, PIVOT_TOLERANCE)
 
@@ -151,9 +151,9 @@ class SparseFactor:
         return self.system.solve(rhs)
 
 
-def mirror_pattern(matrix: sp.csr_array) -> sp.csr_array:
+def make_pattern_symmetric(matrix: sp.csr_array) -> sp.csr_array:
     """Return the matrix with sorted rows and a symmetric pattern: entries of 0 are added if necessary."""
-    if is_mirrored(*get_sorted_csr_arrays(matrix)[:2]):
+    if has_symmetric_pattern(*get_sorted_csr_arrays(matrix)[:2]):
         return matrix
     a = sp.coo_array(matrix)
     positions = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
@@ -192,7 +192,7 @@ class LUFactor:
         self.sparse = problem.csr.nnz < MIN_DENSE_FRACTION * m * m or m > MAX_DENSE_ROWS
         self.a: Any = scaled if self.sparse else scaled.toarray()
         if self.sparse:
-            import_numerics("scipy.sparse.linalg")
+            import_numerical_modules("scipy.sparse.linalg")
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         self.free = np.flatnonzero(place >= 0)
@@ -240,13 +240,13 @@ class PanelsLU:
     def accepts(problem: Problem) -> bool:
         """Return whether A is sparse with a symmetric pattern."""
         indptr, indices, _ = problem._compressed
-        return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and is_mirrored(indptr, indices)
+        return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and has_symmetric_pattern(indptr, indices)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.system.solve(rhs)
 
 
-class GeneralFactor:
+class RankRevealingFactor:
     """LU factor of D^-1/2 A D^-1/2, with a singular value decomposition if that is singular.
 
     Attributes
@@ -270,7 +270,7 @@ class GeneralFactor:
         norm = np.abs(a).sum(axis=0).max(initial=0.0)
         rcond = lapack.dgecon(lu, norm)[0] if info == 0 and len(a) else float(len(a) == 0)
         if rcond <= PIVOT_TOLERANCE * max(1, len(a)) / 10.0:
-            self._reveal(a)
+            self._decompose_singular_matrix(a)
         else:
             self.lu = (lu, pivot)
 
@@ -280,11 +280,11 @@ class GeneralFactor:
             return
         self.lu = None
         if a.shape[0] <= MAX_DENSE_RANK_ROWS:
-            self._reveal(a.toarray())
+            self._decompose_singular_matrix(a.toarray())
         else:
             self.rank = -1
 
-    def _reveal(self, a: FloatArray) -> None:
+    def _decompose_singular_matrix(self, a: FloatArray) -> None:
         """Decompose a singular A: rank, and least squares of minimum norm in the metric of D."""
         self.dense = a
         u, s, vt = np.linalg.svd(a)
@@ -294,7 +294,7 @@ class GeneralFactor:
         self.svd = (u[:, : self.rank], s[: self.rank], vt[: self.rank])
         self.null = u[:, self.rank :]
 
-    def outside(self, rhs: FloatArray) -> FloatArray:
+    def compute_left_null_part(self, rhs: FloatArray) -> FloatArray:
         """Return the part y of D^-1 rhs with A^T y = 0, from the left singular vectors; 0 if they are not known."""
         if self.dense is None:
             return np.zeros_like(rhs)

@@ -46,7 +46,7 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
         assert problem.compliance is not None
         trees = problem.generalized.trees
         touched = np.isin(trees, np.unique(trees[problem.generalized.jac[rows].indices]))
-        general = problem.generalized.restrict(rows, np.flatnonzero(touched))
+        general = problem.generalized.restrict_to_rows_and_velocities(rows, np.flatnonzero(touched))
         return Problem(b, cones, generalized=general, compliance=problem.compliance[rows], **attributes)
     if problem.rows is None:
         return Problem(b, cones, problem.csr[rows][:, rows], **attributes)

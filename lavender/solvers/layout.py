@@ -1,7 +1,7 @@
 """Copy a problem with its rows in sweep order, so that a sweep reads memory from front to back.
 
-Blocks are in the order of the sweep, and bodies are numbered by `ordering.rank_bodies`. A block reads the same values,
-so the impulses have the same bits; only sums over all rows have another order.
+Blocks are in the order of the sweep, and bodies are numbered by `ordering.number_bodies_by_adjacency`. A block reads
+the same values, so the impulses have the same bits; only sums over all rows have another order.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import FRICTION_LAWS, Problem
-from lavender.problem.ordering import Order, rank_bodies
-from lavender_ext.core.blocks import view_blocks
+from lavender.problem.ordering import Order, number_bodies_by_adjacency
+from lavender_ext.core.blocks import make_blocks_over_arrays
 from lavender_ext.core.problem import Data
 
 # The copy is faster from this many contacts on, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
@@ -51,7 +51,7 @@ class Layout:
         np.take(sweep_impulse, self.position, out=impulse, mode="clip")
 
 
-def is_copy_faster(problem: Problem, order: Order) -> bool:
+def is_reordered_copy_faster(problem: Problem, order: Order) -> bool:
     """Return whether the copy is faster: a large problem with a fixed order other than its own, joints first."""
     rows = problem.rows
     if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < MIN_CONTACTS_FOR_COPY:
@@ -59,7 +59,7 @@ def is_copy_faster(problem: Problem, order: Order) -> bool:
     return bool(np.all(order.blocks[: rows.n_joints] < rows.n_joints))
 
 
-def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
+def copy_problem_in_block_order(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
     """Copy `problem` with its blocks in the order `blocks` (k,), joints first.
 
     `before` is the layout of a problem of the same structure in the same order; its permutations are reused.
@@ -75,7 +75,7 @@ def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = No
         rows = np.arange(problem.m) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
         position = np.empty(problem.m, np.intp)
         position[rows] = np.arange(problem.m)
-        ranks = rank_bodies(problem)
+        ranks = number_bodies_by_adjacency(problem)
     else:
         rows, position, ranks = before.rows, before.position, before.rank
     joint, contact = blocks[:kj], blocks[kj:] - kj
@@ -88,7 +88,10 @@ def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = No
         problem.compliance[rows],
     )  # fmt: skip
     data = Data(
-        view_blocks(*arrays[:7]), arrays[7], FRICTION_LAWS.index(problem.friction), rows=tuple(arrays[8:])
+        make_blocks_over_arrays(*arrays[:7]),
+        arrays[7],
+        FRICTION_LAWS.index(problem.friction),
+        rows=tuple(arrays[8:]),
     )
     return Layout(data, rows, position, ranks)
 

@@ -29,7 +29,7 @@ from lavender.solvers.certify import (
 )
 from lavender.solvers.costs import RATES, Cost, estimate_import_cost, estimate_matrix_setup_cost
 from lavender.solvers.pivoting import PivotState
-from lavender.solvers.polyhedral import count_rows
+from lavender.solvers.polyhedral import bound_converted_row_count
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
@@ -76,7 +76,7 @@ class Lemke(Solver):
         deadline = Deadline(time_limit)
         n, free = _count_dictionary_rows(state.problem)
         # The dictionary is built, and every free row eliminated.
-        if deadline.passed(
+        if deadline.has_passed(
             1e-9 * (RATES["dictionary entry"] + RATES["dictionary elimination"] * free) * n**2
         ):
             return Claim(
@@ -84,7 +84,7 @@ class Lemke(Solver):
             )
         state.set_deadline(deadline)
         paths = lemke.Lemke(state.rows)
-        paths.begin(impulse)
+        paths.set_start(impulse)
         try:
             chunk = max(1, int(CHUNK_TIME / (1e-9 * RATES["dictionary pivot"] * n * n)))
             claim = self._follow_paths(state, paths, max_iter, tol, deadline, chunk)
@@ -115,7 +115,7 @@ class Lemke(Solver):
                 status, message = Status.CONVERGED, ""
             elif code == DONE:
                 status = Status.ROUNDOFF_LIMIT if rows.above_floor <= tol else Status.STALLED
-            elif code == LATE or deadline.passed():
+            elif code == LATE or deadline.has_passed():
                 status = Status.TIME_LIMIT
             elif paths.pivots >= max_iter:
                 status = Status.MAX_ITERATIONS
@@ -137,7 +137,7 @@ def _find_certificate_by_linear_program(
     problem: Problem, tol: float, deadline: Deadline
 ) -> FloatArray | None:
     """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
-    if problem.m > CERTIFICATE_ROWS or deadline.passed(
+    if problem.m > CERTIFICATE_ROWS or deadline.has_passed(
         1e-9 * (RATES["linear program"] + estimate_import_cost("scipy.optimize"))
     ):
         return None
@@ -153,7 +153,7 @@ def _normalise_ray(y: FloatArray) -> FloatArray | None:
 
 def _get_refusal_reason(problem: Problem) -> str | None:
     """Return a reason not to accept the problem if its dictionary is too large, else None."""
-    rows = count_rows(problem)
+    rows = bound_converted_row_count(problem)
     if rows > MAX_LEMKE_ROWS:
         converted = "" if rows == problem.m else f", its friction as bounded rows {rows}"
         return (

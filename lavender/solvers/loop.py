@@ -20,8 +20,8 @@ from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
     judge_impulse,
-    judge_once,
     residual,
+    reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
     INTERRUPTED,
@@ -31,7 +31,7 @@ from lavender.judge.solution import (
     TIME_LIMIT,
     Claim,
     History,
-    sum_work,
+    sum_work_counts,
 )
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
@@ -106,15 +106,15 @@ class Loop:
     pace: float = inf
     judged: Any = None
 
-    def run_once(self, max_iter: int) -> Claim:
+    def run_in_one_call(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""
         start_point = self.impulse.copy()
         watch = Stopwatch()
         try:
             try:
-                claim = self.call(max_iter, self.deadline.remaining(MIN_TIME_LIMIT))
+                claim = self.call_solver(max_iter, self.deadline.get_remaining_seconds(MIN_TIME_LIMIT))
             finally:
-                self.time = watch.seconds - self.recording_time
+                self.time = watch.elapsed_seconds - self.recording_time
             self.done = claim.iterations
             if not self.broken:
                 return claim
@@ -124,7 +124,7 @@ class Loop:
         self.impulse[:] = combine_best_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
 
-    def call(self, max_iter: int, time_limit: float | None) -> Claim:
+    def call_solver(self, max_iter: int, time_limit: float | None) -> Claim:
         """Run at most `max_iter` iterations of the solver; an arithmetic error becomes a NUMERICAL_ERROR claim."""
         try:
             claim = self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
@@ -152,7 +152,7 @@ class Loop:
             if self.deadline.is_set:
                 watch = Stopwatch()
                 self.solver.set_deadline(self.state, self.deadline)
-                self.time += watch.seconds
+                self.time += watch.elapsed_seconds
             if records and self._record_residual():
                 return self._add_to_total_work(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
             while self.done < max_iter:
@@ -160,11 +160,11 @@ class Loop:
                 if records:
                     n = min(n, self.next_record - self.done)
                 watch = Stopwatch()
-                claim = self.call(n, None)
-                elapsed = watch.seconds
+                claim = self.call_solver(n, None)
+                elapsed = watch.elapsed_seconds
                 self.time += elapsed
                 self.done += claim.iterations
-                self.work = sum_work((self.work, claim.work))
+                self.work = sum_work_counts((self.work, claim.work))
                 stopped = records and self.done == self.next_record and self._record_residual()
                 if claim.status is not MAX_ITERATIONS:
                     break
@@ -175,7 +175,7 @@ class Loop:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
                 # An iteration is not started if less than half of it fits.
-                if self.deadline.passed(0.5 * elapsed / claim.iterations):
+                if self.deadline.has_passed(0.5 * elapsed / claim.iterations):
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
@@ -189,16 +189,16 @@ class Loop:
 
     def _choose_chunk_time(self) -> float:
         """Return the intended time of the next chunk [s]."""
-        left = self.deadline.remaining()
+        left = self.deadline.get_remaining_seconds()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
 
-    def restore_better(self, start: FloatArray, or_zero: bool = True) -> None:
+    def replace_by_best_impulse(self, start: FloatArray, or_zero: bool = True) -> None:
         """Replace the result, unless it meets tol, by the best of result, start and zero impulse in each island.
 
         The zero impulse is only considered with `or_zero`.
         """
         problem = self.problem
-        result = judge_once(problem, self.impulse, self.judged)
+        result = reuse_or_judge_impulse(problem, self.impulse, self.judged)
         if result.relative > self.tol:
             result = select_best_impulse(problem, result, start, self.tol, or_zero)
         self.judged = result
@@ -217,7 +217,7 @@ class Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
-        self.judged = judge_once(self.problem, self.impulse, self.judged)
+        self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
         if self.judged.relative > self.tol:
             self.impulse[:] = combine_best_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
@@ -227,7 +227,7 @@ class Loop:
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self.recording_time += watch.seconds
+        self.recording_time += watch.elapsed_seconds
         # Record at 1, 2, ... 16 iterations, then after each eighth more.
         self.next_record = self.done + max(1, self.done >> 3)
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
@@ -237,7 +237,7 @@ class Loop:
             return claim  # There was only one chunk.
         return replace(claim, iterations=self.done, work=self.work)
 
-    def recorded(self) -> History | None:
+    def get_history(self) -> History | None:
         """Return the history, or None if it was not requested."""
         if self.records is None:
             return None

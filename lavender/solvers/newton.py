@@ -39,8 +39,8 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_relative, judge_impulse
-from lavender.judge.solution import Claim, Status, format_work_count, sum_work
+from lavender.judge.residuals import compute_stopping_residual, judge_impulse
+from lavender.judge.solution import Claim, Status, format_work_count, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import (
     Cost,
@@ -48,15 +48,15 @@ from lavender.solvers.costs import (
     count_dense_work,
     estimate_analysis_cost,
     estimate_elimination_cost,
+    estimate_factorisation_count,
     estimate_formation_cost,
     estimate_matrix_setup_cost,
     estimate_newton_cost,
-    get_factorisation_count,
 )
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, use_dense_matrix
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.small import NEWTON, estimate_velocity_cost
+from lavender.solvers.small import NEWTON, estimate_velocity_newton_cost
 from lavender.solvers.warm_start import make_warm_start_claim, warm_start
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED
@@ -121,13 +121,13 @@ class NewtonState:
     def steps(self) -> float:
         """Expected number of iterations; over velocities, an iteration is a step of one island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
-        return get_factorisation_count(self.problem) * islands
+        return estimate_factorisation_count(self.problem) * islands
 
     @property
     def cost(self) -> float:
         """Estimated cost of all iterations [ns]."""
         if self.general is not None:
-            return estimate_velocity_cost(self.problem, self.general.work)
+            return estimate_velocity_newton_cost(self.problem, self.general.work)
         return estimate_newton_cost(self.count, self.problem)
 
 
@@ -169,7 +169,7 @@ class Newton(Solver):
         if problem.generalized is None:
             return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem)
         if self.form != "impulse":
-            return estimate_velocity_cost(problem, 0.0)
+            return estimate_velocity_newton_cost(problem, 0.0)
         entries = min(float(problem.metric.entries_of_matrix), m * m)
         work = 0.0 if entries < 0.5 * m * m else count_dense_work(problem.m)
         count = Count("dense", work, entries, m, estimate_formation_cost(problem, False))
@@ -177,10 +177,10 @@ class Newton(Solver):
 
     def prepare(self, problem: Problem) -> NewtonState:
         """Build the linear system of a problem, or the driver over its velocities."""
-        return self._prepare_form(problem, None)
+        return self._choose_form_and_build_state(problem, None)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
-    def _prepare_form(self, problem: Problem, like: System | None) -> NewtonState:
+    def _choose_form_and_build_state(self, problem: Problem, like: System | None) -> NewtonState:
         """Choose the form and build the state; `like` is a system whose layout may be reused.
 
         Raises
@@ -204,9 +204,9 @@ class Newton(Solver):
             max_cost = (
                 VELOCITY_MAX_COST_RATIO * _estimate_full_matrix_cost(problem) if self.form == "auto" else inf
             )
-            fixed = estimate_velocity_cost(problem, 0.0)
-            kernel = general.prepare(
-                problem, (max_cost - fixed) / (estimate_velocity_cost(problem, 1.0) - fixed)
+            fixed = estimate_velocity_newton_cost(problem, 0.0)
+            kernel = general.prepare_islands(
+                problem, (max_cost - fixed) / (estimate_velocity_newton_cost(problem, 1.0) - fixed)
             )
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
             bodies = find_bodies(problem)  # In this case, interior points over bodies are faster.
@@ -229,7 +229,7 @@ class Newton(Solver):
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
         """Build the state for new numbers; the elimination order is reused between the same bodies."""
-        return self._prepare_form(problem, state.system)
+        return self._choose_form_and_build_state(problem, state.system)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
@@ -273,7 +273,9 @@ class Newton(Solver):
                 is_continued,
                 remaining or SPEC.max_iter,
             )
-        claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, is_continued)
+        claim = general.run_newton_steps(
+            state.problem, state.general, impulse, n, tol, time_limit, is_continued
+        )
         if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
             return Claim(Status.STALLED, claim.iterations, claim.work)
         return claim
@@ -287,7 +289,7 @@ class Newton(Solver):
         the better of the two results on return.
         """
         problem, deadline = state.problem, Deadline(time_limit)
-        claim = general.run(problem, state.general, impulse, max_iter, tol, time_limit)
+        claim = general.run_newton_steps(problem, state.general, impulse, max_iter, tol, time_limit)
         remaining = max_iter - claim.iterations
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
@@ -297,7 +299,7 @@ class Newton(Solver):
         ):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
-        best, above = compute_relative(problem, impulse, w, e, True)
+        best, above = compute_stopping_residual(problem, impulse, w, e, True)
         if above <= tol:
             return claim
         before = impulse.copy()
@@ -305,11 +307,16 @@ class Newton(Solver):
             impulse[:] = problem.start()
         system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
         second = self._run_system(
-            problem, system if system.solve.m else None, impulse, remaining, tol, deadline.remaining(1e-3)
+            problem,
+            system if system.solve.m else None,
+            impulse,
+            remaining,
+            tol,
+            deadline.get_remaining_seconds(1e-3),
         )
-        if not compute_relative(problem, impulse, w, e)[0] <= best:
+        if not compute_stopping_residual(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
-        work = sum_work((claim.work, second.work))
+        work = sum_work_counts((claim.work, second.work))
         form = f"{claim.form}, then {second.form or 'impulse'}"
         total = claim.iterations + second.iterations
         return Claim(second.status, total, work, second.message, form=form, certificate=second.certificate)
@@ -398,16 +405,16 @@ def _run_stages(
     try:
         while True:
             before = solve.done
-            steps = INTERRUPT_CHECK_INTERVAL / max(system.seconds, 1e-6)
-            time_left, watch = deadline.remaining(), Stopwatch()
+            steps = INTERRUPT_CHECK_INTERVAL / max(system.expected_factor_seconds, 1e-6)
+            time_left, watch = deadline.get_remaining_seconds(), Stopwatch()
             if time_left is not None:
                 # The time of the first factorisation is only estimated, so the first call runs a single one.
                 steps = (
-                    min(steps, STAGE_TIME_FRACTION * time_left / max(system.seconds, 1e-9))
+                    min(steps, STAGE_TIME_FRACTION * time_left / max(system.expected_factor_seconds, 1e-9))
                     if solve.done
                     else 1.0
                 )
-                if time_left <= system.seconds:
+                if time_left <= system.expected_factor_seconds:
                     late = True
                     solve.request_stop()
             try:
@@ -416,7 +423,7 @@ def _run_stages(
                 late, end = True, OUTCOMES["spent"]
                 solve.request_stop()
             if solve.done > before:
-                system.record_factor_time(watch.seconds / (solve.done - before))
+                system.record_factor_time(watch.elapsed_seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
                 proven = check_certificate(problem, certificate, tol, deadline) is None

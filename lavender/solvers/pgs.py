@@ -37,7 +37,7 @@ _NONE = np.empty(0, np.int32)
 class PGS(Sweeping):
     """Projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _complete_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
+    def _add_work_to_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
     def _estimate_formation_cost(self, problem: Problem) -> float:

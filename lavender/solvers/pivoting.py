@@ -6,8 +6,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.base.lazy_import import import_numerics
-from lavender.judge.residuals import get_reference
+from lavender.base.lazy_import import import_numerical_modules
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.solvers.costs import (
     RATES,
@@ -25,8 +25,8 @@ from lavender.solvers.factors import (
     LUFactor,
     SparseFactor,
     choose_factorisation,
+    compute_half_bandwidth_in_order,
     find_small_bandwidth_order,
-    half_bandwidth_in_order,
 )
 from lavender_ext.pivot.direct import Pivoting
 
@@ -50,11 +50,11 @@ class TimedFactor:
         """Factor like `Factor.factor`, also without any free row; return -1 if the factorisation was not started."""
         if n_free == 0:
             return 0
-        if self.deadline.passed(self.seconds):
+        if self.deadline.has_passed(self.seconds):
             return -1
         watch = Stopwatch()
         small = self.inner.factor(place, n_free, shift)
-        self.seconds = watch.seconds
+        self.seconds = watch.elapsed_seconds
         return small
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -71,7 +71,7 @@ class PivotState:
         self.problem = problem
         self.symmetric = problem.is_symmetric
         if problem.m > MAX_COMPILED_FACTOR_ROWS:
-            import_numerics()  # Factors and certificates need it.
+            import_numerical_modules()  # Factors and certificates need it.
         factor: Factor | None = None
         if self.symmetric:
             same = like is not None and like.symmetric and _have_same_pattern(like.problem, problem)
@@ -89,7 +89,7 @@ class PivotState:
         self.outside = (
             None if factor is None else TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
         )
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
         # Time [s] of one round with a compiled factor: an estimate with all rows free, then the time of the last round.
         sweep_cost = RATES["symmetric sweep entry"] * problem.csr_data.work  # With its slack [ns].
         self.seconds = 1e-9 * (estimate_band_factor_cost(problem.m, band) + sweep_cost)
@@ -123,9 +123,9 @@ class PivotState:
     def is_too_late_to_sweep(self, deadline: Deadline) -> bool:
         """Return whether the sweeps before the first factor would end after the deadline."""
         cost = self.sweeps * RATES["symmetric sweep entry"] * self.problem.csr_data.work
-        return deadline.passed(1e-9 * cost)
+        return deadline.has_passed(1e-9 * cost)
 
-    def advance(self, deadline: Deadline, max_rounds: int) -> tuple[int, bool]:
+    def run_rounds(self, deadline: Deadline, max_rounds: int) -> tuple[int, bool]:
         """Run at most `max_rounds` rounds that are expected to end before the deadline.
 
         Returns
@@ -133,7 +133,7 @@ class PivotState:
         (int, bool)
             Code of `Pivoting.advance`, and whether no round fits.
         """
-        left, before, watch = deadline.remaining(), self.rows.n_rounds, Stopwatch()
+        left, before, watch = deadline.get_remaining_seconds(), self.rows.n_rounds, Stopwatch()
         if left is None or self.outside is not None:  # `TimedFactor` checks the clock itself.
             return self.rows.advance(max_rounds), max_rounds == 0
         n = int(left / self.seconds)
@@ -141,7 +141,7 @@ class PivotState:
         n = min(max_rounds, max(1, n // 2) if n else 0)
         code = self.rows.advance(n)
         if self.rows.n_rounds > before:
-            self.seconds = watch.seconds / (self.rows.n_rounds - before)
+            self.seconds = watch.elapsed_seconds / (self.rows.n_rounds - before)
         return code, n == 0
 
     def set_deadline(self, deadline: Deadline) -> None:
@@ -159,7 +159,7 @@ class PivotState:
 
 def _estimate_filled_factor_cost(problem: Problem) -> float:
     """Estimate the cost [ns] of a banded LU in an order of small bandwidth, which includes the fill."""
-    width = float(half_bandwidth_in_order(problem, find_small_bandwidth_order(problem)) + 1)
+    width = float(compute_half_bandwidth_in_order(problem, find_small_bandwidth_order(problem)) + 1)
     work = problem.m * min(width * width, count_dense_work(problem.m) / problem.m)
     return float(RATES["dense factor"] * work)
 

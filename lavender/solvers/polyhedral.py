@@ -26,8 +26,8 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_relative
-from lavender.judge.solution import Claim, Status, sum_work
+from lavender.judge.residuals import compute_stopping_residual
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.costs import RATES
@@ -37,7 +37,7 @@ ROWS_RATIO = 3.0  # Assumed number of rows of (1) or (2) per row of the problem.
 
 
 @dataclass(frozen=True)
-class AsRows:
+class BoundedRowForm:
     """A problem with friction and its conversion to bounded rows in z (n,), with lambda = E z.
 
     Parameters
@@ -53,7 +53,7 @@ class AsRows:
     rows: Problem
     to_impulse: sp.csr_array
 
-    def start(self, impulse: FloatArray) -> FloatArray:
+    def convert_start(self, impulse: FloatArray) -> FloatArray:
         """Return a z (n,) of a feasible impulse (m,), or of its projection."""
         c, out = self.problem.cones, []
         x, contact = project_impulse(c, impulse), c.is_contact
@@ -84,7 +84,7 @@ def _list_rows_bounded_by_normals(problem: Problem) -> list[tuple[int, list[tupl
     ]
 
 
-def as_rows(problem: Problem) -> AsRows:
+def convert_to_bounded_rows(problem: Problem) -> BoundedRowForm:
     """Build (1) or (2) of a problem without disks.
 
     Raises
@@ -129,10 +129,10 @@ def as_rows(problem: Problem) -> AsRows:
     except InputError as error:
         # The problem itself is valid. Only sums of its entries are out of range.
         raise OverflowError("A or b, times coefficients of friction, is out of range") from error
-    return AsRows(problem, rows, e)
+    return BoundedRowForm(problem, rows, e)
 
 
-def count_rows(problem: Problem) -> int:
+def bound_converted_row_count(problem: Problem) -> int:
     """Upper bound of the number of rows n of (1) or (2), for a problem without disks."""
     c = problem.cones
     if problem.law == "cone":
@@ -157,11 +157,11 @@ def _normalise_direction(y: FloatArray) -> FloatArray:
 class ConvertedState:
     """State of the inner solver, and the conversion of its rows."""
 
-    form: AsRows
+    form: BoundedRowForm
     state: Any
 
 
-class ThroughRows(Solver):
+class BoundedRowSolver(Solver):
     """Wrapper of a solver of bounded rows that also accepts box friction.
 
     If it does not end at a solution, the solver of its `fallback()` continues.
@@ -187,7 +187,7 @@ class ThroughRows(Solver):
         """Prepare the inner solver for the problem, or for its conversion (1) or (2)."""
         if problem.law in ("linear", "lcp"):
             return self.solver.prepare(problem)
-        form = as_rows(problem)
+        form = convert_to_bounded_rows(problem)
         return ConvertedState(form, self.solver.prepare(form.rows))
 
     def update(self, converted: Any, problem: Problem) -> Any:
@@ -209,7 +209,9 @@ class ThroughRows(Solver):
         if claim.status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             return claim
         workspace = np.empty_like(start), np.empty_like(start)
-        before, after = (compute_relative(converted.form.problem, x, *workspace)[0] for x in (start, impulse))
+        before, after = (
+            compute_stopping_residual(converted.form.problem, x, *workspace)[0] for x in (start, impulse)
+        )
         if before < after:
             impulse[:] = start
         return replace(claim, status=Status.CONVERGED, certificate=None) if before <= tol else claim
@@ -224,7 +226,7 @@ class ThroughRows(Solver):
     ) -> Claim:
         """Run the solver of bounded rows on the converted problem, and its fallback if that solver stalls."""
         form = converted.form
-        z, deadline = form.start(impulse), Deadline(time_limit)
+        z, deadline = form.convert_start(impulse), Deadline(time_limit)
         claim = self.solver.run(converted.state, z, max_iter, tol, time_limit)
         claim = self._convert_claim(form, claim, z, impulse, tol)
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
@@ -232,17 +234,19 @@ class ThroughRows(Solver):
         fallback = self.solver.fallback()
         if fallback is None:
             return claim
-        z = form.start(impulse)
-        second = fallback.run(fallback.prepare(form.rows), z, max_iter, tol, deadline.remaining(1e-3))
+        z = form.convert_start(impulse)
+        second = fallback.run(
+            fallback.prepare(form.rows), z, max_iter, tol, deadline.get_remaining_seconds(1e-3)
+        )
         second = self._convert_claim(form, second, z, impulse, tol)
-        work = sum_work((claim.work, second.work))
+        work = sum_work_counts((claim.work, second.work))
         message = f"{claim.message or 'no exchange helped'}, then complementary pivots"
         return replace(
             second, work=work, message=f"{message}: {second.message}" if second.message else message
         )
 
     def _convert_claim(
-        self, form: AsRows, claim: Claim, z: FloatArray, impulse: FloatArray, tol: float
+        self, form: BoundedRowForm, claim: Claim, z: FloatArray, impulse: FloatArray, tol: float
     ) -> Claim:
         """Convert a claim about z (n,) to one about the problem, and store lambda = E z in `impulse` (m,)."""
         projected = project_impulse(form.problem.cones, form.to_impulse @ z)
@@ -250,7 +254,7 @@ class ThroughRows(Solver):
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
         impulse[:] = projected
         workspace = np.empty_like(projected), np.empty_like(projected)
-        relative, above = compute_relative(form.problem, impulse, *workspace, floor=True)
+        relative, above = compute_stopping_residual(form.problem, impulse, *workspace, floor=True)
         status, message, proof = claim.status, claim.message, None
         if relative <= tol:
             status = Status.CONVERGED

@@ -48,9 +48,9 @@ class Recorder:
     @property
     def time(self) -> float:
         """Time of the solve without recording [s]."""
-        return self.watch.seconds - self.solve.recording_time
+        return self.watch.elapsed_seconds - self.solve.recording_time
 
-    def append(self, solver: str, records: Iterable[Record]) -> None:
+    def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
         """Append the records with more iterations than the last one."""
         assert self.solve.records is not None
         for record in records:
@@ -58,37 +58,41 @@ class Recorder:
                 self.solve.records.append(record)
                 self.solve.record_solvers.append(solver)
 
-    def record(self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None) -> None:
+    def record_impulse(
+        self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
+    ) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
         time = self.time if time is None else time
         watch = Stopwatch()
         r = residual(self.solve.problem, impulse, "float64")
-        self.append(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
-        self.solve.recording_time += watch.seconds
+        self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
+        self.solve.recording_time += watch.elapsed_seconds
 
     def add_loop(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
         """Append the records of a loop that began at this number of iterations and this time [s]."""
         self.solve.recording_time += loop.recording_time
-        self.append(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in loop.records or ()])
+        self.append_later_records(
+            solver, [(iterations + r[0], time + r[1], *r[2:]) for r in loop.records or ()]
+        )
 
     def finish(self, claim: Claim, impulse: FloatArray) -> None:
         """Record the result, an impulse (m,) [N s], unless its number of iterations is recorded already."""
-        self.record(claim.stages[-1].solver if claim.stages else "start", claim.iterations, impulse)
+        self.record_impulse(claim.stages[-1].solver if claim.stages else "start", claim.iterations, impulse)
 
-    def add_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
+    def record_compiled_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
         """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
         problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
         before = self.solve.recording_time
         while claim.iterations > self.records[-1][0]:
             watch = Stopwatch()
-            result, counts = call.attempt(problem, start, tol, cost)
-            seconds = max(watch.seconds, self.records[-1][1])
+            result, counts = call.solve_and_judge(problem, start, tol, cost)
+            seconds = max(watch.elapsed_seconds, self.records[-1][1])
             if result is not None:
-                part = call.claim(problem, counts, start, result.relative)
+                part = call.make_claim(problem, counts, start, result.relative)
                 if part.iterations <= claim.iterations:
                     name = part.stages[-1].solver if part.stages else call.name
-                    self.record(name, part.iterations, result.impulse, seconds)
+                    self.record_impulse(name, part.iterations, result.impulse, seconds)
                 if result.relative <= tol:
                     break
             cost *= SAMPLED_COST_RATIO
-        self.solve.recording_time = before + excluded.seconds
+        self.solve.recording_time = before + excluded.elapsed_seconds

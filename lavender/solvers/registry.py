@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, TypedDict
 from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
-from lavender.base.lazy_import import import_lock, import_locked
+from lavender.base.lazy_import import import_lock, import_module_under_lock
 from lavender.base.renamed import SOLVER_HINTS
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -66,7 +66,7 @@ class SmallCall(Protocol):
     def rules(self) -> Any:
         """Options of the compiled call for matrices and bodies."""
 
-    def attempt(
+    def solve_and_judge(
         self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = ...
     ) -> tuple[Any, Any]:
         """Return (judged result or None, work counts), from `impulse` (m,) [N s] or from the zero impulse.
@@ -74,7 +74,7 @@ class SmallCall(Protocol):
         None is returned if the call did not converge; `max_cost` [ns] limits its estimated cost.
         """
 
-    def claim(
+    def make_claim(
         self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
     ) -> Claim:
         """Build the claim of a call from its counts, its start (m,) and its final relative residual `after`."""
@@ -404,7 +404,7 @@ class SolverSpec:
             return self.factory
         module, _, attribute = self.factory.partition(":")
         try:
-            return getattr(import_locked(module), attribute)
+            return getattr(import_module_under_lock(module), attribute)
         except Exception as error:
             raise SolverUnavailable(
                 f"solver {self.name!r} cannot be imported from {self.factory!r}: {format_error(error)}"
@@ -442,9 +442,9 @@ def _is_importable(module: str) -> bool:
 registered: dict[str, SolverSpec] = {}
 
 
-def load_table(table: str) -> None:
+def register_specs_of_module(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
-    for spec in import_locked(table).SPECS:
+    for spec in import_module_under_lock(table).SPECS:
         registered.pop(
             spec.name, None
         )  # A solver that `get` registered by name moves to its place in the table.
@@ -459,21 +459,21 @@ def _add_own(spec: SolverSpec) -> None:
 def load_all() -> None:
     """Fill `registered` once; other threads wait meanwhile."""
     with import_lock():
-        fill()
+        register_all_solvers()
 
 
 @cache
-def fill() -> None:
+def register_all_solvers() -> None:
     """Fill `registered` with the built-in solvers and the plug-ins."""
     from importlib.metadata import entry_points  # This import takes a tenth of the time of `import lavender`.
 
     for table in TABLES:
-        load_table(table)
+        register_specs_of_module(table)
     for entry in entry_points(group="lavender.solvers"):
         try:
             spec = entry.load()
             spec = spec if isinstance(spec, SolverSpec) else spec()
-            _add(spec, replace=False)
+            _add_spec(spec, replace=False)
             object.__setattr__(spec, "from_entry_point", True)
         # A plug-in may raise any error, which must not prevent the use of lavender.
         except Exception as error:
@@ -491,10 +491,10 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
         `spec` is not a SolverSpec, or the name is in use.
     """
     load_all()
-    _add(spec, check_bool("replace", replace))
+    _add_spec(spec, check_bool("replace", replace))
 
 
-def _add(spec: SolverSpec, replace: bool) -> None:
+def _add_spec(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
     if spec.name in registered and not replace:
@@ -536,7 +536,7 @@ def _register_by_name(name: str) -> SolverSpec | None:
 
     The file of a built-in solver is imported alone, which takes less time than the whole table.
     """
-    own: SolverSpec | None = import_locked(TABLES[0]).get_spec(name)
+    own: SolverSpec | None = import_module_under_lock(TABLES[0]).get_spec(name)
     if own is not None:
         _add_own(own)
         return own

@@ -18,7 +18,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.layout import Layout, copy_in_order, is_copy_faster
+from lavender.solvers.layout import Layout, copy_problem_in_block_order, is_reordered_copy_faster
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
 from lavender_ext.sweep import serial
@@ -35,7 +35,11 @@ class ImpulseState(SweepState):
 
     def __init__(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> None:
         layout, sweeps = (None, None) if earlier is None else (earlier.layout, earlier.sweeps)
-        self.layout = copy_in_order(problem, order.blocks, layout) if is_copy_faster(problem, order) else None
+        self.layout = (
+            copy_problem_in_block_order(problem, order.blocks, layout)
+            if is_reordered_copy_faster(problem, order)
+            else None
+        )
         data, swept = problem.data, order
         if self.layout is not None:
             data = self.layout.data

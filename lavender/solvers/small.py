@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import get_reference, judge_impulse
-from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work
+from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
+from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.costs import (
     RATES,
@@ -88,7 +88,7 @@ def make_limits(
     )
 
 
-def time_fraction(problem: Problem, seconds: float) -> float:
+def get_call_time_fraction(problem: Problem, seconds: float) -> float:
     """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
 
     With at most SMALL_ROWS rows, it may use all of the time. Otherwise the call may fail, so it may use a fraction of
@@ -108,7 +108,7 @@ def time_fraction(problem: Problem, seconds: float) -> float:
     return DECISIONS.time_share if 1e-9 * cost <= DECISIONS.time_share * seconds else 0.0
 
 
-def prepare_call(problem: Problem) -> Any:
+def get_small_call(problem: Problem) -> Any:
     """Return the compiled call of a small problem or of small islands, or None. The call is cached with the problem."""
     call = problem.derived.cache.get(COMPILED_CALL_KEY)
     if call is None:
@@ -127,7 +127,7 @@ def _make_call(problem: Problem) -> Small | None:
         count, label = find_islands(problem)
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > DECISIONS.island_rows:
             return None
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     data = problem.metric
     if len(data.empty) or data.relative_at_zero < 0.0:
         return None
@@ -143,15 +143,15 @@ def call_uses_pivots(problem: Problem) -> bool:
     return problem.law in ("linear", "lcp")
 
 
-def describe_call(problem: Problem) -> str:
+def describe_small_call(problem: Problem) -> str:
     """Describe the solver of the compiled call of `auto`; return an empty text if the call is not made."""
     if problem.generalized is not None:
-        kernel = general.prepare(problem)
+        kernel = general.prepare_islands(problem)
         if kernel is None or AUTO.limits is None:
             return ""
         cost, max_cost = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
         return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
-    small = prepare_call(problem)
+    small = get_small_call(problem)
     if small is None:
         return ""
     if call_uses_pivots(problem):
@@ -199,7 +199,7 @@ class SmallCall:
         """Return the largest accepted cost [ns] of the call over J and M; 0 if the call is never made."""
         return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
 
-    def attempt(
+    def solve_and_judge(
         self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = inf
     ) -> tuple[Any, Any]:
         """Solve from an impulse (m,) [N s] or from the zero impulse.
@@ -229,22 +229,24 @@ class SmallCall:
             return result
         small = problem.derived.cache.get(COMPILED_CALL_KEY)
         if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
-            small = prepare_call(problem)
+            small = get_small_call(problem)
         if not small or not (self.pivots if call_uses_pivots(problem) else self.hands_over):
             return None, ()
         result = small.run(impulse, tol, self.rules, max_cost)
         return result
 
-    def failed_claims(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
+    def list_claims_of_failed_call(
+        self, problem: Problem, counts: tuple[int, ...] | None
+    ) -> list[tuple[str, Claim]]:
         """Return (solver name, claim) for each solver that ran in a failed call, from its counts."""
         if counts is None or not any(counts):  # If the counts are None, the start is the result.
             return []
         if problem.generalized is not None:
-            return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]
+            return [("newton", replace(general.make_claim(Status.STALLED, counts), iterations=0))]
         done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(counts)
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
-    def claim(
+    def make_claim(
         self,
         problem: Problem,
         counts: tuple[int, ...] | None,
@@ -257,7 +259,7 @@ class SmallCall:
         if counts is None:
             return Claim(status, 0, {}, no_work)
         if problem.generalized is not None:
-            claim = general.claim(status, counts)
+            claim = general.make_claim(status, counts)
             if self.name == "newton":
                 return claim
             done, ran = claim.iterations, [("newton", dict(claim.work))]
@@ -278,7 +280,7 @@ class SmallCall:
         return Claim(
             status,
             done,
-            sum_work(stage.work for stage in stages),
+            sum_work_counts(stage.work for stage in stages),
             describe_stages(stages) or no_work,
             stages=stages,
         )
@@ -326,7 +328,7 @@ def _make_stages(
 def describe_stages(stages: Sequence[SolverStage]) -> str:
     """Describe the stages that ran; consecutive stages of one solver are combined."""
     return " -> ".join(
-        describe_work(name, sum_work(stage.work for stage in group))
+        describe_work(name, sum_work_counts(stage.work for stage in group))
         for name, group in groupby(stages, key=lambda stage: stage.solver)
     )
 
@@ -346,7 +348,7 @@ DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", make_limits(inf), False)
 
 
-def estimate_velocity_cost(problem: Problem, work: float) -> float:
+def estimate_velocity_newton_cost(problem: Problem, work: float) -> float:
     """Estimate the cost [ns] of Newton's method over velocities, with `work` multiply-adds to factorise all islands."""
     limits = NEWTON.limits
     assert limits is not None

@@ -13,9 +13,9 @@ from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
     combine_best_islands,
     find_relative_at_zero,
-    judge_once,
+    reuse_or_judge_impulse,
 )
-from lavender.judge.solution import Claim, SolverStage, Status, sum_work
+from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 
@@ -56,21 +56,23 @@ class SolveLog:
         self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
-    def begin(self, start: FloatArray) -> None:
+    def start_from_better_impulse(self, start: FloatArray) -> None:
         """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
-        self.offer(start, is_start=True)
+        self.judge_and_store_best(start, is_start=True)
         if self.best > 1.0:
             self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
-            self.offer(self.problem._start, is_start=True)  # The zero impulse has the residual 1.
+            self.judge_and_store_best(
+                self.problem._start, is_start=True
+            )  # The zero impulse has the residual 1.
 
-    def offer(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
+    def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s], unless `judged` belongs to it, and store it in islands in which it is the best.
 
         No island of `result` has a larger relative residual than an impulse that was offered with `is_start`.
         """
         relative = find_relative_at_zero(self.problem, impulse)
         if relative is None:
-            last = judge_once(self.problem, impulse, self.judged if judged is None else judged)
+            last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
             relative, impulse = float(last.relative), last.impulse
             if relative < self.best:
                 self.judged = last
@@ -80,10 +82,10 @@ class SolveLog:
             starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
             self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
 
-    def note(self, name: str, claim: Claim, before: float) -> None:
+    def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""
         self.iterations += claim.iterations
-        self.work = sum_work((self.work, claim.work))
+        self.work = sum_work_counts((self.work, claim.work))
         self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
         if claim.certificate is not None:
             if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
@@ -103,11 +105,11 @@ class SolveLog:
     @property
     def time_left(self) -> float | None:
         """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
-        return self.deadline.remaining(1e-5)
+        return self.deadline.get_remaining_seconds(1e-5)
 
-    def ends_late(self, cost: float) -> bool:
+    def ends_after_deadline(self, cost: float) -> bool:
         """Return whether a step of this estimated cost [ns] would end after the deadline."""
-        return self.deadline.passed(1e-9 * cost)
+        return self.deadline.has_passed(1e-9 * cost)
 
     @property
     def last_stage_failed(self) -> bool:
@@ -122,7 +124,7 @@ class SolveLog:
         """Return whether the best impulse is at the round-off floor."""
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
-        self.judged = judge_once(self.problem, self.impulse, self.judged)
+        self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
         return bool(self.judged.above_floor <= self.tol)
 
     @property
@@ -134,13 +136,13 @@ class SolveLog:
             return Status.CONVERGED
         if self.is_at_floor():
             return Status.ROUNDOFF_LIMIT
-        if self.timed_out or self.deadline.passed():
+        if self.timed_out or self.deadline.has_passed():
             return Status.TIME_LIMIT
         if self.remaining_iterations <= 0:
             return Status.MAX_ITERATIONS
         return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
 
-    def claim(self) -> Claim:
+    def make_claim(self) -> Claim:
         """Return the claim of the complete solve."""
         status = self.status
         no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
@@ -150,13 +152,13 @@ class SolveLog:
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
-            "; ".join(filter(None, (message, self.failure, *self._conflict_messages()))),
+            "; ".join(filter(None, (message, self.failure, *self._describe_conflict_in_relaxation()))),
             certificate=self.direction if self.certificate is None else self.certificate,
             stages=tuple(self.stages),
             judged=self.judged,
         )
 
-    def _conflict_messages(self) -> list[str]:
+    def _describe_conflict_in_relaxation(self) -> list[str]:
         """Return messages about the conflict in the relaxation and the recommended compliance, if it is unsolved."""
         if self.conflict is None or self.best <= self.tol:
             return []

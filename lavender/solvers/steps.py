@@ -86,7 +86,7 @@ class Step:
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
         self.late = claim.status is Status.TIME_LIMIT
-        log.note(self.name, claim, before)
+        log.record_stage(self.name, claim, before)
 
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the result to the log."""
@@ -94,20 +94,20 @@ class Step:
         if self.state is None:
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
         claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
-        self.offer(claim.judged)
-        self.record(claim)
+        self.store_iterate_in_log(claim.judged)
+        self.record_iterate(claim)
         return claim
 
-    def record(self, claim: Claim) -> None:
+    def record_iterate(self, claim: Claim) -> None:
         """Record the iterate at the end of a stage, if a history is requested."""
         log = self.log
         if log.recorder is not None:
-            log.recorder.record(self.name, log.iterations + claim.iterations, self.impulse)
+            log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
 
-    def offer(self, judged: Any = None) -> None:
+    def store_iterate_in_log(self, judged: Any = None) -> None:
         """Offer the iterate, and the judge's pass over it if there is one, to the log if it is finite."""
         if all_finite(self.impulse):
-            self.log.offer(self.impulse, judged=judged)
+            self.log.judge_and_store_best(self.impulse, judged=judged)
 
 
 class Newton(Step):
@@ -138,8 +138,8 @@ class Newton(Step):
             self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
         )
         self.has_stalled = claim.status is Status.STALLED
-        self.offer(claim.judged)
-        self.record(claim)
+        self.store_iterate_in_log(claim.judged)
+        self.record_iterate(claim)
         return claim
 
 
@@ -150,9 +150,9 @@ class Iterations(Step):
 
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the last and the best iterate to the log."""
-        log, left = self.log, self.log.deadline.remaining()
+        log, left = self.log, self.log.deadline.get_remaining_seconds()
         if self.state is None:
-            self.begin()
+            self.prepare_and_set_start()
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
             deadline=log.deadline if left is None or self.time_fraction == 1.0 else Deadline(self.time_fraction * left),
@@ -160,21 +160,21 @@ class Iterations(Step):
             records=None if log.recorder is None else [],
         )  # fmt: skip
         begun = 0.0 if log.recorder is None else log.recorder.time
-        claim = self.iterate(loop, n)
+        claim = self.run_loop_iterations(loop, n)
         if log.recorder is not None:
             log.recorder.add_loop(self.name, log.iterations, begun, loop)
-        self.offer()
+        self.store_iterate_in_log()
         if log.best > log.tol:
             best, impulse = self.state.best
             if impulse is not None and best < log.best:
-                log.offer(impulse)
+                log.judge_and_store_best(impulse)
         return claim
 
-    def begin(self) -> None:
+    def prepare_and_set_start(self) -> None:
         """Prepare the solver and start from the best impulse of the log."""
         self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
 
-    def iterate(self, loop: Loop, n: int) -> Claim:
+    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n iterations."""
         return loop.run_chunks(n)
 
@@ -182,7 +182,7 @@ class Iterations(Step):
 class Sweeps(Iterations):
     """Sweeps that stop if more than `least` remaining sweeps are predicted.
 
-    With a time limit, they use a part of the remaining time, or all of it in `finish`.
+    With a time limit, they use a part of the remaining time, or all of it in `sweep_until_deadline`.
     """
 
     time_fraction = DECISIONS.time_share
@@ -198,16 +198,16 @@ class Sweeps(Iterations):
             self.predicted = claim.iterations * log(now / tol) / gain if gain > 0.0 else np.inf
         return claim
 
-    def begin(self) -> None:
+    def prepare_and_set_start(self) -> None:
         """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
         p = self.log.problem
-        too_late = self.log.deadline.is_set and self.log.deadline.passed(
+        too_late = self.log.deadline.is_set and self.log.deadline.has_passed(
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
         self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
         self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 
-    def iterate(self, loop: Loop, n: int) -> Claim:
+    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
         first = int(DECISIONS.first_sweeps)
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
@@ -228,13 +228,13 @@ class Sweeps(Iterations):
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
             before = self.log.best
-            self.offer()
+            self.store_iterate_in_log()
             now = self.log.best
             gain = log(before / now) if 0.0 < now < before else 0.0
             if now <= tol or gain * self.least < step * log(now / tol):
                 return claim
 
-    def finish(self) -> None:
+    def sweep_until_deadline(self) -> None:
         """Sweep until the remaining time is used up."""
         self.time_fraction, self.least = 1.0, np.inf
         self.run(np.inf)

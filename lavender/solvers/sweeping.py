@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
@@ -45,7 +45,7 @@ class SweepState:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
         self.order = self.plan = order  # `plan` contains the order of the problem's own blocks.
-        get_reference(problem)
+        get_zero_impulse_reference(problem)
         data.share_reference(problem.metric)  # Residuals in every form are relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)
         # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
@@ -103,9 +103,9 @@ class SweepSolver(Solver):
     ) -> Claim:
         """Run `max_iter` sweeps in one call of the kernel, fewer if a check ends them; tol = 0 disables the checks."""
         status, done, count = state.sweeps.run(state.watch, impulse, max_iter, tol)
-        return self._complete_claim(state, make_claim(status, done), count)
+        return self._add_work_to_claim(state, make_claim(status, done), count)
 
-    def _complete_claim(self, state: Any, claim: Claim, count: int) -> Claim:
+    def _add_work_to_claim(self, state: Any, claim: Claim, count: int) -> Claim:
         """Add solver-specific work to a claim; `count` is the number of fallbacks of exact blocks, or of restarts."""
         return claim
 

@@ -15,7 +15,7 @@ from lavender.judge.solution import CONFIRMED, CONVERGED, TIME_LIMIT, Claim, Sol
 from lavender.problem import Problem
 from lavender.solvers.loop import select_best_impulse
 from lavender.solvers.registry import SMALL_ROWS, SolverSpec
-from lavender.solvers.small import time_fraction
+from lavender.solvers.small import get_call_time_fraction
 from lavender_ext.judge.measure import all_finite
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def solve_small(
         return None, None
     fraction = 1.0
     if limit < math.inf:
-        fraction = time_fraction(problem, limit)
+        fraction = get_call_time_fraction(problem, limit)
         if fraction == 0.0:
             return None, ()
     start = perf_counter()
@@ -67,7 +67,7 @@ def solve_small(
         first = impulse
     else:
         first = problem.impulse_array(impulse)
-    judged, counts = small.attempt(problem, first, tol, COST_PER_SECOND * fraction * limit)
+    judged, counts = small.solve_and_judge(problem, first, tol, COST_PER_SECOND * fraction * limit)
     if judged is None:
         return None, counts
     status = CONVERGED
@@ -78,7 +78,7 @@ def solve_small(
     # The caller may change their own array later.
     start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)
-    solution = Solution.late(
+    solution = Solution.with_late_fields(
         judged.impulse,
         status,
         tol,
@@ -96,11 +96,11 @@ def compute_postponed_fields(
     start: FloatArray | None,
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
-    """Return the fields of the solution of a compiled call that `Solution.late` postpones."""
+    """Return the fields of the solution of a compiled call that `Solution.with_late_fields` postpones."""
     if spec.small is None:  # The solution belongs to a world of `solve_many`.
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
-        claim = spec.small.claim(problem, counts, start, judged.relative, status)
+        claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
     return {
         "residual": make_residual(problem, judged),
         "iterations": claim.iterations,

@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import check_bool, check_float, check_int
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.problem import Problem, check_problem
 from lavender.solvers.costs import (
     estimate_disk_cost,
@@ -50,7 +50,7 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     if (
         problem.rows is not None
         and problem.cones.has_ellipse
-        and deadline.passed(1e-9 * estimate_judge_setup_cost(problem))
+        and deadline.has_passed(1e-9 * estimate_judge_setup_cost(problem))
     ):
         # Even the couplings of bodies, which give the number of entries of A, would take too long.
         return True
@@ -59,15 +59,15 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     if (
         needed > 0.0
         and problem.generalized is None
-        and deadline.passed(needed)
+        and deadline.has_passed(needed)
         and estimate_import_cost("scipy.sparse")
     ):
         watch = Stopwatch()
-        import_numerics()
+        import_numerical_modules()
         # SciPy is imported outside the limit: otherwise no call with this limit would ever have it.
-        deadline.reserve(-watch.seconds)
+        deadline.reserve_seconds(-watch.elapsed_seconds)
         needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
-    return needed > 0.0 and deadline.passed(needed)
+    return needed > 0.0 and deadline.has_passed(needed)
 
 
 def is_tight(problem: Problem, deadline: Deadline) -> bool:
@@ -75,7 +75,7 @@ def is_tight(problem: Problem, deadline: Deadline) -> bool:
 
     Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
     """
-    return deadline.is_set and deadline.passed(1e-9 * get_loose_limit(problem))
+    return deadline.is_set and deadline.has_passed(1e-9 * get_loose_limit(problem))
 
 
 def check_time_limit(time_limit: Any) -> float:
@@ -102,7 +102,7 @@ def make_deadline(spec: SolverSpec, limit: float, begun: float | None = None) ->
         return NEVER
     if spec.external or not spec.builtin:
         spec.load()
-        import_numerics(*(() if spec.external else spec.requires))
+        import_numerical_modules(*(() if spec.external else spec.requires))
         begun = None
     return Deadline(limit, begun)
 

@@ -16,10 +16,10 @@ from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
     divide_by_reference,
-    get_reference,
-    judge_once,
+    get_zero_impulse_reference,
     refine_residual,
     residual,
+    reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
     CONFIRMED,
@@ -79,7 +79,7 @@ def finish(
             problem, (problem._start,), (project_impulse(problem.cones, impulse),), tol
         )
     # Solvers work in float64, whatever the precision of the data.
-    judged = refine_residual(problem, judge_once(problem, impulse, claim.judged), tol)
+    judged = refine_residual(problem, reuse_or_judge_impulse(problem, impulse, claim.judged), tol)
     status, message = claim.status, claim.message
     relative = judged.relative
     if (
@@ -151,7 +151,7 @@ def finish(
         message = _joined(message, describe_islands(judged, tol))
     order = get_order_name(options.get("order", "given")) if spec.order else ""
     impulse.setflags(write=False)
-    return Solution.of(
+    return Solution.from_fields(
         {
             "impulse": impulse,
             "residual": judged,
@@ -188,7 +188,7 @@ def create_unjudged(
     start = problem._start if problem.guess is None else problem.guess
     start = start.copy() if impulse is None else problem.impulse_array(impulse)
     late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
-    return Solution.late(mark_read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
+    return Solution.with_late_fields(mark_read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
 
 
 def judge_late_fields(
@@ -199,7 +199,7 @@ def judge_late_fields(
     solution = finish(disk, spec, options, problem.on_disk(impulse), claim, tol, 0.0, 0.0, None)
     if problem is not disk:
         judged = residual(problem, impulse, "float64")
-        solution = replace(solution.unstretched(problem), residual=judged)
+        solution = replace(solution.convert_from_disk(problem), residual=judged)
     return {name: getattr(solution, name) for name in ("residual", *LATE_FIELDS)}
 
 
@@ -257,7 +257,7 @@ def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
         formed = problem.csr_data
     except InputError:  # A is too large to be formed, so no solver has formed it.
         return False
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     formed.share_reference(problem.metric)
     return bool(Judged(formed, impulse).above_floor <= tol)
 

@@ -11,11 +11,11 @@ from typing import Any
 from lavender.base.arrays import check_float
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import CapabilityError, InputError
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
-from lavender.solvers.auto import Stage, Tree, program_backends
+from lavender.solvers.auto import DecisionTree, Stage, program_backends
 from lavender.solvers.registry import get
-from lavender.solvers.small import describe_call
+from lavender.solvers.small import describe_small_call
 
 MAX_EXPLAINED_STAGES = 6  # Largest number of stages that are listed before the alternation with doubled work.
 
@@ -123,11 +123,11 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
             stages=stages, in_turn=(),
         )  # fmt: skip
     problem = problem.disk  # Equal to the problem if it has no ellipses.
-    get_reference(problem)
-    tree, small = Tree(problem), describe_call(problem)
+    get_zero_impulse_reference(problem)
+    tree, small = DecisionTree(problem), describe_small_call(problem)
     tree.compiled_call_failed = problem.generalized is not None and bool(small)
     stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
-        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.alternate(1.0)),
+        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.iterate_one_round(1.0)),
     )  # fmt: skip

@@ -13,16 +13,16 @@ import numpy as np
 from lavender.base.arrays import ArrayLike, FloatArray, are_equal
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
-from lavender.base.lazy_import import import_numerics
-from lavender.base.renamed import suggest_argument
+from lavender.base.lazy_import import import_numerical_modules
+from lavender.base.renamed import suggest_argument_name
 from lavender.external.foreign import ForeignSolver
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
-    convert_from_disk,
+    convert_residual_from_disk,
     find_relative_at_zero,
-    get_reference,
+    get_zero_impulse_reference,
 )
 from lavender.judge.solution import (
     CONVERGED,
@@ -32,10 +32,10 @@ from lavender.judge.solution import (
     TIME_LIMIT,
     Claim,
     Solution,
-    sum_work,
+    sum_work_counts,
 )
 from lavender.problem import Problem, check_problem
-from lavender.solvers.certify import check_infeasible
+from lavender.solvers.certify import check_infeasibility_claim
 from lavender.solvers.costs import (
     SCIPY_MODULES,
     estimate_import_cost,
@@ -144,7 +144,7 @@ class Prepared:
                     )
                 valid = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
                 kind = f"option of solver {spec.name!r}"
-                raise UnknownName(kind, name, valid, suggest_argument(name, valid))
+                raise UnknownName(kind, name, valid, suggest_argument_name(name, valid))
         self.spec = spec
         self.options = options
         self._original, self.problem = problem, problem if late else problem.disk
@@ -152,7 +152,7 @@ class Prepared:
         # `auto` prepares nothing before its compiled call for small problems.
         if begin and (options or not spec.delegates):
             self._prepare_solver(NEVER)
-        self.setup_time = watch.seconds
+        self.setup_time = watch.elapsed_seconds
 
     solver: Any = None  # Created when it is first needed.
     setup_time = 0.0  # [s]
@@ -171,7 +171,7 @@ class Prepared:
             self.solver = None  # After a failure, the next call tries again.
             raise
         self._is_fresh = True
-        self.setup_time += watch.seconds
+        self.setup_time += watch.elapsed_seconds
 
     def _replace_problem(self, problem: Problem | None, deadline: Deadline = NEVER) -> None:
         """Replace the prepared problem by another one, if one is given, without a set-up."""
@@ -202,7 +202,7 @@ class Prepared:
             No such argument.
         """
         for name in unknown:
-            successor = suggest_argument(name, SOLVE_ARGUMENTS)
+            successor = suggest_argument_name(name, SOLVE_ARGUMENTS)
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS, successor)
         deadline = make_deadline(self.spec, check_time_limit(time_limit))
         if velocity_tol is None:
@@ -233,7 +233,7 @@ class Prepared:
             original = self._original if problem is None else problem
             is_default = max_iter is None and callback is None and history is False
             if failed_call is None and is_default and self.spec.delegates and not self.options:
-                limit = deadline.remaining(MIN_TIME_LIMIT) or math.inf
+                limit = deadline.get_remaining_seconds(MIN_TIME_LIMIT) or math.inf
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
                 if solution is not None:
                     self._replace_problem(problem)
@@ -251,15 +251,15 @@ class Prepared:
                 passes = 2 if start is not None or disk.guess is not None else 1
                 judge_time = 1e-9 * passes * estimate_result_cost(disk)
                 setup_time = 1e-9 * estimate_judge_setup_cost(disk)
-                if deadline.passed(setup_time + judge_time) and not self.spec.external:
+                if deadline.has_passed(setup_time + judge_time) and not self.spec.external:
                     self._replace_problem(problem)
                     return create_unjudged(
                         original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
                     )
-                deadline.reserve(judge_time)
+                deadline.reserve_seconds(judge_time)
                 selection_time = 1e-9 * SELECTION_PASSES * estimate_pass_cost(disk)
-                if self.spec.delegates and not deadline.passed(4.0 * selection_time):
-                    deadline.reserve(selection_time)
+                if self.spec.delegates and not deadline.has_passed(4.0 * selection_time):
+                    deadline.reserve_seconds(selection_time)
             if self.solver is None:
                 self._replace_problem(problem)
                 self._prepare_solver(deadline)
@@ -284,15 +284,15 @@ class Prepared:
         """Build the loop of a solve, and start the worker processes of the solver."""
         problem, original = self.problem, self._original
         if original is not problem and callback is not None:
-            callback = _unstretched_callback(original, original.cones.stretch, callback)
+            callback = _make_callback_in_original_tangents(original, original.cones.stretch, callback)
         if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
-        left = deadline.remaining()
+        left = deadline.get_remaining_seconds()
         if left is not None and not self._is_late and not self._failure:
             watch = Stopwatch()
             self.solver.start_workers(self.state, left)
-            deadline.reserve(-watch.seconds)
-            self.setup_time += watch.seconds
+            deadline.reserve_seconds(-watch.elapsed_seconds)
+            self.setup_time += watch.elapsed_seconds
         records: list[Record] | None = [] if history else None
         return Loop(
             problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, deadline=deadline,
@@ -310,10 +310,15 @@ class Prepared:
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
         elif self._failure:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._failure)
-        elif self._is_late or (loop.deadline.passed() and not spec.external):
+        elif self._is_late or (loop.deadline.has_passed() and not spec.external):
             # If the start is the zero impulse, there is no better one to select, and judging is postponed.
             at_zero = find_relative_at_zero(problem, loop.impulse)
-            if at_zero is not None and at_zero > loop.tol and loop.records is None and loop.deadline.passed():
+            if (
+                at_zero is not None
+                and at_zero > loop.tol
+                and loop.records is None
+                and loop.deadline.has_passed()
+            ):
                 start = loop.impulse
                 if self._original is not problem:
                     start = self._original.cones.stretch * loop.impulse
@@ -322,10 +327,10 @@ class Prepared:
                     self._original, spec, self.options, start, loop.tol, message, setup_time
                 )
             claim = Claim(TIME_LIMIT, 0, {}, SETUP_LATE_MESSAGE)
-            loop.restore_better(loop.impulse)
+            loop.replace_by_best_impulse(loop.impulse)
         else:
             start = loop.impulse.copy()
-            claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
+            claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
                 # `auto` and the checks of sweeps already store the best of each island, including the start.
@@ -334,7 +339,7 @@ class Prepared:
                     claim.status is TIME_LIMIT
                     or not isinstance(getattr(self.state, "watch", None), StoppingTest)
                 ):
-                    loop.restore_better(start, or_zero=claim.status is TIME_LIMIT)
+                    loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
             if (
                 claim.status is TIME_LIMIT
                 and spec.delegates
@@ -344,15 +349,15 @@ class Prepared:
                 claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
         refutation = ""
         if claim.status is INFEASIBLE and (spec.external or not spec.builtin):
-            claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
+            claim, _, refutation = check_infeasibility_claim(problem, claim, loop.tol, loop.deadline)
         if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:
             claim = self._without_infeasible_islands(loop, claim, max_iter)
         claim = replace(claim, judged=loop.judged)
         solution = finish(
-            problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
+            problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.get_history(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
         )  # fmt: skip
-        return solution if self._original is problem else solution.unstretched(self._original)
+        return solution if self._original is problem else solution.convert_from_disk(self._original)
 
     def _without_infeasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
         """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
@@ -372,7 +377,7 @@ class Prepared:
 
     def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
         """Solve with b = 0 on rows that cannot be met, so that other islands get an impulse; return the same claim."""
-        if loop.tol == 0.0 or loop.deadline.passed():
+        if loop.tol == 0.0 or loop.deadline.has_passed():
             return claim
         b, start = self.problem.b.copy(), loop.impulse.copy()
         b[rows] = start[rows] = 0.0
@@ -381,11 +386,14 @@ class Prepared:
         except InputError:  # All other numbers of b are below the smallest that a problem may have.
             return claim
         solution = others.solve(
-            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(MIN_TIME_LIMIT)
+            impulse=start,
+            tol=loop.tol,
+            max_iter=max_iter,
+            time_limit=loop.deadline.get_remaining_seconds(MIN_TIME_LIMIT),
         )
         loop.impulse[:] = combine_best_islands(self.problem, (loop.impulse,), (solution.impulse,), loop.tol)
         loop.time += solution.setup_time + solution.solve_time
-        work = sum_work((claim.work, solution.work))
+        work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
@@ -398,7 +406,7 @@ class Prepared:
             check_accepted(problem, self.spec)
             original, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
-            self.setup_time = watch.seconds
+            self.setup_time = watch.elapsed_seconds
             # These are assigned last, so that a problem does not replace the old one if its set-up raises an error.
             self._original, self.problem = original, problem
         self._is_fresh = False
@@ -410,17 +418,19 @@ class Prepared:
     def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
         """Build the state, or update the state of a problem of the same structure, if its estimated time fits."""
         if problem.metric.reference_energy < 0.0:
-            get_reference(problem)  # The judge computes its reference before a solver gets the problem.
+            get_zero_impulse_reference(
+                problem
+            )  # The judge computes its reference before a solver gets the problem.
         is_new, self._failure = is_new or bool(self._failure), ""
         if deadline.is_set:
-            self._is_late = deadline.passed(1e-9 * self.solver.cost(problem).setup)
+            self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
             if self._is_late and self.solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES):
                 # SciPy is imported outside the limit, like the start of processes: otherwise no call with this limit
                 # would ever have it.
                 watch = Stopwatch()
-                import_numerics()
-                deadline.reserve(-watch.seconds)
-                self._is_late = deadline.passed(1e-9 * self.solver.cost(problem).setup)
+                import_numerical_modules()
+                deadline.reserve_seconds(-watch.elapsed_seconds)
+                self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
             if self._is_late:
                 self.state = None
                 return
@@ -435,17 +445,19 @@ class Prepared:
             self.state, self._failure = None, format_error(error)
 
 
-def _unstretched_callback(problem: Problem, stretch: FloatArray, callback: Callback) -> Callback:
+def _make_callback_in_original_tangents(
+    problem: Problem, stretch: FloatArray, callback: Callback
+) -> Callback:
     """Return a callback for `problem.disk` that calls `callback` with impulse and residual of `problem`."""
 
     def call(done: int, impulse: FloatArray, judged: Residual) -> Any:
-        return callback(done, stretch * impulse, convert_from_disk(problem, judged))
+        return callback(done, stretch * impulse, convert_residual_from_disk(problem, judged))
 
     return call
 
 
 def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
-    """Create the solver; wrap solvers of others (`ForeignSolver`) and own solvers of bounded rows (`ThroughRows`)."""
+    """Create the solver; wrap external ones (`ForeignSolver`) and own ones of bounded rows (`BoundedRowSolver`)."""
     factory = spec.load()
     try:
         solver = factory(**options)
@@ -458,9 +470,9 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
     if spec.box_friction_laws <= spec.laws:
         return solver
     # This module is imported here, because it imports the table of solvers.
-    from lavender.solvers.polyhedral import ThroughRows
+    from lavender.solvers.polyhedral import BoundedRowSolver
 
-    return ThroughRows(solver)
+    return BoundedRowSolver(solver)
 
 
 def same_structure(p: Problem, q: Problem) -> bool:

@@ -51,4 +51,4 @@ def accept_velocity(solution: Solution, velocity_tol: float) -> Solution:
     if solution.status in UNFINISHED and solution.residual.velocity <= velocity_tol:
         values["status"] = Status.CONVERGED
         values["message"] = f"the velocity error of every row is at most {velocity_tol:g} m/s"
-    return Solution.of(values)
+    return Solution.from_fields(values)

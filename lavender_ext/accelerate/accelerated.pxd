@@ -22,7 +22,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
 cdef void restart_acceleration(void* context, const double* lam) noexcept nogil
 cdef double count_undone_steps(const acceleration_t* c) noexcept nogil
 cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil
-cdef void begin_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
+cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil
 
 

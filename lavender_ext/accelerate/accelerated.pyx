@@ -224,7 +224,7 @@ cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) 
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
-cdef void begin_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
+cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil:
     """Turn a started run of sweeps x into an accelerated one, before its first iteration.
 
@@ -260,10 +260,10 @@ cdef class AcceleratedSweeps(Sweeps):
 
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,
                  int convex=0, bint keeps=False):
-        cdef view_t v = p.view()
+        cdef view_t v = p.get_pointers()
         cdef int64_t n = accelerated_workspace_size(v.p.n_rows, count_sweep_velocities(&v), memory)
         self.x.packing.single = True
-        begin_accelerated_sweeps(&self.x, &self.acceleration, memory, convex, keeps,
+        start_accelerated_sweeps(&self.x, &self.acceleration, memory, convex, keeps,
                    self.allocate(p, order, split, mode, rng, exact, exact or convex > 0, n))
 
     cdef double undone(self) noexcept:

@@ -37,7 +37,7 @@ from lavender_ext.core.block_types cimport (
     CONE, blocks_t, is_round_cone_contact, has_independent_rows, get_friction_components, friction_components_t,
 )
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.linear cimport LinearSystem, linear_solve, linear_t
+from lavender_ext.factor.linear cimport LinearSystem, solve_linear_system, linear_t
 from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_strictly_inactive_row
 
 
@@ -82,7 +82,7 @@ cdef inline void solve_shifted_system(const factor_t* f, int32_t m, double* x, d
     cdef int32_t i, k
     cdef double s
     if f.k_ptr == NULL:
-        linear_solve(f.linear, x)
+        solve_linear_system(f.linear, x)
         return
     for i in range(f.linear.n):
         t[i] = 0.0
@@ -90,7 +90,7 @@ cdef inline void solve_shifted_system(const factor_t* f, int32_t m, double* x, d
         s = f.e[i] * x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
             t[f.k_col[k]] += f.k_val[k] * s
-    linear_solve(f.linear, t)
+    solve_linear_system(f.linear, t)
     for i in range(m):
         s = x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
@@ -147,7 +147,8 @@ cdef inline void project_scaled_block(const blocks_t* p, const double* root, int
             z[k] = q.friction_coefficient[g] * s / t[g] * u[k] if t[g] > q.friction_coefficient[g] * s else u[k]
 
 
-cdef inline double friction_shift_of_normal(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
+cdef inline double compute_friction_shift_of_normal(const blocks_t* p, const double* root, int32_t i,
+                                                    const double* y) noexcept nogil:
     """Return the shift s of the normal of contact i."""
     cdef friction_components_t q
     cdef double t[3]
@@ -180,7 +181,7 @@ cdef inline double compute_residual_imbalance(const admm_t* c, double* primal, d
     return primal[0] if primal[0] > dual[0] else dual[0]
 
 
-cdef inline double update_rho(const admm_t* c) noexcept nogil:
+cdef inline double compute_balanced_rho(const admm_t* c) noexcept nogil:
     """Return the rho that balances the last iteration, or the present one if the imbalance is small."""
     cdef double primal, dual, s
     compute_residual_imbalance(c, &primal, &dual)
@@ -269,7 +270,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         if p.law != CONE and c.shifted:
             for i in range(p.n_blocks):
                 if not has_independent_rows(p, i):
-                    c.x[p.ptr[i]] -= friction_shift_of_normal(p, c.root, i, c.y)
+                    c.x[p.ptr[i]] -= compute_friction_shift_of_normal(p, c.root, i, c.y)
         solve_shifted_system(f, m, c.x, c.work)
         c.done += 1.0
         for i in range(m):
@@ -283,7 +284,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             clear_mixing_memory(&c.mixing)
         if c.done >= c.next:
             if c.next > 0.0:
-                rho = update_rho(c)
+                rho = compute_balanced_rho(c)
             c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_UPDATE_INTERVAL else RHO_UPDATE_INTERVAL)
         for i in range(m):
             c.before[i] = c.z[i]
@@ -312,7 +313,7 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
     if p.law != CONE:
         for i in range(p.n_blocks):
             if not has_independent_rows(p, i):
-                c.u[p.ptr[i]] -= friction_shift_of_normal(p, c.root, i, c.y)
+                c.u[p.ptr[i]] -= compute_friction_shift_of_normal(p, c.root, i, c.y)
     for i in range(p.n_rows):
         c.u[i] = c.root[i] * lam[i] + c.u[i] / c.rho
 

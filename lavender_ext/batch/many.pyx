@@ -18,7 +18,7 @@ from lavender_ext.core.problem cimport Data, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
-from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived, judge_task, judge_zero_impulse_of_task,
+from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
                                       judge_task_workspace_size, prepare_task_for_small_call,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport max_newton_cost, estimate_newton_cost, limits_t
@@ -51,7 +51,7 @@ cdef enum:
     INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
 
 
-cdef int set_problem_task(task_t* j, problem) except -1:
+cdef int set_task_from_problem(task_t* j, problem) except -1:
     """Set up a task from a `Problem` of A or of bodies without derived data."""
     cdef Blocks blocks = problem.cones._blocks
     cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
@@ -75,7 +75,7 @@ cdef int set_problem_task(task_t* j, problem) except -1:
     return 0
 
 
-cdef int set_data_task(task_t* j, Data p, start, double* lam, double* slack_error) except -1:
+cdef int set_task_from_data(task_t* j, Data p, start, double* lam, double* slack_error) except -1:
     """Set up a task from the data `p`, with the start `start` (m,) [N s] or the zero impulse if it is None."""
     j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
     j.has_derived = p.ready
@@ -140,7 +140,7 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint had_derived = p.ready
     impulse, results = new(m), new(2 * m + 1)
-    set_data_task(&j, p, start, as_double_pointer(impulse, m), as_double_pointer(results, 2 * m + 1))
+    set_task_from_data(&j, p, start, as_double_pointer(impulse, m), as_double_pointer(results, 2 * m + 1))
     j.cost_limit = max_cost
     with nogil:
         solve_task(&j, &workspace, &islands, &limits.at, tol)
@@ -181,7 +181,7 @@ NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "roundoff_floo
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}
 
 
-cdef enum:                      # results of `Worker.run` other than the index of a deferred world
+cdef enum:                      # results of `Worker.process_worlds` other than the index of a deferred world
     DONE_ALL = -1
     CHECK_CLOCK = -2            # the caller must check the time limit
 
@@ -273,7 +273,7 @@ cdef class Worlds:
         self.v = &velocity[0] if velocity.shape[0] else NULL
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
-    def of_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
+    def set_from_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Set the worlds from arrays that are validated except for their values."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
@@ -299,7 +299,7 @@ cdef class Worlds:
                 wide = arrays[i]
                 self.w.array[i] = &wide[0]
 
-    def of_bodies(self, fields, pairs, int bodies, int joints, int contacts, Blocks blocks, int law):
+    def set_from_bodies(self, fields, pairs, int bodies, int joints, int contacts, Blocks blocks, int law):
         """Set the worlds from bodies: (array, stride from world to world) for each field of `bodies_t` and for the pairs."""
         cdef int32_t i
         self.w.blocks, self.w.general, self.w.factored = blocks.at, False, True
@@ -313,7 +313,7 @@ cdef class Worlds:
             self.w.bodies.pair[i] = as_int_pointer(array, array.size)
         self.w.bodies.n, self.w.bodies.joints, self.w.bodies.contacts = bodies, joints, contacts
 
-    def of_objects(self, list problems, list data, list starts):
+    def set_from_problems(self, list problems, list data, list starts):
         """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
         cdef int64_t i
         cdef task_t* j
@@ -324,10 +324,10 @@ cdef class Worlds:
         for i in range(self.w.n):
             p, j = data[i], &self.tasks[i]
             if p is True:
-                set_problem_task(j, problems[i])
+                set_task_from_problem(j, problems[i])
                 set_task_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
             elif p is not None:
-                set_data_task(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+                set_task_from_data(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
 
     def store_zero_residuals(self, data):
         """Store the residuals of the zero impulse in the data of solved problems."""
@@ -392,7 +392,7 @@ cdef class Worlds:
                self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
         return READY
 
-    cdef int32_t solve(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
+    cdef int32_t solve_world(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
                        double max_cost) noexcept nogil:
         """Solve world i, store its result and return its status."""
         cdef task_t j
@@ -422,7 +422,7 @@ cdef class Worlds:
                 self.tasks[i].zero_residual[k] = j.zero_residual[k]
         return code
 
-    cdef int32_t judge(self, int64_t i, worker_t* h, double tol, bint narrow, bint late) noexcept nogil:
+    cdef int32_t judge_world(self, int64_t i, worker_t* h, double tol, bint narrow, bint late) noexcept nogil:
         """Judge world i without solving, refined for `tol`, and return its status; worlds with empty rows are deferred.
 
         narrow: with the round-off floor of float32. late: problems of A and of bodies are deferred as well, since they are judged
@@ -450,7 +450,7 @@ cdef class Worlds:
             judge_small_impulse(&s, j.lam, j.slack_error, h.small.call.work.real)
             copy_small_judgement(&j, &s)
             j.push = h.small.call.work.real
-        elif (compute_missing_derived(&j) and j.made.n_empty == 0
+        elif (compute_missing_derived_numbers(&j) and j.made.n_empty == 0
               and grow_workspace_to(&h.workspace, 0, max(judge_task_workspace_size(&j), 4 * <int64_t>m + 5 * j.g.n))
               and grow_workspace_to(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and judge_world_zero(&j, h)):
             code, x = READY, h.workspace.real
@@ -505,22 +505,23 @@ cdef class Worker:
         free(self.h.made.marks)
         free(self.h.made.numbers)
 
-    def solve(self, double tol, Limits limits, Rules rules, double max_cost=INFINITY):
+    def solve_worlds(self, double tol, Limits limits, Rules rules, double max_cost=INFINITY):
         """Solve worlds until one is deferred and return its index, or DONE_ALL if there are no more.
 
         Without limits all worlds of J and M are deferred, without rules all others. max_cost: estimated cost [ns] of a
         world at which its current iterate is the result; CHECK_CLOCK is then returned after each world.
         """
-        return self.run(tol, limits, rules, max_cost, 0, False)
+        return self.process_worlds(tol, limits, rules, max_cost, 0, False)
 
-    def judge(self, double tol, bint narrow, bint late=False):
+    def judge_worlds(self, double tol, bint narrow, bint late=False):
         """Judge the impulses of worlds until one is deferred; narrow: with the round-off floor of float32.
 
         late: the worlds keep their starts, because there was no time to solve.
         """
-        return self.run(tol, None, None, INFINITY, LATE if late else READY, narrow)
+        return self.process_worlds(tol, None, None, INFINITY, LATE if late else READY, narrow)
 
-    cdef int64_t run(self, double tol, Limits limits, Rules rules, double max_cost, int32_t judges, bint narrow) except? -3:
+    cdef int64_t process_worlds(self, double tol, Limits limits, Rules rules, double max_cost, int32_t judges,
+                                bint narrow) except? -3:
         """Process worlds until one is deferred; judges: 0 to solve, or the status of judged worlds."""
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
@@ -533,11 +534,11 @@ cdef class Worker:
                 if i >= n:
                     return DONE_ALL
                 if judges:
-                    code = w.judge(i, &self.h, tol, narrow, judges == LATE)
+                    code = w.judge_world(i, &self.h, tol, narrow, judges == LATE)
                     if code == READY:
                         code = judges
                 else:
-                    code = w.solve(i, &self.h, at, small_rules, tol, max_cost)
+                    code = w.solve_world(i, &self.h, at, small_rules, tol, max_cost)
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i

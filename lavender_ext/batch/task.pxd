@@ -13,7 +13,8 @@ from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport island_workspace_integers
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
-from lavender_ext.core.problem cimport DERIVED, lav_compute_body_diagonal, derived_t, compute_derived, compute_csr_derived
+from lavender_ext.core.problem cimport (DERIVED, lav_compute_body_diagonal, derived_t, compute_derived_numbers_of_jacobian,
+                                        compute_derived_numbers_of_csr)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
@@ -169,10 +170,10 @@ cdef inline void judge_task(task_t* j, double tol, double* x) noexcept nogil:
     j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
 
 
-cdef inline bint compute_missing_derived(task_t* j) noexcept nogil:
+cdef inline bint compute_missing_derived_numbers(task_t* j) noexcept nogil:
     """Compute the derived numbers d, Y unless they are known; return whether they are in the valid range."""
     if not j.has_derived:
-        j.has_derived = compute_derived(&j.p, &j.g, &j.made) == DERIVED
+        j.has_derived = compute_derived_numbers_of_jacobian(&j.p, &j.g, &j.made) == DERIVED
     return j.has_derived and find_invalid_number(j.p.d, j.p.n_rows) < 0
 
 
@@ -185,7 +186,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     cdef int32_t m = j.p.n_rows, code = NEEDS_WORKSPACE
     cdef bint soft
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
-    if not compute_missing_derived(j):
+    if not compute_missing_derived_numbers(j):
         return
     if not grow_workspace_to(workspace, 0, 3 * <ssize_t>m + j.g.n):
         return
@@ -230,7 +231,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     j.solved = j.relative <= tol
 
 
-cdef inline bint compute_matrix_derived(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint compute_derived_numbers_of_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute A in compressed rows, d, nu and step in `workspace`; return False without memory."""
     cdef int64_t m = j.p.n_rows, entries = m * m + THIN_PADDING if j.dense != NULL else 0
     cdef double* x
@@ -242,11 +243,11 @@ cdef inline bint compute_matrix_derived(task_t* j, workspace_t* workspace) noexc
         j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
         compress_dense_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.made.n_empty = compute_csr_derived(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
+    j.made.n_empty = compute_derived_numbers_of_csr(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
     return True
 
 
-cdef inline bint compute_body_derived(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint compute_derived_numbers_of_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
@@ -286,7 +287,7 @@ cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_
                  ptr, <int32_t*>j.a.indices, <double*>j.a.data)
     s.over = view_t(j.p, &j.a, NULL, NULL)
     s.over.p.d, s.over.p.nu, s.over.p.step = x, j.p.nu, x + 2 * (m + 1)
-    compute_csr_derived(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
+    compute_derived_numbers_of_csr(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
     return True
 
 
@@ -306,7 +307,10 @@ cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task
     """Set up A or bodies for a solve or the judge; return False to defer the task, as with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
-        j.has_derived = compute_body_derived(j, &workspaces.made) if j.factored else compute_matrix_derived(j, &workspaces.made)
+        if j.factored:
+            j.has_derived = compute_derived_numbers_of_bodies(j, &workspaces.made)
+        else:
+            j.has_derived = compute_derived_numbers_of_matrix(j, &workspaces.made)
     if not j.has_derived or j.made.n_empty:
         return False
     s.v = make_judge_view(j)

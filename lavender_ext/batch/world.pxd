@@ -100,7 +100,7 @@ cdef struct worker_scratch_t:   # of one thread
     double* free                # v* of the current world
 
 
-cdef inline void read_array_entries(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
+cdef inline void convert_entries_to_float64(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
     """Copy n entries of an array to float64."""
     cdef int32_t i
     cdef const float* x = <const float*>w.array[which] + first
@@ -111,7 +111,8 @@ cdef inline void read_array_entries(const worlds_t* w, int32_t which, int64_t fi
         memcpy(out, <const double*>w.array[which] + first, n * sizeof(double))
 
 
-cdef inline const double* read_matrix_entries(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n, int64_t* row,
+cdef inline const double* convert_matrix_to_float64(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n,
+                                                    int64_t* row,
                                   double* out) noexcept nogil:
     """Return a matrix (m, n) in place, or converted from float32 in out (m n); row: stride of its rows."""
     cdef int32_t i
@@ -120,7 +121,7 @@ cdef inline const double* read_matrix_entries(const worlds_t* w, int32_t which, 
     if not w.narrow[which]:
         return <const double*>w.array[which] + first
     for i in range(m):
-        read_array_entries(w, which, first + i * row[0], n, out + <int64_t>i * n)
+        convert_entries_to_float64(w, which, first + i * row[0], n, out + <int64_t>i * n)
     row[0] = n
     return out
 
@@ -251,7 +252,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     ptr, x = d.workspace.index, d.workspace.real
     idx = ptr + m + 1
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
-    a = read_matrix_entries(w, 0, at[JAC], m, n, &row, x + numbers)
+    a = convert_matrix_to_float64(w, 0, at[JAC], m, n, &row, x + numbers)
     entries = compress_dense_rows(a, row, m, n, ptr, idx, x)
     if has_invalid_number(x, entries):
         return BAD
@@ -260,7 +261,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     idx = ptr + n + 1
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
-        a = read_matrix_entries(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
+        a = convert_matrix_to_float64(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
         if has_invalid_number(a, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
@@ -271,7 +272,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
             shared = False
     else:
         row = w.mass_row
-        a = read_matrix_entries(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
+        a = convert_matrix_to_float64(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
         entries = compress_lower_triangle(a, row, w.asymmetry, n, ptr, idx, x)
         if entries < 0 or has_invalid_number(x, entries):
             return BAD
@@ -289,9 +290,9 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     # b = target - J v*
     x += half + 2 * n
     d.free, b, g.compliance = x, x + n, x + n + m
-    read_array_entries(w, 2, at[FREE], n, d.free)
-    read_array_entries(w, 3, at[TARGET], m, b)
-    read_array_entries(w, 4, at[SOFT], m, <double*>g.compliance)
+    convert_entries_to_float64(w, 2, at[FREE], n, d.free)
+    convert_entries_to_float64(w, 3, at[TARGET], m, b)
+    convert_entries_to_float64(w, 4, at[SOFT], m, <double*>g.compliance)
     for j in range(m):
         b[j] -= multiply_jacobian_row(g, j, d.free)
     if find_invalid_magnitude(g.compliance, m) >= 0 or has_invalid_number(d.free, n) or not is_valid_rhs(b, m):
@@ -308,11 +309,11 @@ cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_sc
     if not grow_workspace_to(&d.workspace, k + 1, m + k + <int64_t>m * m):
         return LEFT
     b, row[0] = d.workspace.real, w.jac_row_stride
-    a[0] = read_matrix_entries(w, 0, at[JAC], m, m, row, b + m + k)
+    a[0] = convert_matrix_to_float64(w, 0, at[JAC], m, m, row, b + m + k)
     for j in range(m):
         if has_invalid_number(a[0] + j * row[0], m):
             return BAD
-    read_array_entries(w, 3, at[TARGET], m, b)
+    convert_entries_to_float64(w, 3, at[TARGET], m, b)
     if not is_valid_rhs(b, m):
         return BAD
     return convert_world_blocks(w, at, p, b, d.workspace.index, b + m)
@@ -368,7 +369,7 @@ cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, b
     if has_mu:
         p.mu = mu
     elif w.array[5] != NULL:
-        read_array_entries(w, 5, at[MU], p.n_blocks, mu)
+        convert_entries_to_float64(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
     for k in range(p.n_blocks):
         if find_friction_fault(p, p.kind[k], k) != NO_FAULT:

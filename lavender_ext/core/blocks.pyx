@@ -20,10 +20,10 @@ cdef object new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
-    """Pointers to the arrays of a problem's blocks, which are kept alive: see `copy_to_blocks` and `view_blocks`."""
+    """Pointers to the arrays of a problem's blocks, which are kept alive (`make_blocks_over_arrays`)."""
 
     def __init__(self):
-        raise TypeError("blocks are made by copy_to_blocks or view_blocks")
+        raise TypeError("blocks are made by make_blocks_from_copied_arrays or make_blocks_over_arrays")
 
     @property
     def arrays(self):
@@ -162,7 +162,7 @@ def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
     return True
 
 
-def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
+def make_blocks_from_copied_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Return blocks over a copy of these arrays, whose `fault` is set; None if the arrays need conversion or have NaN bounds."""
     cdef Blocks source = Blocks.__new__(Blocks), blocks
     cdef Py_ssize_t j
@@ -182,7 +182,7 @@ def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
     return blocks
 
 
-def view_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
+def make_blocks_over_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Return blocks that read these arrays in place; raise ValueError if they do not fit each other or have a fault."""
     cdef Blocks blocks = Blocks.__new__(Blocks)
     if not blocks.bind_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling) or not blocks.validate():

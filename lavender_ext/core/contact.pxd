@@ -15,7 +15,7 @@ from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get
                                             count_angular_rows, count_tangent_rows)
 from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport (apply_contact_impulse_changes_to_body, clip_below_zero, clip_to_bound,
-                                        constant_of_type, dot_numbers, number_t, project_disk, compute_relative_angular_velocity)
+                                        convert_to_type_of, dot_numbers, number_t, project_disk, compute_relative_angular_velocity)
 from lavender_ext.core.rows cimport cross
 from lavender_ext.core.view cimport rows_t
 
@@ -89,7 +89,7 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
     cdef int32_t k, spin_row = 1 + nt, rolling_row = 1 + nt + spins
     # relative velocity
     for k in range(3):
-        u[k] = constant_of_type(lam, 0.0)
+        u[k] = convert_to_type_of(lam, 0.0)
     if body_b >= 0:
         u[0] = vb[0] + (vb[4] * arm_b[2] - vb[5] * arm_b[1])
         u[1] = vb[1] + (vb[5] * arm_b[0] - vb[3] * arm_b[2])
@@ -104,7 +104,7 @@ cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number
     slack = dot_numbers(normal, u) + (compliance[0] * lam[0] - b[0])
     normal_impulse = clip_below_zero(lam[0] - slack * step[0])
     change[0] = normal_impulse - lam[0]
-    change[1] = change[2] = change[3] = constant_of_type(lam, 0.0)
+    change[1] = change[2] = change[3] = convert_to_type_of(lam, 0.0)
     lam[0] = normal_impulse
     for k in range(3):
         impulse[k] = change[0] * normal[k]

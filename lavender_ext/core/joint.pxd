@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.numbers cimport clip_number, constant_of_type, number_t
+from lavender_ext.core.numbers cimport clip_number, convert_to_type_of, number_t
 from lavender_ext.core.view cimport rows_t
 
 
@@ -32,8 +32,8 @@ cdef inline void relax_joint(const joint_t* joint, number_t* lam, number_t* va, 
     cdef int32_t row, k
     for row in range(joint.n_rows):
         # slack
-        velocity_a = constant_of_type(lam, 0.0)
-        velocity_b = constant_of_type(lam, 0.0)
+        velocity_a = convert_to_type_of(lam, 0.0)
+        velocity_b = convert_to_type_of(lam, 0.0)
         if joint.body_a >= 0:
             for k in range(6):
                 velocity_a = velocity_a + jac[k] * va[k]

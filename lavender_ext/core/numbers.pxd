@@ -15,7 +15,7 @@ ctypedef fused number_t:
     pair_t
 
 
-cdef inline number_t constant_of_type(const number_t* like, double x) noexcept nogil:
+cdef inline number_t convert_to_type_of(const number_t* like, double x) noexcept nogil:
     """Return x as a number of the type that `like` points at."""
     if number_t is double:
         return x
@@ -75,7 +75,7 @@ cdef inline void compute_relative_angular_velocity(const number_t* va, const num
     """Compute omega_b - omega_a from the velocities (6) of the bodies; a negative body is static."""
     cdef int32_t k
     for k in range(3):
-        omega[k] = constant_of_type(omega, 0.0)
+        omega[k] = convert_to_type_of(omega, 0.0)
         if body_b >= 0:
             omega[k] = vb[3 + k]
         if body_a >= 0:

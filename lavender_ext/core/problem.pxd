@@ -12,7 +12,7 @@ cdef class Workspace:
 cdef Workspace allocate_workspace(Py_ssize_t bytes)
 
 
-cdef enum:                      # results of `compute_derived`
+cdef enum:                      # results of `compute_derived_numbers_of_jacobian`
     DERIVED = 0
     NO_MEMORY = 1
     TOO_MANY = 2
@@ -29,14 +29,14 @@ cdef struct derived_t:          # derived numbers in generalised coordinates; th
     double values               # number of values of Y
 
 
-cdef double count_products(const generalized_t* g, double* on) noexcept nogil
-cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
+cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexcept nogil
+cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
 
 
 cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
                                               int32_t* empty,
                                       double* minv_jac, double* coupling, double* inv_inertia_arm) noexcept nogil
-cdef int32_t compute_csr_derived(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
+cdef int32_t compute_derived_numbers_of_csr(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
                                  int32_t* empty) noexcept nogil
 
 
@@ -56,7 +56,7 @@ cdef class Data:
     cdef object _weight
     cdef list keep
 
-    cdef view_t view(self) noexcept nogil
+    cdef view_t get_pointers(self) noexcept nogil
     cdef void adopt_derived(self, derived_t* derived)
     cdef void store_reference(self, const islands_t* islands, const double* start)
     cdef object get_derived_array(self, int which)

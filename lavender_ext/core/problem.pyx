@@ -92,7 +92,7 @@ cdef public void lav_compute_csr_velocity_weights(const blocks_t* p, double* nu)
     compute_velocity_weights(p, p.d, nu)
 
 
-cdef int32_t compute_csr_derived(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
+cdef int32_t compute_derived_numbers_of_csr(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
                             int32_t* empty) noexcept nogil:
     """Compute d (= p.d), nu and step from a matrix; return the number of empty rows."""
     cdef int32_t n_empty = lav_compute_csr_diagonal(p, a, d, step, empty)
@@ -196,7 +196,7 @@ cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const ge
     return n_empty
 
 
-cdef void bind_derived(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
+cdef void bind_derived_numbers(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
     """Point p and g at the derived numbers."""
     cdef ssize_t k = p.n_blocks, m = p.n_rows
     p.d = derived.numbers
@@ -211,7 +211,7 @@ cdef void bind_derived(blocks_t* p, generalized_t* g, const derived_t* derived) 
     g.cols = g.home + k
 
 
-cdef double count_products(const generalized_t* g, double* on) noexcept nogil:
+cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexcept nogil:
     """Return `Data.entries_of_matrix`; on (n) is scratch: the number of rows of each tree, stored at its root."""
     cdef int32_t b, q, rows
     cdef double out = 0.0, dense = <double>g.m * g.m
@@ -227,7 +227,7 @@ cdef double count_products(const generalized_t* g, double* on) noexcept nogil:
     return out if out < dense else dense
 
 
-cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil:
+cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil:
     """Compute panels, Y, d, nu and step in generalised coordinates, and point p and g at them.
 
     `out` is zero-initialised, or holds the memory of an earlier problem, which is reused. Returns DERIVED, NO_MEMORY or
@@ -271,7 +271,7 @@ cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noex
         while w[2 * <ssize_t>n + b + 1] <= p.ptr[i]:        # prow
             b += 1
         home[i] = b
-    bind_derived(p, g, out)
+    bind_derived_numbers(p, g, out)
     out.n_empty = lav_compute_generalized_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
     return DERIVED
 
@@ -336,7 +336,7 @@ cdef class Data:
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = compute_csr_derived(&self.blocks, &self.csr, d, nu, step, empty)
+            n_empty = compute_derived_numbers_of_csr(&self.blocks, &self.csr, d, nu, step, empty)
         self._numbers = numbers_
         self.empty = _NONE
         if n_empty:
@@ -346,7 +346,7 @@ cdef class Data:
         free(self.derived.marks)
         free(self.derived.numbers)
 
-    cdef view_t view(self) noexcept nogil:
+    cdef view_t get_pointers(self) noexcept nogil:
         """Return pointers into this object, which must outlive them."""
         cdef view_t v = view_t(self.blocks, NULL, NULL, NULL)
         if self.is_general:
@@ -357,7 +357,7 @@ cdef class Data:
             v.a = &self.csr
         return v
 
-    def prepare(self):
+    def compute_derived_numbers(self):
         """Compute d, nu, step and Y in generalised coordinates, unless they are known."""
         cdef derived_t derived = derived_t(NULL, NULL, 0, 0, NULL, 0, 0, 0.0)
         cdef blocks_t blocks = self.blocks
@@ -365,7 +365,7 @@ cdef class Data:
         cdef int32_t end
         if self.ready:
             return
-        end = compute_derived(&blocks, &general, &derived)
+        end = compute_derived_numbers_of_jacobian(&blocks, &general, &derived)
         if end == DERIVED:
             self.adopt_derived(&derived)
             return
@@ -376,7 +376,7 @@ cdef class Data:
         raise MemoryError(f"{derived.values:.3g} entries of M^-1 J^T")
 
     cdef void adopt_derived(self, derived_t* derived):
-        """Take ownership of the result of `compute_derived`; free it if another thread stored the same result first."""
+        """Take ownership of numbers of `compute_derived_numbers_of_jacobian`; free them if another thread was first."""
         cdef int32_t m = self.blocks.n_rows, i
         empty = _NONE
         if derived.n_empty:
@@ -388,7 +388,7 @@ cdef class Data:
                 return
             self.empty = empty
             self.derived = derived[0]
-            bind_derived(&self.blocks, &self.general, derived)
+            bind_derived_numbers(&self.blocks, &self.general, derived)
             self.ready = True
 
     def _set_rows(self, rows):
@@ -493,7 +493,7 @@ cdef class Data:
     def entries_of_matrix(self):
         """Upper bound on the entries of A, from J and M: rows on the same tree are coupled; rows on two trees count twice."""
         cdef double[::1] on = np.empty(self.general.n + 1)
-        return count_products(&self.general, &on[0])
+        return count_gram_matrix_products(&self.general, &on[0])
 
     @property
     def products_of_matrix(self):
@@ -563,7 +563,7 @@ cdef class Data:
 
     def islands(self):
         """Return (number of islands, island of each block (k,)), computed by `find_islands` of core/islands.pxd."""
-        cdef view_t v = self.view()
+        cdef view_t v = self.get_pointers()
         cdef islands_t islands
         cdef Py_ssize_t i, k = self.blocks.n_blocks
         cdef Workspace marks = allocate_workspace(island_workspace_integers(&v) * sizeof(int32_t))

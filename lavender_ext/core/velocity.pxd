@@ -10,7 +10,7 @@ from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.core.view cimport rows_t
 
 
-cdef inline void add6(double* total, const double* x) noexcept nogil:
+cdef inline void add_vector_6(double* total, const double* x) noexcept nogil:
     """Add x (6) to `total`."""
     cdef int32_t k
     for k in range(6):
@@ -30,9 +30,9 @@ cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i,
         for k in range(12):
             x[k] += row[k] * lam[j]
     if a >= 0:
-        add6(f + 6 * a, x)
+        add_vector_6(f + 6 * a, x)
     if b >= 0:
-        add6(f + 6 * b, x + 6)
+        add_vector_6(f + 6 * b, x + 6)
 
 
 cdef inline void add_contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,

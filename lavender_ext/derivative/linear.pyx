@@ -28,7 +28,8 @@ from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLI
                                               form_scaled_generalized, form_reduced_system, linearised_t, linearise_all_projections,
                                               multiply_block_derivatives, natural_t, number_system_rows)
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.factor.linear cimport LU, analyse_dense, linear_factor, linear_solve, linear_solve_transposed
+from lavender_ext.factor.linear cimport (LU, analyse_dense, factor_linear_system_matrix, solve_linear_system,
+                                         solve_transposed_linear_system)
 from lavender_ext.judge.measure cimport (
     residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score, count_judge_scratch,
 )
@@ -109,7 +110,7 @@ cdef public void lav_adjoint(const linearised_t* a, const double* y, const doubl
     for i in range(m):
         if a.system_row[i] >= 0:
             s[a.system_row[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
-    linear_solve_transposed(&a.g, s)
+    solve_transposed_linear_system(&a.g, s)
     for i in range(m):
         q[i] = s[a.system_row[i]] if a.system_row[i] >= 0 else 0.0
     multiply_block_derivatives(&a.x, &v.p, a.x.p, q, True, s)
@@ -213,7 +214,7 @@ cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shif
     analyse_dense(&a.g, n)
     a.g.by, a.g.wide, a.g.matrix, a.g.swap = LU, has_wide(), at, <int32_t*>(at + <ssize_t>n * n)
     form_derivative_system(a, v, shift, at, scratch)
-    if linear_factor(&a.g) == 0:
+    if factor_linear_system_matrix(&a.g) == 0:
         for i in range(n):
             x = 1.0 / fabs(at[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
             smallest = x if x < smallest else smallest
@@ -225,7 +226,7 @@ cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shif
 cdef bint prepare_problem_data(Data p):
     """Prepare p; return False if it has too many entries or d outside the valid range."""
     try:
-        p.prepare()
+        p.compute_derived_numbers()
     except OverflowError:
         return False
     return find_invalid_number(p.blocks.d, p.blocks.n_rows) < 0
@@ -301,7 +302,7 @@ cdef class Linear:
 
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, with A of `data` (compressed rows, or J and M); return whether it is regular."""
-        cdef view_t v = data.view()
+        cdef view_t v = data.get_pointers()
         cdef Workspace spare = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
         self.data, self.factor = data, allocate_workspace(derivative_factor_workspace_size(self.at.rows) * sizeof(double))
         with nogil:
@@ -336,7 +337,7 @@ cdef class Linear:
         """Return G (n, n)."""
         out_ = np.empty((self.at.rows, self.at.rows))
         cdef double[:, ::1] out = out_
-        cdef view_t v = self.data.view()
+        cdef view_t v = self.data.get_pointers()
         cdef Workspace work
         if self.at.rows:
             work = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
@@ -348,9 +349,9 @@ cdef class Linear:
         out_ = r.copy()
         cdef double[::1] out = out_
         if self.at.rows and transpose:
-            linear_solve_transposed(&self.at.g, &out[0])
+            solve_transposed_linear_system(&self.at.g, &out[0])
         elif self.at.rows:
-            linear_solve(&self.at.g, &out[0])
+            solve_linear_system(&self.at.g, &out[0])
         return out_
 
     def multiply_projection_derivative(self, v_, bint transpose=False, bint edge=False):
@@ -438,7 +439,7 @@ cdef class Linears:
             a = self.at + i
             if p is None or not prepare_problem_data(p):
                 continue
-            a.valid, a.v = True, p.view()
+            a.valid, a.v = True, p.get_pointers()
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
             size += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
             scratch = max(scratch, a.v.p.n_rows + count_judge_scratch(&a.v))

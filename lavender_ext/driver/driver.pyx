@@ -8,7 +8,8 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
-from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, rows_workspace_size, rows_start, system_step
+from lavender_ext.newton.solve cimport (bodies_workspace_size, start_newton_over_bodies, rows_workspace_size,
+                                        start_newton_over_rows, step_newton_system)
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 
@@ -17,8 +18,8 @@ cdef inline method_t find_method_functions(const view_t* v) noexcept nogil:
     if v.g != NULL:
         return method_t(islands_workspace_size, start_islands, advance_islands)
     if v.r != NULL:
-        return method_t(bodies_workspace_size, bodies_start, system_step)
-    return method_t(rows_workspace_size, rows_start, system_step)
+        return method_t(bodies_workspace_size, start_newton_over_bodies, step_newton_system)
+    return method_t(rows_workspace_size, start_newton_over_rows, step_newton_system)
 
 
 cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
@@ -60,7 +61,7 @@ cdef class Driver(Method):
     cdef readonly bint fits
 
     def __init__(self, Data data, double max_values=INFINITY, double work=INFINITY):
-        self.data, self.view = data, data.view()
+        self.data, self.view = data, data.get_pointers()
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), max_values
         self.options.work = work
         self.own = find_method_functions(&self.view)

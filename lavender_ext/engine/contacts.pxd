@@ -39,7 +39,7 @@ from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_body
 from lavender_ext.engine.narrow_phase cimport collide_bodies, manifold_t
-from lavender_ext.engine.vectors cimport combine3, copy3, subtract3
+from lavender_ext.engine.vectors cimport linear_combination3, copy3, subtract3
 
 
 cdef inline uint64_t make_contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
@@ -319,13 +319,13 @@ cdef inline void store_contact_cache(engine_t* e) noexcept nogil:
         p[0] = e.impulse[row]
         if nt > 0:
             cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
-            combine3(e.impulse[row + 1], e.tangent + 3 * c, e.impulse[row + 2], t2, p + 1)
+            linear_combination3(e.impulse[row + 1], e.tangent + 3 * c, e.impulse[row + 2], t2, p + 1)
         else:
             p[1] = p[2] = p[3] = 0.0
         size = e.ptr[e.size[N_JOINT] + c + 1] - row
         p[4] = e.impulse[row + 3] if size == 4 or size == 6 else 0.0
         if size > 4:
-            combine3(e.impulse[row + size - 2], e.tangent + 3 * c, e.impulse[row + size - 1], t2, e.cache_roll + 3 * at)
+            linear_combination3(e.impulse[row + size - 2], e.tangent + 3 * c, e.impulse[row + size - 1], t2, e.cache_roll + 3 * at)
         elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
                 e.cache_roll[3 * at + k] = 0.0

@@ -22,7 +22,7 @@ from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
 from lavender_ext.engine.bodies cimport rotate_to_body, rotate_to_world
-from lavender_ext.engine.vectors cimport column3, copy3, subtract3, add_scaled3, scale3
+from lavender_ext.engine.vectors cimport copy_column3, copy3, subtract3, add_scaled3, scale3
 
 
 cdef struct manifold_t:
@@ -257,9 +257,9 @@ cdef inline void build_face_manifold(const double* xr, const double* rr, const d
     cdef int32_t pick[4]
     hx = hr[ax]
     hy = hr[ay]
-    column3(rr, ax, x)
-    column3(rr, ay, y)
-    column3(rr, axis, n)
+    copy_column3(rr, ax, x)
+    copy_column3(rr, ay, y)
+    copy_column3(rr, axis, n)
     scale3(sign, n, n)
     # incident face: the other box's face most antiparallel to n
     rotate_to_body(ro, n, u)
@@ -273,13 +273,13 @@ cdef inline void build_face_manifold(const double* xr, const double* rr, const d
     s = -ho[face] if u[face] > 0.0 else ho[face]
     # corners of the incident face in the frame of the reference face, from its centre and half edges
     subtract3(xo, xr, u)
-    column3(ro, face, c)
+    copy_column3(ro, face, c)
     add_scaled3(u, s, c, c)
     transform_to_face_frame(x, y, n, c, w)
     w[2] -= hr[axis]
     for i in range(2):
         j = fx if i == 0 else fy
-        column3(ro, j, c)
+        copy_column3(ro, j, c)
         scale3(ho[j], c, c)
         transform_to_face_frame(x, y, n, c, more + 3 * i)
     for k in range(3):
@@ -360,7 +360,7 @@ cdef inline int32_t find_support_edge_centre(const double* x, const double* rot,
     for r in range(3):
         if r != axis:
             bits = bits * 2 + (u[r] > 0.0)
-            column3(rot, r, side)
+            copy_column3(rot, r, side)
             add_scaled3(out, sign * (half[r] if u[r] > 0.0 else -half[r]), side, out)
     return bits
 
@@ -379,8 +379,8 @@ cdef inline void build_edge_manifold(const double* xa, const double* ra, const d
     bits = 4 * find_support_edge_centre(xa, ra, ha, i, n, 1.0, p)
     bits += find_support_edge_centre(xb, rb, hb, j, n, -1.0, q)
     subtract3(q, p, d)
-    column3(ra, i, along_a)
-    column3(rb, j, along_b)
+    copy_column3(ra, i, along_a)
+    copy_column3(rb, j, along_b)
     u = dot3(along_a, along_b)
     v = dot3(along_a, d)
     w = dot3(along_b, d)
@@ -467,8 +467,8 @@ cdef inline void collide_box_box(const double* xa, const double* ra, const doubl
                     edge_j = j
     # manifold on the axis of least penetration
     if edge_i >= 0 and edge > best + tol + 0.05 * fabs(best):
-        column3(ra, edge_i, n)
-        column3(rb, edge_j, l)
+        copy_column3(ra, edge_i, n)
+        copy_column3(rb, edge_j, l)
         cross(n, l, m.normal)
         length = sqrt(dot3(m.normal, m.normal))
         s = 1.0 / length if dot3(m.normal, d) >= 0.0 else -1.0 / length

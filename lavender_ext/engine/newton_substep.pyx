@@ -25,9 +25,9 @@ from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport find_reference, score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.newton.solve cimport bodies_start, bodies_workspace_size, system_step
-from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, band_width,
-                                             bind_warm_workspace, judge_impulse, measure_as_engine, warm_solve,
+from lavender_ext.newton.solve cimport start_newton_over_bodies, bodies_workspace_size, step_newton_system
+from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, compute_joint_bandwidth,
+                                             bind_warm_workspace, judge_impulse, measure_as_engine, solve_from_warm_start,
                                              warm_t, warm_workspace_size, zero_impulse_errors)
 
 
@@ -84,7 +84,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     if all_stages and bodies_workspace_size(&v, NULL, &n):
         scratch[1] = <int32_t>(available - own_index_size(&v))
         n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
-        bodies_start(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
+        start_newton_over_bodies(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
         if n.is_bound:
             needed = n.n_real
         elif scratch[1] < n.n_index < INDEX_LIMIT - own_index_size(&v):
@@ -92,18 +92,18 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
             return SCRATCH_TOO_SMALL
         else:
             scratch[1] = 0                              # The factor has too many entries: only the first phase runs.
-    scratch[0] = band_width(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
+    scratch[0] = compute_joint_bandwidth(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
     needed += warm_workspace_size(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
     return <int32_t>needed if needed < INDEX_LIMIT else -1
 
 
 cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
-    """Run Newton's method after `warm_solve`, also from lam = 0; return UNDECIDED with the best lam if it does not reach tol."""
+    """Run Newton's method after `solve_from_warm_start`, also from lam = 0; return UNDECIDED with the best lam above tol."""
     cdef info_t said
-    cdef int32_t result = bodies_start(problem, o, workspace, lam)
+    cdef int32_t result = start_newton_over_bodies(problem, o, workspace, lam)
     while result == MORE or result == CERTIFICATE:
-        result = system_step(problem, o, workspace, 1, lam, &said)
+        result = step_newton_system(problem, o, workspace, 1, lam, &said)
         s.factorisations = said.factorisations
         if s.trace != NULL:
             judge_impulse(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
@@ -114,7 +114,7 @@ cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o,
 cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
                                    int32_t* scratch, double* workspace, double* lam, double* v) noexcept nogil:
     """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
-    cdef int32_t j, result = warm_solve(p, r, s, tol, lam, v, 1)
+    cdef int32_t j, result = solve_from_warm_start(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef view_t problem
     cdef options_t o

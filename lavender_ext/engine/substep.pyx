@@ -354,7 +354,7 @@ cdef class Buffers:
         self.workspace = np.empty(packed_workspace_size(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MAX_PACKED_BLOCKS else 1)
 
-    def pairs(self):
+    def count_broad_phase_pairs(self):
         """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""
         cdef int32_t n
         with nogil:
@@ -362,7 +362,7 @@ cdef class Buffers:
             n = update_pair_list(&self.e)
         return n
 
-    def prepare(self):
+    def prepare_substep(self):
         """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
         cdef int32_t status
         with nogil:
@@ -374,14 +374,14 @@ cdef class Buffers:
         with nogil:
             run_stepper(&self.e, sweeps, NULL, NULL, NULL)
 
-    def solve_watched(self, double[:, ::1] curve):
+    def sweep_and_record_errors(self, double[:, ::1] curve):
         """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
             run_stepper(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
 
-    def apply(self):
+    def apply_impulses(self):
         """Compute dv and the final error of impulses that another solver has written."""
         cdef blocks_t p
         cdef rows_t r
@@ -390,14 +390,14 @@ cdef class Buffers:
             compute_velocity_change(&p, &r, self.e.impulse, self.e.dv)
             measure_contact_errors(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
 
-    def finish(self):
+    def finish_substep(self):
         """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
         cdef int32_t status
         with nogil:
             status = finish_substep(&self.e)
         return status
 
-    def substeps(self, int32_t n):
+    def run_substeps(self, int32_t n):
         """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:

@@ -33,14 +33,14 @@ cdef inline void add_scaled3(const double* x, double s, const double* y, double*
         out[k] = x[k] + s * y[k]
 
 
-cdef inline void combine3(double s, const double* x, double t, const double* y, double* out) noexcept nogil:
+cdef inline void linear_combination3(double s, const double* x, double t, const double* y, double* out) noexcept nogil:
     """Compute out = s x + t y."""
     cdef int32_t k
     for k in range(3):
         out[k] = s * x[k] + t * y[k]
 
 
-cdef inline void column3(const double* matrix, int32_t j, double* out) noexcept nogil:
+cdef inline void copy_column3(const double* matrix, int32_t j, double* out) noexcept nogil:
     """Copy column j of a matrix (3, 3), axis j of a body's frame, to out."""
     cdef int32_t k
     for k in range(3):

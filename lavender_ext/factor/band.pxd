@@ -8,7 +8,7 @@ c[i, t] c[i, 0]. The method is right-looking: one division, one product and one 
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.factors cimport no_pivots, pivots_t
+from lavender_ext.factor.factors cimport clear_pivot_statistics, pivots_t
 
 
 cdef enum:
@@ -16,7 +16,7 @@ cdef enum:
     NEGATIVE_PIVOT_RATIO = 100000000
 
 
-cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
+cdef inline double invert_pivot_or_count_it(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
     """Return 1 / p, or 0 for a small pivot, and count small and negative pivots."""
     if p < out.least * size:
         out.least = p / size
@@ -31,18 +31,18 @@ cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, 
     return 1.0 / p
 
 
-cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny, double* x,
+cdef inline void factor_tridiagonal_ldl(int32_t n, double* c, const double* size, double tiny, double* x,
                               pivots_t* out) noexcept nogil:
     """Factor a tridiagonal matrix by (1) from both ends to the middle row h (twisted factorisation).
 
     The two chains of divisions are independent. c[2 i] becomes 1 / p_i, and the off-diagonals stay. If x is not NULL, the first
-    half of `ldl_solve_2` is applied to it while the divisions run.
+    half of `solve_tridiagonal_ldl` is applied to it while the divisions run.
     """
     cdef int32_t i = 0, j = n - 1, h = n // 2
     cdef double p = c[0], r = c[2 * (n - 1)], off
     while i < h or j > h:
         if i < h:
-            p = inverse_pivot(p, size[i], i, tiny, out)
+            p = invert_pivot_or_count_it(p, size[i], i, tiny, out)
             c[2 * i] = p
             off = c[2 * i + 1]
             if x != NULL:
@@ -50,7 +50,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
             p = (c[2 * i + 2] if i + 1 < h else 0.0) - off * off * p
             i += 1
         if j > h:
-            r = inverse_pivot(r, size[j], j, tiny, out)
+            r = invert_pivot_or_count_it(r, size[j], j, tiny, out)
             c[2 * j] = r
             off = c[2 * j - 1]
             if x != NULL:
@@ -63,11 +63,11 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
         off += p
     if h < n - 1:
         off += r
-    c[2 * h] = inverse_pivot(off, size[h], h, tiny, out)
+    c[2 * h] = invert_pivot_or_count_it(off, size[h], h, tiny, out)
 
 
-cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogil:
-    """Apply the second half of `ldl_solve_2` to x, from the middle to both ends."""
+cdef inline void back_substitute_tridiagonal_ldl(int32_t n, const double* c, double* x) noexcept nogil:
+    """Apply the second half of `solve_tridiagonal_ldl` to x, from the middle to both ends."""
     cdef int32_t h = n // 2, i = h - 1, j = h + 1
     x[h] *= c[2 * h]
     while i >= 0 or j < n:
@@ -79,8 +79,8 @@ cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogi
             j += 1
 
 
-cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nogil:
-    """Overwrite x (n) with the solution of the tridiagonal system of `ldl_factor_2`."""
+cdef inline void solve_tridiagonal_ldl(int32_t n, const double* c, double* x) noexcept nogil:
+    """Overwrite x (n) with the solution of the tridiagonal system of `factor_tridiagonal_ldl`."""
     cdef int32_t i = 0, j = n - 1, h = n // 2
     while i < h or j > h:
         if i < h:
@@ -89,14 +89,14 @@ cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nog
         if j > h:
             x[j - 1] -= c[2 * j - 1] * c[2 * j] * x[j]
             j -= 1
-    ldl_back_2(n, c, x)
+    back_substitute_tridiagonal_ldl(n, c, x)
 
 
-cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t height, double* c, const double* size,
+cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t height, double* c, const double* size,
                              double tiny, double* x, pivots_t* out) noexcept nogil:
     """Apply (1) to columns begin ... end - 1, of `height` rows, or down to row end - 1 if that is 0.
 
-    If x is not NULL, `ldl_forward` is applied to it as well.
+    If x is not NULL, `forward_substitute_band_ldl` is applied to it as well.
     """
     cdef int32_t i, s, t, last
     cdef double inv, l
@@ -104,7 +104,7 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
     cdef double* to
     for i in range(begin, end):
         col = c + <int64_t>i * width
-        inv = inverse_pivot(col[0], size[i], i, tiny, out)
+        inv = invert_pivot_or_count_it(col[0], size[i], i, tiny, out)
         if inv == 0.0:
             for t in range(width):
                 col[t] = 0.0
@@ -127,25 +127,25 @@ cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
     return n - width + 1 if n >= width > 0 else 0
 
 
-cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
+cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
                             pivots_t* out) noexcept nogil:
     """Factor by (1); pivots are compared with size (n) > 0.
 
-    If x is not NULL, the first half of `ldl_solve` is applied to it, which is hidden by the latency of the divisions.
+    If x is not NULL, the first half of `solve_band_ldl` is applied to it, which is hidden by the latency of the divisions.
     """
     cdef int32_t full = full_columns(n, width)
-    no_pivots(out)
+    clear_pivot_statistics(out)
     if width == 2:
-        ldl_factor_2(n, c, size, tiny, x, out)
+        factor_tridiagonal_ldl(n, c, size, tiny, x, out)
         return
     if width == 6:                                      # Chains of joints with three rows have this width: constant loop bounds.
-        ldl_columns(0, full, 6, 6, c, size, tiny, x, out)
+        factor_band_ldl_columns(0, full, 6, 6, c, size, tiny, x, out)
     else:
-        ldl_columns(0, full, width, width, c, size, tiny, x, out)
-    ldl_columns(full, n, width, 0, c, size, tiny, x, out)
+        factor_band_ldl_columns(0, full, width, width, c, size, tiny, x, out)
+    factor_band_ldl_columns(full, n, width, 0, c, size, tiny, x, out)
 
 
-cdef inline void ldl_forward(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
+cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                              double* x) noexcept nogil:
     """Solve with L for columns begin ... end - 1."""
     cdef int32_t i, t, last
@@ -159,7 +159,7 @@ cdef inline void ldl_forward(int32_t begin, int32_t end, int32_t width, int32_t 
             x[i + t] -= col[t] * y
 
 
-cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
+cdef inline void back_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                           double* x) noexcept nogil:
     """Solve with D L^T for columns end - 1 ... begin."""
     cdef int32_t i, t, last
@@ -174,28 +174,28 @@ cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t hei
         x[i] = y * col[0]
 
 
-cdef inline void ldl_back_all(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
-    """Apply the second half of `ldl_solve` to x (n)."""
+cdef inline void back_substitute_all_band_ldl(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
+    """Apply the second half of `solve_band_ldl` to x (n)."""
     cdef int32_t full = full_columns(n, width)
     if width == 2:
-        ldl_back_2(n, c, x)
+        back_substitute_tridiagonal_ldl(n, c, x)
         return
-    ldl_back(full, n, width, 0, c, x)
+    back_substitute_band_ldl(full, n, width, 0, c, x)
     if width == 6:
-        ldl_back(0, full, 6, 6, c, x)
+        back_substitute_band_ldl(0, full, 6, 6, c, x)
     else:
-        ldl_back(0, full, width, width, c, x)
+        back_substitute_band_ldl(0, full, width, width, c, x)
 
 
-cdef inline void ldl_solve(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
+cdef inline void solve_band_ldl(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
     """Overwrite x (n) with (L D L^T)^-1 x; components of small pivots become 0."""
     cdef int32_t full = full_columns(n, width)
     if width == 2:
-        ldl_solve_2(n, c, x)
+        solve_tridiagonal_ldl(n, c, x)
         return
     if width == 6:
-        ldl_forward(0, full, 6, 6, c, x)
+        forward_substitute_band_ldl(0, full, 6, 6, c, x)
     else:
-        ldl_forward(0, full, width, width, c, x)
-    ldl_forward(full, n, width, 0, c, x)
-    ldl_back_all(n, width, c, x)
+        forward_substitute_band_ldl(0, full, width, width, c, x)
+    forward_substitute_band_ldl(full, n, width, 0, c, x)
+    back_substitute_all_band_ldl(n, width, c, x)

@@ -7,10 +7,10 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.factor.factors cimport block_matrix_t, supernodal_t
-from lavender_ext.factor.supernodal cimport begin_supernodes, factor_supernode, panel_width, rows_below, set_local_rows
+from lavender_ext.factor.supernodal cimport clear_descendant_lists, factor_supernode, panel_width, rows_below, set_local_rows
 
 
-cdef inline void fill_panels(const block_matrix_t* f, int32_t lu) noexcept nogil:
+cdef inline void copy_blocks_to_panels(const block_matrix_t* f, int32_t lu) noexcept nogil:
     """Copy the blocks of N to the panels of its factor, and set all other entries of the panels to 0."""
     cdef const supernodal_t* p = &f.factor
     cdef int32_t k, q, r, c, i, s = f.s
@@ -49,8 +49,8 @@ cdef inline int32_t factor_blocks(const block_matrix_t* f, int32_t lu) noexcept 
     """Factor N = L L^T, or L U with row exchanges inside panels; return the number of pivots lost to rounding."""
     cdef const supernodal_t* p = &f.factor
     cdef int32_t i, lost = 0
-    begin_supernodes(p)
-    fill_panels(f, lu)
+    clear_descendant_lists(p)
+    copy_blocks_to_panels(f, lu)
     for i in range(p.supernodes):
         set_local_rows(p, i)
         lost += factor_supernode(p, i, lu, NULL, 0.0)

@@ -10,7 +10,8 @@ largest entries of their columns.
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.factor.panels cimport (LU_STRIP, cholesky_panel, gemm_subtract_lower, gemm_subtract_nonzeros, lu_panel,
+from lavender_ext.factor.panels cimport (LU_STRIP, factor_panel_by_cholesky, gemm_subtract_lower, gemm_subtract_nonzeros,
+                                         factor_panel_by_lu,
                                          swap_entries)
 from lavender_ext.factor.tiles cimport axpy_subtract
 
@@ -55,7 +56,7 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, con
             p += PANEL_COLUMNS
         if min_pivot != NULL:
             bound = min_pivot + k
-        lost += cholesky_panel(wide, w, n - k, panel, bound)
+        lost += factor_panel_by_cholesky(wide, w, n - k, panel, bound)
         if lost and min_pivot == NULL:
             return lost
         k += PANEL_COLUMNS
@@ -95,7 +96,7 @@ cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, 
     cdef double upper[PANEL_COLUMNS * LU_STRIP]
     while k < n:
         w = PANEL_COLUMNS if k + PANEL_COLUMNS <= n else n - k
-        lost = lu_panel(wide, w, n - k, n - k, a + <int64_t>k * (n + 1), n, swap + k, min_pivot, upper)
+        lost = factor_panel_by_lu(wide, w, n - k, n - k, a + <int64_t>k * (n + 1), n, swap + k, min_pivot, upper)
         if lost:
             return lost
         # Exchange the rows of the earlier columns.

@@ -22,7 +22,7 @@ cdef struct pivots_t:
     int32_t first_small         # index of the first small pivot, or -1
 
 
-cdef inline void no_pivots(pivots_t* out) noexcept nogil:
+cdef inline void clear_pivot_statistics(pivots_t* out) noexcept nogil:
     """Set the statistics of a factorisation without pivots."""
     out.small = 0
     out.negative = 0

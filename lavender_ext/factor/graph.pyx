@@ -9,7 +9,7 @@ from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
 
-def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
+def order_by_minimum_degree(const int32_t[::1] ptr, const int32_t[::1] near):
     """Return the vertices (n,) in an elimination order. near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i itself."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
     cdef double[::1] scratch = np.empty(order_workspace_size(n, all_) // 2 + 1)
@@ -23,7 +23,7 @@ def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
     return order_array
 
 
-def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const int32_t[::1] indptr,
+def find_matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const int32_t[::1] indptr,
                       const int32_t[::1] indices):
     """Return (number of components, label (k,)) of the blocks of a matrix in compressed rows; block (m,) has each row's block."""
     cdef int32_t i, j, q, k = <int32_t>ptr.shape[0] - 1, count = 0
@@ -43,7 +43,7 @@ cdef enum:
     MAX_BODY_VELOCITIES = 6     # A body has at most six velocities.
 
 
-def bodies_in(Data p, order):
+def find_bodies_of_velocities(Data p, order):
     """Group velocities of J and M to bodies of which each block touches at most two.
 
     A body is a run of at most six velocities, in the given order, of which neighbours are mostly in the same panels of Y.
@@ -60,7 +60,7 @@ def bodies_in(Data p, order):
         Bodies of each block, -1 if it touches fewer; number of bodies; 6 times the body of each velocity plus its index in it.
         None if a block touches more than two.
     """
-    p.prepare()
+    p.compute_derived_numbers()
     cdef const generalized_t* g = &p.general
     cdef int32_t i, b, c, q, t, last = -1, size = 0, n = 0, k = p.blocks.n_blocks
     cdef int32_t[::1] given = np.arange(g.n, dtype=np.int32) if order is None else np.argsort(order).astype(np.int32)

@@ -8,11 +8,11 @@
     TREE     rows of kinematic trees                      L^T D L                                             core/tree.pxd
 
     analyse     `analyse_dense`, ... set kind, order, pattern and cost; of ROWS and BLOCKS `LinearSystem` and `analyse_blocks`
-    factor      `linear_factor` factors A + shift D and returns the number of lost pivots                           (1)
-    solve       `linear_solve`; `linear_solve_checked` refines, and uses the fallback if (3) fails
-    multiply    `linear_multiply`                                                                                    (2)
+    factor      `factor_linear_system_matrix` factors A + shift D and returns the number of lost pivots               (1)
+    solve       `solve_linear_system`; `solve_linear_system_checked` refines, and uses the fallback if (3) fails
+    multiply    `multiply_by_system_matrix`                                                                                    (2)
     cost        multiply-adds of a factorisation, known after the analysis; L U takes twice those of L L^T
-    sign        `linear_sign`, of det A
+    sign        `compute_determinant_sign`, of det A
 
 D = diag(d), or the identity if d is NULL. A pivot is lost if it does not exceed tiny d. L U of DENSE and ROWS is that of
 D^-1/2 A D^-1/2. Exchanges within supernodes may lose digits that exchanges between all rows keep. A solution must satisfy
@@ -50,7 +50,7 @@ cdef struct fallback_t:         # factorisation by the caller
 cdef struct linear_t:
     int32_t kind
     int32_t n
-    int32_t by                  # factorisation that the next `linear_factor` computes: CHOLESKY, LU or CHOLESKY_OR_LU
+    int32_t by                  # factorisation that the next `factor_linear_system_matrix` computes: CHOLESKY, LU or CHOLESKY_OR_LU
     int32_t wide                # use one instruction for four lanes
     double cost                 # multiply-adds of L L^T, L D L^T or L^T D L
     const double* d             # (n) diagonal of the metric D, or NULL
@@ -112,12 +112,12 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
                            const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil
 cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil
 cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* index, double* real) noexcept nogil
-cdef int32_t linear_factor(linear_t* f) noexcept nogil
-cdef void linear_solve(linear_t* f, double* x) noexcept nogil
-cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil
-cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil
-cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcept nogil
-cdef int32_t linear_sign(const linear_t* f) noexcept nogil
+cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil
+cdef void solve_linear_system(linear_t* f, double* x) noexcept nogil
+cdef void solve_transposed_linear_system(const linear_t* f, double* x) noexcept nogil
+cdef int32_t solve_linear_system_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil
+cdef void multiply_by_system_matrix(const linear_t* f, const double* x, double* y) noexcept nogil
+cdef int32_t compute_determinant_sign(const linear_t* f) noexcept nogil
 
 
 cdef class LinearSystem:
@@ -130,6 +130,6 @@ cdef class LinearSystem:
     cdef readonly int64_t entries                       # number of values of L
 
     cpdef analyse(self)
-    cpdef lend(self, data, double tiny)
-    cdef int bind(self, bint lu) except -1
+    cpdef factor_rows_of_kernel(self, data, double tiny)
+    cdef int allocate_factor_memory(self, bint lu) except -1
     cdef int raise_error(self) except -1

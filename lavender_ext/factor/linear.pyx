@@ -11,17 +11,17 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport factor_tree_matrix
 from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.validate cimport norm_inf
-from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_solve
+from lavender_ext.factor.band cimport back_substitute_all_band_ldl, factor_band_ldl, solve_band_ldl
 from lavender_ext.factor.blocks cimport factor_blocks
 from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
                                         dense_lu_solve, dense_lu_solve_transposed, panel_offset)
-from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t, no_pivots, supernodal_t
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t, clear_pivot_statistics, supernodal_t
 from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, analyse_dense,
                                          backward_tolerance, fallback_t, linear_t)
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
 from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
                                              supernodal_scratch_size)
-from lavender_ext.factor.symbolic cimport column_pattern, find_supernodes, list_supernode_rows
+from lavender_ext.factor.symbolic cimport list_factor_rows_by_column, find_supernodes, list_supernode_rows
 
 
 #: Largest accepted backward error (3) of `linear.pxd`.
@@ -45,7 +45,8 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
                            const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil:
     """Set the pattern of f in index (`block_pattern_index_size`, a multiple of 8 bytes); return the multiply-adds of L L^T.
 
-    nptr and nind are the blocks of N, parent (n) is the elimination tree and lptr (n + 1) the columns of L of `block_tree`.
+    nptr and nind are the blocks of N. `compute_block_elimination_tree` returns parent (n), the elimination tree, and
+    lptr (n + 1), the columns of L.
     """
     cdef int32_t blocks = nptr[n], i, j, k, q, count
     cdef int64_t place, ld
@@ -63,7 +64,7 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
     cdef int32_t* mark = starts + n + 1
     cdef int32_t* lind = mark + n + 1
     cdef int32_t* row_indices = lind + lptr[n] + 1
-    column_pattern(n, nptr, nind, parent, mark, lptr, starts, lind)
+    list_factor_rows_by_column(n, nptr, nind, parent, mark, lptr, starts, lind)
     count = find_supernodes(n, lptr, lind, NULL, group)
     for i in range(n + 1):
         starts[i] = i * s
@@ -175,11 +176,11 @@ cdef inline void factor_band(linear_t* f) noexcept nogil:
     if f.shift != 0.0:
         for i in range(f.n):
             f.matrix[<int64_t>i * f.width] += f.shift * f.d[i]
-    ldl_factor(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots)
+    factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots)
     f.factored = CHOLESKY
 
 
-cdef inline void factor_rows(linear_t* f) noexcept nogil:
+cdef inline void factor_compressed_rows(linear_t* f) noexcept nogil:
     """Factor compressed rows; use the fallback if a pivot is lost."""
     cdef int32_t i, negative = 0
     cdef bint lu = f.by == LU
@@ -189,26 +190,26 @@ cdef inline void factor_rows(linear_t* f) noexcept nogil:
         negative += not f.d[i] > 0.0
     f.pivots.small = negative if negative else factor_sparse(&f.rows, lu, f.d, f.shift, f.tiny)
     if f.pivots.small and f.fallback != NULL:
-        use_fallback(f)
+        replace_factor_by_fallback(f)
 
 
-cdef inline void use_fallback(linear_t* f) noexcept nogil:
+cdef inline void replace_factor_by_fallback(linear_t* f) noexcept nogil:
     """Replace the factor by the caller's fallback. Without a fallback, or if it fails, there is no factor afterwards."""
     f.factored = NO_FACTOR
     if f.fallback != NULL and f.fallback.factor(f.fallback.at):
         f.factored, f.pivots.small = FALLBACK, 0
 
 
-cdef int32_t linear_factor(linear_t* f) noexcept nogil:
+cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
     """Factor A + shift D; return the number of lost pivots. For BAND, `pivots` also contains the number of negative pivots."""
     cdef int32_t lost
-    no_pivots(&f.pivots)
+    clear_pivot_statistics(&f.pivots)
     if f.kind == DENSE:
         factor_dense(f)
     elif f.kind == BAND:
         factor_band(f)
     elif f.kind == ROWS:
-        factor_rows(f)
+        factor_compressed_rows(f)
     elif f.kind == BLOCKS:
         f.factored = f.by
         f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
@@ -222,7 +223,7 @@ cdef int32_t linear_factor(linear_t* f) noexcept nogil:
 # -- solve, multiply, sign -----------------------------------------------------------------------------------------
 
 
-cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
+cdef void solve_linear_system(linear_t* f, double* x) noexcept nogil:
     """Overwrite x (n) with the solution of the system with right-hand side x; infinite if there is no factor."""
     cdef int32_t j
     if f.factored == FALLBACK:
@@ -232,9 +233,9 @@ cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
             x[j] = 1.0 / 0.0
     elif f.kind == BAND and x == f.ahead:
         f.ahead = NULL
-        ldl_back_all(f.n, f.width, f.matrix, x)
+        back_substitute_all_band_ldl(f.n, f.width, f.matrix, x)
     elif f.kind == BAND:
-        ldl_solve(f.n, f.width, f.matrix, x)
+        solve_band_ldl(f.n, f.width, f.matrix, x)
     elif f.kind == ROWS:
         solve_sparse(&f.rows, f.factored == LU, x)
     elif f.kind == BLOCKS:
@@ -253,12 +254,12 @@ cdef void linear_solve(linear_t* f, double* x) noexcept nogil:
             x[j] *= f.scale[j]
 
 
-cdef void linear_solve_transposed(const linear_t* f, double* x) noexcept nogil:
+cdef void solve_transposed_linear_system(const linear_t* f, double* x) noexcept nogil:
     """Overwrite x (n) with A^-T x. This requires L U of a full matrix without d."""
     dense_lu_solve_transposed(f.n, f.matrix, f.swap, x)
 
 
-cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcept nogil:
+cdef void multiply_by_system_matrix(const linear_t* f, const double* x, double* y) noexcept nogil:
     """Compute y = A x, without the shift, for ROWS, or for DENSE if L U has not overwritten the matrix."""
     cdef int32_t i, q
     cdef double s
@@ -275,7 +276,7 @@ cdef void linear_multiply(const linear_t* f, const double* x, double* y) noexcep
 cdef inline bint has_backward_error(const linear_t* f, const double* r, const double* x, double* error) noexcept nogil:
     """Compute error = r - A x; return whether it exceeds the limit (3)."""
     cdef int32_t i
-    linear_multiply(f, x, error)
+    multiply_by_system_matrix(f, x, error)
     for i in range(f.n):
         error[i] = r[i] - error[i]
         if f.shift != 0.0:
@@ -283,7 +284,7 @@ cdef inline bint has_backward_error(const linear_t* f, const double* r, const do
     return not norm_inf(error, f.n) <= backward_tolerance() * ((f.largest + f.shift) * norm_inf(x, f.n) + norm_inf(r, f.n))
 
 
-cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil:
+cdef int32_t solve_linear_system_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil:
     """Solve A x = r. Refine L U of ROWS until (3) holds, then use the fallback if necessary; return whether (3) holds.
 
     scratch has n doubles; x must not be r.
@@ -291,24 +292,24 @@ cdef int32_t linear_solve_checked(linear_t* f, const double* r, double* x, doubl
     cdef int32_t i, k
     for i in range(f.n):
         x[i] = r[i]
-    linear_solve(f, x)
+    solve_linear_system(f, x)
     if f.kind != ROWS or f.factored != LU:
         return f.factored != NO_FACTOR
     for k in range(MAX_REFINEMENTS + 1):
         if not has_backward_error(f, r, x, scratch):
             return True
         if k < MAX_REFINEMENTS:
-            linear_solve(f, scratch)
+            solve_linear_system(f, scratch)
             for i in range(f.n):
                 x[i] += scratch[i]
-    use_fallback(f)
+    replace_factor_by_fallback(f)
     for i in range(f.n):
         x[i] = r[i]
-    linear_solve(f, x)
+    solve_linear_system(f, x)
     return f.factored != NO_FACTOR
 
 
-cdef int32_t linear_sign(const linear_t* f) noexcept nogil:
+cdef int32_t compute_determinant_sign(const linear_t* f) noexcept nogil:
     """Return the sign of det A after a factorisation; 0 if it is not known."""
     if f.factored == CHOLESKY:
         return 1
@@ -414,7 +415,7 @@ cdef class LinearSystem:
         index = self.indices
         self.f.rows.indices = &index[0] if index.shape[0] else NULL
 
-    cdef int bind(self, bint lu) except -1:
+    cdef int allocate_factor_memory(self, bint lu) except -1:
         """Allocate the memory that the next factorisation needs and earlier ones did not."""
         cdef int32_t n = self.f.n
         cdef int64_t size
@@ -455,10 +456,10 @@ cdef class LinearSystem:
             raise error
         return 0
 
-    cpdef lend(self, data, double tiny):
+    cpdef factor_rows_of_kernel(self, data, double tiny):
         """Let a kernel form the entries of compressed rows in `data` (nnz,) and factor them, by L L^T or L U."""
         cdef double[::1] x = data
-        self.bind(True)
+        self.allocate_factor_memory(True)
         self.data = data
         self.f.rows.data, self.f.tiny, self.f.shift = &x[0], tiny, 0.0
 
@@ -490,7 +491,7 @@ cdef class LinearSystem:
         cdef const double[::1] metric
         cdef const double[::1] x = data.reshape(-1)         # a view of `data`
         cdef int32_t lost, n = self.f.n
-        self.bind(lu)
+        self.allocate_factor_memory(lu)
         if x.shape[0] != (<int64_t>n * n if self.f.kind == DENSE else len(self.indices)):
             raise ValueError("entries of another matrix")
         self.data, self.other = data, None
@@ -506,7 +507,7 @@ cdef class LinearSystem:
         self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
         self.interrupt.stopped = 0
         with nogil:
-            lost = linear_factor(&self.f)
+            lost = factor_linear_system_matrix(&self.f)
         if self.interrupt.stopped:
             self.f.factored = NO_FACTOR
         self.raise_error()
@@ -527,10 +528,10 @@ cdef class LinearSystem:
         if checked:
             scratch = np.empty(n)
             with nogil:
-                is_good = linear_solve_checked(&self.f, &r[0], &x[0], &scratch[0])
+                is_good = solve_linear_system_checked(&self.f, &r[0], &x[0], &scratch[0])
         else:
             with nogil:
-                linear_solve(&self.f, &x[0])
+                solve_linear_system(&self.f, &x[0])
         self.raise_error()
         return out if is_good else None
 
@@ -543,13 +544,13 @@ cdef class LinearSystem:
         cdef double[::1] y = out
         if x.shape[0] != self.f.n or self.data is None:
             raise ValueError("of another size, or before a factor")
-        linear_multiply(&self.f, &x[0], &y[0])
+        multiply_by_system_matrix(&self.f, &x[0], &y[0])
         return out
 
     @property
     def sign(self):
         """Sign of det A, 0 if the fallback has factored it or no factor exists."""
-        return linear_sign(&self.f)
+        return compute_determinant_sign(&self.f)
 
     @property
     def uses_fallback(self):
@@ -562,7 +563,7 @@ cdef class LinearSystem:
         self.analyse()
         return self.analysis[0][:self.f.n]
 
-    def lost_rows(self):
+    def list_lost_rows(self):
         """Return the rows (ascending) whose pivots the last L L^T of compressed rows rejected; their columns of L are 0."""
         cdef const supernodal_t* f = &self.f.rows.factor
         cdef int32_t i, k

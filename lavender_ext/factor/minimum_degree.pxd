@@ -53,7 +53,7 @@ cdef inline void insert_degree(quotient_t* g, int32_t i) noexcept nogil:
     g.head[d] = i
 
 
-cdef inline void compact(quotient_t* g) noexcept nogil:
+cdef inline void compact_lists(quotient_t* g) noexcept nogil:
     """Move the lists in use to the front, in their order. Meanwhile, the first entry of each list is -1 - its owner."""
     cdef int32_t i, j, q = 0, to = 0, k
     for i in range(g.n):
@@ -75,7 +75,7 @@ cdef inline void compact(quotient_t* g) noexcept nogil:
     g.free = to
 
 
-cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t workspace) noexcept nogil:
+cdef inline int32_t gather_element_neighbours(quotient_t* g, int32_t p, int32_t workspace) noexcept nogil:
     """Write the union (1) as the list of p, which becomes an element. Its weight is computed later."""
     cdef int32_t k, q, i, e, need = 0, begin
     for k in range(g.elements[p]):
@@ -84,7 +84,7 @@ cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t workspace) noexcept
     if need > g.n:
         need = g.n
     if g.free + need > workspace:
-        compact(g)
+        compact_lists(g)
     begin = g.free
     for k in range(g.length[p]):
         e = g.list[g.at[p] + k]
@@ -109,7 +109,7 @@ cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t workspace) noexcept
     return g.length[p]
 
 
-cdef inline int32_t begin_graph(quotient_t* g, const int32_t* size, int32_t* integers, int32_t* last,
+cdef inline int32_t initialise_quotient_graph(quotient_t* g, const int32_t* size, int32_t* integers, int32_t* last,
                                 int32_t* order) noexcept nogil:
     """Bind the integers, compute degrees, and order vertices with very many neighbours last, from order[last] on.
 
@@ -165,7 +165,7 @@ cdef inline void minimum_degree_order(int32_t n, const int32_t* size, int32_t wo
     cdef int32_t i, j, e, p, k, q, to, first, count = 0, last, least = 0, deg, weight, total, rest, middle
     cdef int64_t stamp = 1
     g.n, g.list, g.outside, g.head = n, list, outside, head
-    total = rest = begin_graph(&g, size, integers, &last, order)
+    total = rest = initialise_quotient_graph(&g, size, integers, &last, order)
     while count < last:
         while head[least] < 0:
             least += 1
@@ -174,7 +174,7 @@ cdef inline void minimum_degree_order(int32_t n, const int32_t* size, int32_t wo
         order[count] = p
         count += 1
         rest -= size[p]
-        gather(&g, p, workspace)
+        gather_element_neighbours(&g, p, workspace)
         first = g.at[p]
         weight = 0
         for k in range(first, first + g.length[p]):

@@ -1,7 +1,7 @@
 """Factorisation of one dense panel: its columns, with the rows of L below them.
 
-    [L_1; L_2] L_1^T = [A_1; A_2]              `cholesky_panel`                                         (1)
-    P [A_1; A_2] = [L_1; L_2] U_1              `lu_panel`, L_1 unit lower triangular                    (2)
+    [L_1; L_2] L_1^T = [A_1; A_2]              `factor_panel_by_cholesky`                                         (1)
+    P [A_1; A_2] = [L_1; L_2] U_1              `factor_panel_by_lu`, L_1 unit lower triangular                    (2)
 
 A panel is stored column by column; its first `width` rows are those of its own columns. The reciprocals 1 / L_jj of (1) and
 1 / U_jj of (2) are stored on the diagonal. Dense and sparse factorisations consist of panels (`dense.pxd`, `supernodal.pxd`).
@@ -17,7 +17,7 @@ cdef enum:
     LU_STRIP = 12               # Columns of (2) that are finished together, which is the width of four tiles.
 
 
-cdef inline int32_t cholesky_panel(int32_t wide, int32_t width, int32_t rows, double* a,
+cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a,
                                    const double* min_pivot) noexcept nogil:
     """Factor the panel a (rows, width) by (1) in place; return the number of pivots that are too small.
 
@@ -101,7 +101,8 @@ cdef inline void swap_entries(double* y, int32_t n, const int32_t* swap) noexcep
             y[swap[t]] = x
 
 
-cdef inline int32_t lu_panel(int32_t wide, int32_t width, int32_t rows, int32_t candidates, double* a, int64_t lda, int32_t* swap,
+cdef inline int32_t factor_panel_by_lu(int32_t wide, int32_t width, int32_t rows, int32_t candidates, double* a, int64_t lda,
+                                       int32_t* swap,
                              double min_pivot, double* scratch) noexcept nogil:
     """Factor the panel a (rows, width) by (2) in place; return the number of pivots that are too small.
 

@@ -9,7 +9,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.csr cimport transpose_csr
 from lavender_ext.factor.factors cimport sparse_t, supernodal_t
-from lavender_ext.factor.supernodal cimport (begin_supernodes, factor_supernode, panel_width, rows_below, set_local_rows,
+from lavender_ext.factor.supernodal cimport (clear_descendant_lists, factor_supernode, panel_width, rows_below, set_local_rows,
                                              solve_supernodes)
 
 
@@ -60,7 +60,7 @@ cdef inline int32_t factor_sparse(const sparse_t* s, int32_t lu, const double* d
     for k in range(f.n):
         size = d[f.order[k]] if d != NULL else 1.0
         s.scale[k] = 1.0 / sqrt(size) if lu else tiny * size
-    begin_supernodes(f)
+    clear_descendant_lists(f)
     for i in range(f.supernodes):
         set_local_rows(f, i)
         fill_supernode(s, i, lu, d, shift)

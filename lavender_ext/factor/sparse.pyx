@@ -36,7 +36,7 @@ def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
     return band[0], band[1], asymmetry
 
 
-def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
+def has_symmetric_pattern(const int32_t[::1] indptr, const int32_t[::1] indices):
     """Return whether the pattern of a canonical CSR matrix is symmetric."""
     cdef int32_t[::1] cursor = np.array(indptr)
     cdef int32_t i, j, q
@@ -49,7 +49,7 @@ def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
     return True
 
 
-def free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
+def extract_free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
               const int32_t[::1] place, int n_free):
     """Return (indptr, indices, data) of the rows and columns with place >= 0, numbered in the order of the rows."""
     cdef int32_t i, q, k = 0, n = <int32_t>indptr.shape[0] - 1

@@ -15,7 +15,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.factor.factors cimport interrupt_t, supernodal_t
-from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, gemm_subtract_lower, lu_panel
+from lavender_ext.factor.panels cimport LU_STRIP, factor_panel_by_cholesky, gemm_subtract_lower, factor_panel_by_lu
 from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
 
 
@@ -24,7 +24,7 @@ cdef inline double interrupt_check_interval() noexcept nogil:
     return 2e8
 
 
-cdef inline bint is_stopped(const supernodal_t* f, double work) noexcept nogil:
+cdef inline bint count_work_and_check_stop(const supernodal_t* f, double work) noexcept nogil:
     """Count `work` multiply-adds; return whether this check, or an earlier one, ended the factorisation."""
     cdef interrupt_t* c = f.interrupt
     if c == NULL:
@@ -46,7 +46,7 @@ cdef inline int32_t rows_below(const supernodal_t* f, int32_t i) noexcept nogil:
 
 
 cdef inline int64_t supernodal_scratch_size(const supernodal_t* f, bint lu) noexcept nogil:
-    """Return the number of doubles for the largest update, for the rows below a panel, and for a strip of `lu_panel`."""
+    """Return the number of doubles for the largest update, for the rows below a panel, and for a strip of `factor_panel_by_lu`."""
     cdef int32_t i, j, run
     cdef int64_t largest = 0, needed
     for i in range(f.supernodes):
@@ -63,7 +63,8 @@ cdef inline int64_t supernodal_scratch_size(const supernodal_t* f, bint lu) noex
 # -- updates of a supernode by its descendants -------------------------------------------------------------------
 
 
-cdef inline void add_scratch(const supernodal_t* f, int32_t begin, int32_t end, int32_t skipped, int32_t n, const int32_t* columns,
+cdef inline void add_scratch_to_panel(const supernodal_t* f, int32_t begin, int32_t end, int32_t skipped, int32_t n,
+                                      const int32_t* columns,
                              int32_t base, int64_t ld, double* panel) noexcept nogil:
     """Add scratch (end - begin, n) to a panel, at the rows of row_indices[begin:end] and these columns, minus `base`.
 
@@ -115,7 +116,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
         else:
             memset(f.scratch, 0, sizeof(double) * m * n)
             gemm_subtract_lower(f.wide, m, n, width, a, rows, f.scratch, m)
-            add_scratch(f, q, end, 0, n, columns, base, ld, panel)
+            add_scratch_to_panel(f, q, end, 0, n, columns, base, ld, panel)
         return
     # update of the columns of L (and of the diagonal block of U)
     u = f.upper + f.upper_offset[k] + r
@@ -124,7 +125,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
     else:
         memset(f.scratch, 0, sizeof(double) * m * n)
         gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.scratch, m)
-        add_scratch(f, q, end, 0, n, columns, base, ld, panel)
+        add_scratch_to_panel(f, q, end, 0, n, columns, base, ld, panel)
     # update of the rows of U
     if m > n:
         panel = f.upper + f.upper_offset[i]
@@ -134,10 +135,10 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
         else:
             memset(f.scratch, 0, sizeof(double) * (m - n) * n)
             gemm_subtract_nt(f.wide, m - n, n, width, u + n, below, a, rows, f.scratch, m - n)
-            add_scratch(f, q + n, end, own, n, columns, base, beside, panel)
+            add_scratch_to_panel(f, q + n, end, own, n, columns, base, beside, panel)
 
 
-cdef inline void begin_supernodes(const supernodal_t* f) noexcept nogil:
+cdef inline void clear_descendant_lists(const supernodal_t* f) noexcept nogil:
     """Begin a factorisation; no supernode has updated another one yet."""
     cdef int32_t i
     for i in range(f.supernodes):
@@ -182,11 +183,11 @@ cdef inline void swap_columns(double* u, int32_t n, int32_t ld, const int32_t* s
                 z[i] = x
 
 
-cdef inline int32_t lu_supernode(const supernodal_t* f, int32_t width, int32_t below, double* a, double* u, int32_t* swap,
+cdef inline int32_t factor_supernode_by_lu(const supernodal_t* f, int32_t width, int32_t below, double* a, double* u, int32_t* swap,
                                  double min_pivot) noexcept nogil:
     """Factor one panel a and its rows u of U, transposed, by (2) and (3); return the number of pivots that are too small."""
     cdef int32_t j, j0 = 0, t, n, rows = width + below
-    cdef int32_t lost = lu_panel(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch)
+    cdef int32_t lost = factor_panel_by_lu(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch)
     if below == 0:
         return lost
     swap_columns(u, width, below, swap)
@@ -206,23 +207,23 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
 
     After a request to end, every pivot counts as lost.
 
-    min_pivot (n), by position, is that of `cholesky_panel`, or NULL; min_lu_pivot that of `lu_panel`.
+    min_pivot (n), by position, is that of `factor_panel_by_cholesky`, or NULL; min_lu_pivot that of `factor_panel_by_lu`.
     """
     cdef int32_t k = f.head[i], after, lost, width = panel_width(f, i), below = rows_below(f, i)
     cdef double* a = f.values + f.value_offset[i]
     while k >= 0:
         after = f.link[k]
-        if is_stopped(f, <double>panel_width(f, k) * (f.row_ptr[k + 1] - f.next_row[k]) * width):
+        if count_work_and_check_stop(f, <double>panel_width(f, k) * (f.row_ptr[k + 1] - f.next_row[k]) * width):
             return width
         subtract_descendant(f, i, k, lu)
         link_descendant(f, k, f.next_row[k])
         k = after
-    if is_stopped(f, 0.5 * width * width * (width + below)):
+    if count_work_and_check_stop(f, 0.5 * width * width * (width + below)):
         return width
     if lu:
-        lost = lu_supernode(f, width, below, a, f.upper + f.upper_offset[i], f.swap + f.first[i], min_lu_pivot)
+        lost = factor_supernode_by_lu(f, width, below, a, f.upper + f.upper_offset[i], f.swap + f.first[i], min_lu_pivot)
     else:
-        lost = cholesky_panel(f.wide, width, width + below, a, min_pivot + f.first[i] if min_pivot != NULL else NULL)
+        lost = factor_panel_by_cholesky(f.wide, width, width + below, a, min_pivot + f.first[i] if min_pivot != NULL else NULL)
     link_descendant(f, i, f.row_ptr[i])
     return lost
 
@@ -230,7 +231,7 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
 # -- solves --------------------------------------------------------------------------------------------------------
 
 
-cdef inline void subtract_three(int32_t n, int32_t columns, const double* a, int64_t lda, const double* t,
+cdef inline void subtract_three_columns(int32_t n, int32_t columns, const double* a, int64_t lda, const double* t,
                                 double* y) noexcept nogil:
     """Subtract A t from y (n). The products of up to three columns of A are subtracted one after the other."""
     cdef int32_t q
@@ -317,8 +318,8 @@ cdef inline void solve_lower(const supernodal_t* f, double* y, const int32_t lu)
                     own[k] = t
                 for q in range(k + 1, j + n):
                     own[q] -= t * a[q + <int64_t>(k - j) * rows]
-            subtract_three(width - j - n, n, a + j + n, rows, own + j, own + j + n)
-            subtract_three(below, n, a + width, rows, own + j, f.scratch)
+            subtract_three_columns(width - j - n, n, a + j + n, rows, own + j, own + j + n)
+            subtract_three_columns(below, n, a + width, rows, own + j, f.scratch)
             a += <int64_t>n * rows
             j += n
         for q in range(below):

@@ -11,7 +11,7 @@ cdef inline double max_zero_fraction() noexcept nogil:
     return 0.1
 
 
-cdef inline void block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent, int32_t* mark,
+cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent, int32_t* mark,
                             int32_t* row_count, int32_t* column_count) noexcept nogil:
     """Compute the elimination tree of a lower pattern, and the number of off-diagonal entries in each row and column of L."""
     cdef int32_t k, q, j
@@ -31,7 +31,8 @@ cdef inline void block_tree(int32_t n, const int32_t* nptr, const int32_t* nind,
                 j = parent[j]
 
 
-cdef inline void column_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent, int32_t* mark,
+cdef inline void list_factor_rows_by_column(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+                                            int32_t* mark,
                                 const int32_t* lptr, int32_t* next_entry, int32_t* lind) noexcept nogil:
     """List the rows of every column of L below the diagonal, ascending; mark and next_entry (n) are scratch."""
     cdef int32_t k, q, j
@@ -74,7 +75,7 @@ cdef inline void find_postorder(int32_t n, const int32_t* parent, int32_t* child
                 top -= 1
 
 
-cdef inline void permuted_lower_pattern(int32_t n, const int32_t* ptr, const int32_t* neighbour, const int32_t* rank,
+cdef inline void list_permuted_lower_pattern(int32_t n, const int32_t* ptr, const int32_t* neighbour, const int32_t* rank,
                                         const int32_t* order, int32_t* nptr, int32_t* nind) noexcept nogil:
     """List the lower pattern of a graph in an order, with the diagonal last in each row."""
     cdef int32_t k, i, q, to = 0
@@ -116,14 +117,14 @@ cdef inline void apply_postorder(int32_t n, const int32_t* ptr, const int32_t* n
     cdef int32_t i
     for i in range(n):
         rank[order[i]] = i
-    permuted_lower_pattern(n, ptr, neighbour, rank, order, nptr, nind)
+    list_permuted_lower_pattern(n, ptr, neighbour, rank, order, nptr, nind)
     find_elimination_tree(n, nptr, nind, parent, scratch)
     find_postorder(n, parent, scratch, scratch + n, scratch + 2 * n, scratch + 3 * n)
     for i in range(n):
         rank[i] = scratch[3 * n + rank[i]]
     for i in range(n):
         order[rank[i]] = i
-    permuted_lower_pattern(n, ptr, neighbour, rank, order, nptr, nind)
+    list_permuted_lower_pattern(n, ptr, neighbour, rank, order, nptr, nind)
 
 
 cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_t* lind, const int32_t* size,

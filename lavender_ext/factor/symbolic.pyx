@@ -7,7 +7,8 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.factor.minimum_degree cimport minimum_degree_order
-from lavender_ext.factor.symbolic cimport (apply_postorder, block_tree, column_pattern, find_supernodes, list_supernode_rows)
+from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimination_tree, list_factor_rows_by_column,
+                                           find_supernodes, list_supernode_rows)
 
 
 cdef public int32_t lav_find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
@@ -80,7 +81,7 @@ cdef public int32_t lav_order_rows(int32_t n, const int32_t* indptr, const int32
     apply_postorder(count, graph_ptr, neighbour, order, rank, nptr, nind, parent, integers)
     for i in range(count):
         size[i] = begin[order[i] + 1] - begin[order[i]]
-    block_tree(count, nptr, nind, parent, integers, integers + n, lptr + 1)
+    compute_block_elimination_tree(count, nptr, nind, parent, integers, integers + n, lptr + 1)
     lptr[0] = 0
     for k in range(count):
         below += lptr[k + 1]
@@ -98,7 +99,7 @@ cdef public int32_t lav_supernodes(int32_t count, const int32_t* nptr, const int
     lind (lptr[count]) receives the vertices below each, `below` the rows below all supernodes; scratch has 2 count entries.
     """
     cdef int32_t i, c, q, k
-    column_pattern(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
+    list_factor_rows_by_column(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
     k = find_supernodes(count, lptr, lind, size, group)
     below[0] = 0
     for i in range(k):

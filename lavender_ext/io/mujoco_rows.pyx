@@ -232,7 +232,7 @@ def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
     return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
 
 
-def lower_triangle_of_mass(first_, count_, columns, values, x, y, double bound, tuple like):
+def extract_lower_triangle_of_mass(first_, count_, columns, values, x, y, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     The denominator is max |y| if the ratio is then at most `bound`. Rows are given by first index and length and must be
@@ -323,7 +323,7 @@ cdef bint has_row_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* fir
     return True
 
 
-def compare_spatial_velocities(parent, body, axis, spatial, v_):
+def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
     """Return the largest difference of the spatial velocities c (n, 6) from the ones that v (nv) gives, and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
@@ -381,7 +381,7 @@ def compare_spatial_velocities(parent, body, axis, spatial, v_):
 
 def recover_joint_velocity(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
                   const double[:, ::1] spatial, double alike):
-    """Recover v (nv) from the spatial velocities c of `compare_spatial_velocities`; None if s does not determine it.
+    """Recover v (nv) from the spatial velocities c of `compute_spatial_velocity_difference`; None if s does not determine it.
 
     Least squares are solved body by body with modified Gram-Schmidt. `alike` is the minimum fraction of an axis s_j that must
     be independent of the other axes of its body.

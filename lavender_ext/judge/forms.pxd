@@ -16,7 +16,7 @@ from lavender_ext.core.csr cimport csr_row_dot, csr_row_dot_with_abs_sum
 from lavender_ext.core.generalized cimport add_abs_panel_transpose_product, multiply_abs_whitened_panel
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, count_tangent_rows, count_angular_rows
 from lavender_ext.core.rows cimport cross
-from lavender_ext.core.velocity cimport add6, compute_velocity_change
+from lavender_ext.core.velocity cimport add_vector_6, compute_velocity_change
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
@@ -30,7 +30,7 @@ from lavender_ext.judge.tally cimport (
 # -- islands --------------------------------------------------------------------------------------------
 
 
-cdef inline void raise_total_floor(const floor_t* island, floor_t* total) noexcept nogil:
+cdef inline void add_island_floor_to_total(const floor_t* island, floor_t* total) noexcept nogil:
     """Add the floor of an island to the floor of all rows."""
     total.energy += island.energy
     if island.fast > total.fast:
@@ -62,7 +62,7 @@ cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const doub
             else:
                 add_contact_floor(p, r, i - r.n_joints, lam, w, e, sizes, &floor)
         add_island_to_score(p, island, w, e, &own, &floor, &s, out)
-        raise_total_floor(&floor, &f)
+        add_island_floor_to_total(&floor, &f)
     write_score_norms(p, e, &s, out)
     write_score_floor(&f, out)
 
@@ -111,7 +111,7 @@ cdef inline void judge_csr(const blocks_t* p, const csr_t* a, const double* lam,
         for k in range(index_of_island_begin(p, island), end):
             judge_csr_block(p, a, get_block_in_order(order, k), lam, w, e, &own, &island_floor_)
         add_island_to_score(p, island, w, e, &own, &island_floor_, &s, out)
-        raise_total_floor(&island_floor_, &f)
+        add_island_floor_to_total(&island_floor_, &f)
     write_score_norms(p, e, &s, out)
     write_score_floor(&f, out)
 
@@ -132,9 +132,9 @@ cdef inline void add_joint_abs_wrench(const blocks_t* p, const rows_t* r, int32_
         for k in range(12):
             x[k] += fabs(row[k] * lam[j])
     if a >= 0:
-        add6(size + 6 * a, x)
+        add_vector_6(size + 6 * a, x)
     if b >= 0:
-        add6(size + 6 * b, x + 6)
+        add_vector_6(size + 6 * b, x + 6)
 
 
 cdef inline double abs_cross_component(const double* x, const double* y, int32_t k) noexcept nogil:

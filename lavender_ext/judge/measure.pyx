@@ -130,7 +130,7 @@ def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, b
     """
     cdef score_t s = make_empty_score()
     cdef double now, above
-    cdef view_t v = p.view()
+    cdef view_t v = p.get_pointers()
     cdef double[::1] scratch
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, 0.0, 0.0
@@ -144,7 +144,7 @@ def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, b
     return s.energy, s.velocity, now, above
 
 
-cdef double factor_loss(Data p, impulse, both) except -1.0:
+cdef double estimate_factor_loss_of_pass(Data p, impulse, both) except -1.0:
     """Return the possible error of the slack in `both` due to the factor of M, as a relative residual."""
     cdef const double[::1] lam = impulse, w = both
     cdef Workspace workspace
@@ -184,7 +184,7 @@ cdef class Judged:
         cdef double* w
         cdef double* e
         cdef Workspace workspace
-        cdef view_t v = p.view()
+        cdef view_t v = p.get_pointers()
         cdef score_t s = make_empty_score()
         self.data = p
         self.impulse = impulse
@@ -211,14 +211,14 @@ cdef class Judged:
     def loss(self):
         """Possible error due to the factor of M, as a relative residual (judge/refine.pxd (2)); 0 after refinement."""
         if self.known_loss < 0.0:
-            self.known_loss = factor_loss(self.data, self.impulse, self.both)
+            self.known_loss = estimate_factor_loss_of_pass(self.data, self.impulse, self.both)
         return self.known_loss
 
     def refine(self, double tol):
         """Return the refined pass if a tolerance of `tol` requires it (judge/refine.pxd (2)), otherwise self."""
         cdef Data p = self.data
         cdef int32_t m = p.blocks.n_rows
-        cdef view_t v = p.view()
+        cdef view_t v = p.get_pointers()
         cdef score_t s = make_empty_score()
         cdef const double[::1] lam
         cdef const double[::1] first
@@ -286,7 +286,7 @@ def score_slack_array(Data p, const double[::1] lam, const double[::1] w, double
 def store_zero_impulse_residual(Data p):
     """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only."""
     cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks
-    cdef view_t v = p.view()
+    cdef view_t v = p.get_pointers()
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
@@ -307,7 +307,7 @@ def residuals_by_island(Data p, const double[::1] lam):
     Columns: relative residual, E [sqrt J], V [m/s] (worst row), E0 [sqrt J], V0 [m/s]; the last two -1 if no row acts.
     """
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef view_t v = p.view()
+    cdef view_t v = p.get_pointers()
     cdef const islands_t* s = p.blocks.islands
     cdef int32_t i, a, n = s.n if s != NULL else 1
     cdef score_t score = make_empty_score()
@@ -340,7 +340,7 @@ def residuals_by_island(Data p, const double[::1] lam):
 def combine_best_islands(Data p, list starts, list impulses, double tol):
     """Combine the best island impulses of starts and impulses (m,), compared by judge/best.pxd, in a new array."""
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef view_t v = p.view()
+    cdef view_t v = p.get_pointers()
     cdef best_t best
     cdef score_t s
     cdef int64_t workspace = best_workspace_size(m, count_islands(&p.blocks))

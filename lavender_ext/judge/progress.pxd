@@ -92,7 +92,7 @@ cdef inline bint residual_reaches_target(const progress_t* s, double target, dou
     return n <= max_sweeps
 
 
-cdef inline double row_speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
+cdef inline double compute_row_speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
     """Return the slower of the last two speeds of row i [N s per sweep], 0 if its direction changed."""
     cdef double x = (lam[i] - s.last[i]) / (now - s.last_at), y = (s.last[i] - s.before[i]) / (s.last_at - s.before_at)
     if not x * y > 0.0:
@@ -113,8 +113,8 @@ cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, 
     cdef int32_t k
     for k in range(first, end):
         size = norm2(size, lam[k])
-        along += lam[k] * row_speed(s, lam, now, k)
-        v = norm2(v, row_speed(s, lam, now, k))
+        along += lam[k] * compute_row_speed(s, lam, now, k)
+        v = norm2(v, compute_row_speed(s, lam, now, k))
     return closes_gap_within(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps)
 
 
@@ -130,13 +130,13 @@ cdef inline bint any_row_reaches_bound(const progress_t* s, const blocks_t* p, c
         j = p.ptr[i]
         if has_independent_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                v = row_speed(s, lam, now, k)
+                v = compute_row_speed(s, lam, now, k)
                 if closes_gap_within(lam[k] - p.lower[k], -v, max_sweeps) or closes_gap_within(p.upper[k] - lam[k], v, max_sweeps):
                     return True
             continue
         if not lam[j] > 0.0:
             continue
-        rate = row_speed(s, lam, now, j)
+        rate = compute_row_speed(s, lam, now, j)
         if closes_gap_within(lam[j], -rate, max_sweeps):
             return True
         get_friction_components(p, i, &q)

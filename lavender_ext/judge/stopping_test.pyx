@@ -96,7 +96,7 @@ cdef inline bint is_check_better(stopping_test_t* s, double now, double tol) noe
     return better
 
 
-cdef inline int32_t perform_check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
+cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """Perform one check and schedule the next; return the status."""
     cdef score_t x = make_empty_score()
     cdef const blocks_t* p = &v.p
@@ -155,7 +155,7 @@ cdef inline int32_t perform_check(stopping_test_t* s, const view_t* v, double* l
     return RUNNING
 
 
-cdef inline int32_t confirm_status(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
+cdef inline int32_t confirm_status_in_other_form(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
                                    int32_t status) noexcept nogil:
     """Judge lam in another form of the problem; return `status` if it holds there, otherwise RUNNING or STALLED."""
     cdef score_t x = make_empty_score()
@@ -185,9 +185,9 @@ cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view
     if not tol > 0.0:
         return RUNNING
     if s.total >= s.check_at:                           # total exceeds check_at after sweeps without checks
-        status = perform_check(s, v, lam, tol)
+        status = perform_residual_check(s, v, lam, tol)
         if confirm != NULL and (status == CONVERGED or status == AT_FLOOR):
-            status = confirm_status(s, confirm, lam, tol, status)
+            status = confirm_status_in_other_form(s, confirm, lam, tol, status)
     if s.check_at - s.total < step[0]:
         step[0] = s.check_at - s.total
     return status
@@ -225,9 +225,9 @@ cdef class StoppingTest:
     def __init__(self, Data data, int patience=64, Data confirm=None):
         cdef Py_ssize_t m = data.blocks.n_rows, workspace
         cdef double[::1] scratch
-        self.view = self.other = data.view()
+        self.view = self.other = data.get_pointers()
         if confirm is not None:
-            self.other = confirm.view()
+            self.other = confirm.get_pointers()
             self.confirm = &self.other
         workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
         scratch = np.empty(workspace + 2 * m + count_judge_scratch(&self.other) + 4)

@@ -12,19 +12,19 @@ from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t, vie
 from lavender_ext.factor.graph cimport order_bodies_and_list_block_rows, pattern_workspace_size
 from lavender_ext.factor.linear cimport (BLOCKS, NO_FACTOR, bind_block_factor, block_factor_index_size, block_factor_size,
                                          block_pattern_index_size)
-from lavender_ext.factor.symbolic cimport block_tree
+from lavender_ext.factor.symbolic cimport compute_block_elimination_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport compute_panel, factor_inertia
 from lavender_ext.newton.run cimport (bind_index_workspace, bind_real_workspace, method_index_size, method_real_size,
                                       newton_t)
-from lavender_ext.newton.scaling cimport is_known, scaled_t
+from lavender_ext.newton.scaling cimport is_problem_supported, scaled_t
 from lavender_ext.newton.system cimport BODIES
 
 
 cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
     """Return the number of int32 for `order_bodies` if every row were an element; 0 if the method does not apply."""
     cdef int64_t k = p.n_rows, n = r.n_bodies
-    if n == 0 or k == 0 or not is_known(p):
+    if n == 0 or k == 0 or not is_problem_supported(p):
         return 0
     return order_index_size(n, k) + method_index_size(k) + 1
 
@@ -83,7 +83,7 @@ cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
     cdef int32_t i
     cdef int64_t below = 0
     order_bodies_and_list_block_rows(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.swapped)
-    block_tree(a.n, a.nptr, a.nind, a.parent, a.mark, a.scratch, a.lptr + 1)
+    compute_block_elimination_tree(a.n, a.nptr, a.nind, a.parent, a.mark, a.scratch, a.lptr + 1)
     a.lptr[0] = 0
     for i in range(a.n):
         below += a.lptr[i + 1]
@@ -115,7 +115,7 @@ cdef inline int64_t body_workspace_size(const newton_t* s, const blocks_t* p, co
             + block_factor_size(&s.linear.blocks, needs_lu(s, p)))
 
 
-cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
+cdef inline int32_t group_elements_by_bodies(elements_t* e, int32_t* group) noexcept nogil:
     """List the groups of consecutive elements between the same two bodies in group (n + 1); return the number of groups."""
     cdef int32_t k, h = 0
     for k in range(e.n):
@@ -127,7 +127,7 @@ cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
     return h
 
 
-cdef inline void narrow_panel(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
+cdef inline void remove_fixed_rows_and_columns(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
                               double* panel) noexcept nogil:
     """Compress a panel (rows, 12) in place: keep the rows that are not fixed, and `size` columns of each body.
 
@@ -158,7 +158,7 @@ cdef inline void form_panel(const blocks_t* p, const rows_t* r, double* root, do
 
 cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, const int32_t* body, const int32_t* column,
                                      double* panel) noexcept nogil:
-    """Compute K (rows, 12) from J and M whose velocities belong to bodies: column (n), body (n_blocks, 2) of `graph.bodies_in`."""
+    """Compute K (rows, 12) from J and M whose velocities belong to bodies: column (n), body (n_blocks, 2)."""
     cdef int32_t i, j, q, c, b, nc
     cdef const double* y
     cdef double* row
@@ -180,10 +180,10 @@ cdef inline void bind_factor(newton_t* s, const pattern_t* a, double* panel, con
     index has `block_factor_index_size`, y n size, real `block_factor_size`.
     """
     if s.sc.e.m:
-        narrow_panel(&s.sc, a.swapped, column, size, panel)
+        remove_fixed_rows_and_columns(&s.sc, a.swapped, column, size, panel)
     s.s.form, s.s.symmetric, s.s.y = BODIES, 1, y
     s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
-    find_groups(&s.sc.e, a.group)
+    group_elements_by_bodies(&s.sc.e, a.group)
     s.linear.kind, s.linear.n, s.linear.factored = BLOCKS, s.linear.blocks.factor.n, NO_FACTOR
     bind_block_factor(&s.linear.blocks, lu, wide, index, real)
 

@@ -68,7 +68,7 @@ cdef inline double tangent_factor(double a) noexcept nogil:
     return 1.0 / a if a < 1.0 else 1.0
 
 
-cdef inline void load_cone(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
+cdef inline void load_cone_variable(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
     """Compute x = G z."""
     cdef int32_t q = e.first[g] - 1, k
     cdef double a = e.reach[g]
@@ -93,7 +93,7 @@ cdef inline double* dual_normal(const elements_t* e, int32_t i, int32_t g, doubl
     return u1 + e.ptr[i] if g == e.part[i] else u2 + e.ptr[i] + (g - e.part[i] - 1)
 
 
-cdef inline void load_dual(const elements_t* e, int32_t i, int32_t g, const double* u1, const double* u2,
+cdef inline void load_cone_dual(const elements_t* e, int32_t i, int32_t g, const double* u1, const double* u2,
                            double* x) noexcept nogil:
     """Load the dual of a cone."""
     cdef const double* u = u1 if g == e.part[i] else u2
@@ -103,7 +103,7 @@ cdef inline void load_dual(const elements_t* e, int32_t i, int32_t g, const doub
         x[k] = u[q + k]
 
 
-cdef inline void store_dual(const elements_t* e, int32_t i, int32_t g, const double* x, double* u1, double* u2) noexcept nogil:
+cdef inline void store_cone_dual(const elements_t* e, int32_t i, int32_t g, const double* x, double* u1, double* u2) noexcept nogil:
     """Store the dual of a cone."""
     cdef double* u = u1 if g == e.part[i] else u2
     cdef int32_t q = e.first[g] - 1, k
@@ -174,7 +174,8 @@ cdef inline bint has_upper_bound(const elements_t* e, int32_t j) noexcept nogil:
     return e.upper[j] < 1.0 / 0.0
 
 
-cdef inline void load_slack(const elements_t* e, int32_t i, int32_t g, const double* hz, double* c) noexcept nogil:
+cdef inline void compute_cone_dual_from_slack(const elements_t* e, int32_t i, int32_t g, const double* hz,
+                                              double* c) noexcept nogil:
     """Compute u with G^T u = H z - g on a contact with one cone."""
     cdef int32_t j = e.ptr[i], q = e.first[g] - 1, k
     cdef double a = e.reach[g]
@@ -190,7 +191,7 @@ cdef struct cone_weight_t:      # G^-1 (T^-2 + delta)^-1 G^-T = x [1 h][1 h]^T +
     double root[4]              # square root of c
 
 
-cdef inline void scale_cone(const double* s, const double* u, int32_t n, double a, double delta, double* w,
+cdef inline void compute_cone_scaling(const double* s, const double* u, int32_t n, double a, double delta, double* w,
                             cone_weight_t* out) noexcept nogil:
     """Compute the scaling of s and u into w (CONE_SCALING_SIZE), and the cone's weight.
 
@@ -227,7 +228,7 @@ cdef inline void scale_cone(const double* s, const double* u, int32_t n, double 
     out.x = 0.5 * (grow + shrink) / (gn * gn)
 
 
-cdef inline double limit_step(double x, double dx, double best) noexcept nogil:
+cdef inline double limit_step_to_nonnegative(double x, double dx, double best) noexcept nogil:
     """Return the smaller of `best` and the step along dx at which x > 0 becomes 0."""
     if dx < 0.0 and -x / dx < best:
         return -x / dx
@@ -236,19 +237,19 @@ cdef inline double limit_step(double x, double dx, double best) noexcept nogil:
 
 # Steps of a cone are computed in scaled coordinates, where T^-1 s = T u = v. With y = T^-1 G dz, T du is -v - y for the
 # affine step and -(v \\ c) - y for the combined step. T maps the cone onto itself, so step lengths do not change.
-cdef inline void step_affine(const elements_t* e, int32_t i, int32_t g, const double* da, const int32_t n,
+cdef inline void compute_affine_cone_step(const elements_t* e, int32_t i, int32_t g, const double* da, const int32_t n,
                              double* y, double* back) noexcept nogil:
     """Compute y = T^-1 G dz_a and back = T du_a."""
     cdef const double *w = scaling_of(e, g)
     cdef double x[4]
     cdef int32_t k
-    load_cone(e, i, g, da, x)
+    load_cone_variable(e, i, g, da, x)
     apply_inv_scaling(w, n, x, y)
     for k in range(n):
         back[k] = -w[SCALING_V + k] - y[k]
 
 
-cdef inline void combine_steps(const elements_t* e, int32_t i, int32_t g, const double* da, double sigma_mu,
+cdef inline void compute_combined_cone_rhs(const elements_t* e, int32_t i, int32_t g, const double* da, double sigma_mu,
                                const int32_t n, double* rhs) noexcept nogil:
     """Compute v \\\\ c of interior.pxd (4) into the cone's scaling, and rhs = T^-1 (v \\\\ c)."""
     cdef double *w = scaling_of(e, g)
@@ -257,7 +258,7 @@ cdef inline void combine_steps(const elements_t* e, int32_t i, int32_t g, const 
     cdef double y[4]
     cdef double back[4]
     cdef int32_t k
-    step_affine(e, i, g, da, n, y, back)
+    compute_affine_cone_step(e, i, g, da, n, y, back)
     x[0] = -sigma_mu
     for k in range(n):
         x[0] += v[k] * v[k] + y[k] * back[k]
@@ -275,7 +276,7 @@ cdef inline double limit_cone_step(const elements_t* e, int32_t i, int32_t g, co
     cdef double y[4]
     cdef double a
     cdef int32_t k
-    load_cone(e, i, g, dz, x)
+    load_cone_variable(e, i, g, dz, x)
     apply_inv_scaling(w, n, x, y)
     a = distance_to_boundary(w + SCALING_V, y, n)
     best = a if a < best else best

@@ -17,7 +17,7 @@ cdef struct coupled_t:
     const double* h             # entries of H
 
 
-cdef inline void coupled_block(const double* h, double* out, int32_t ld, const double* left, const double* right,
+cdef inline void form_coupled_block(const double* h, double* out, int32_t ld, const double* left, const double* right,
                                double own, bint diagonal, const int32_t ni, const int32_t nj) noexcept nogil:
     """Compute (1) for one pair of elements; the rows of h and out have stride ld."""
     cdef int32_t k, l, t
@@ -45,7 +45,7 @@ cdef inline void coupled_block(const double* h, double* out, int32_t ld, const d
             out[k * ld + l] = x
 
 
-cdef inline void couple_entries(const coupled_t* c, const elements_t* e, const double* left, const double* right, double own,
+cdef inline void form_coupled_entries(const coupled_t* c, const elements_t* e, const double* left, const double* right, double own,
                                 double* out) noexcept nogil:
     """Compute the entries of (1); right may be NULL (the identity)."""
     cdef int32_t i, j, q, ni, nj, at, ld
@@ -60,9 +60,9 @@ cdef inline void couple_entries(const coupled_t* c, const elements_t* e, const d
             if right != NULL:
                 r = right + e.wptr[j]
             if ni == 3 and nj == 3:
-                coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 3, 3)
+                form_coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 3, 3)
             elif ni == 1 and nj == 1:
-                coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 1, 1)
+                form_coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 1, 1)
             else:
-                coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, ni, nj)
+                form_coupled_block(c.h + at, out + at, ld, left + e.wptr[i], r, own, i == j, ni, nj)
             at += nj

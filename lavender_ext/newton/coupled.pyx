@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 
-cdef void list_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
+cdef void list_rows_of_graph(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                     int32_t* indptr, int32_t* indices) noexcept nogil:
     """Write the compressed rows of a graph of n elements, columns ascending; if indices is NULL, write indptr only."""
     cdef int32_t i, j, q, r, width, at
@@ -23,7 +23,7 @@ cdef void list_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int3
                         at += 1
 
 
-def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
+def find_element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
                   const int32_t[::1] indices):
     """Return (indptr, indices) of the graph of elements: the elements whose columns appear in an element's rows of A."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, i, j, q, k, count = 0
@@ -42,7 +42,7 @@ def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int3
     return to_array, other_array[:count].copy()
 
 
-def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const double[::1] scale):
+def scale_matrix_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const double[::1] scale):
     """Return the entries of diag(scale) A diag(scale)."""
     out_array = np.empty(a.shape[0])
     cdef double[::1] out = out_array
@@ -54,23 +54,23 @@ def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const 
     return out_array
 
 
-def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::1] other):
+def list_coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::1] other):
     """Return (indptr, indices) of the rows of the graph of elements; n > 0."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1
     indptr_array = np.empty(ptr[n] + 1, np.int32)
     cdef int32_t[::1] indptr = indptr_array, indices
-    list_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], NULL)
+    list_rows_of_graph(n, &ptr[0], &to[0], &other[0], &indptr[0], NULL)
     indices_array = np.empty(indptr[ptr[n]], np.int32)
     indices = indices_array
     if indices.shape[0]:
         with nogil:
-            list_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], &indices[0])
+            list_rows_of_graph(n, &ptr[0], &to[0], &other[0], &indptr[0], &indices[0])
     return indptr_array, indices_array
 
 
-def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
+def copy_coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
                     const int32_t[::1] indices):
-    """Return the entries of A, whose columns ascend, in the pattern of `coupled_rows`, which includes its own."""
+    """Return the entries of A, whose columns ascend, in the pattern of `list_coupled_rows`, which includes its own."""
     out_array = np.zeros(indices.shape[0])
     cdef double[::1] out = out_array
     cdef int32_t i, p, q

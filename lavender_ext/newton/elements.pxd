@@ -53,7 +53,7 @@ cdef inline void load_components(const elements_t* e, int32_t i, friction_compon
         q.first[g], q.size[g], q.friction_coefficient[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
 
 
-cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
+cdef inline void invert_small_matrix(double* a, double* inv, int32_t n) noexcept nogil:
     """Invert a by Gauss-Jordan elimination with row exchanges; a is lost. A zero pivot leaves zeros in its column."""
     cdef int32_t i, j, k, best
     cdef double x
@@ -88,7 +88,7 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
                         inv[i * n + j] -= x * inv[k * n + j]
 
 
-cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out,
+cdef inline void multiply_by_element_matrices(const elements_t* e, const double* w, const double* x, double* out,
                                const bint turned) noexcept nogil:
     """Compute out = W x, or W^T x, with one small matrix for each element."""
     cdef int32_t i, j, r, c, nr

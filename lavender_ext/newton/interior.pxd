@@ -9,10 +9,11 @@ u is dual to G z, both are inside every cone, and W = G^T T^-2 G with the scalin
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.newton.cones cimport (SCALING_V, add_cone_transpose, combine_steps, cone_gap, cone_size,
+from lavender_ext.newton.cones cimport (SCALING_V, add_cone_transpose, compute_combined_cone_rhs, cone_gap, cone_size,
                                         cone_weight_t, distance_to_boundary, dual_normal, has_lower_bound,
-                                        has_upper_bound, limit_cone_step, limit_step, load_cone, load_dual, load_slack,
-                                        normal_factor, scale_cone, scaling_of, step_affine, store_dual)
+                                        has_upper_bound, limit_cone_step, limit_step_to_nonnegative, load_cone_variable,
+                                        load_cone_dual, compute_cone_dual_from_slack,
+                                        normal_factor, compute_cone_scaling, scaling_of, compute_affine_cone_step, store_cone_dual)
 from lavender_ext.newton.elements cimport elements_t, is_row
 
 
@@ -82,13 +83,13 @@ cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, 
             continue
         for g in range(e.part[i], e.part[i + 1]):
             n = cone_size(e, g)
-            load_cone(e, i, g, z, c)
+            load_cone_variable(e, i, g, z, c)
             x = -cone_gap(c, n) / normal_factor(e.reach[g])
             worst_z = x if x > worst_z else worst_z
-            load_slack(e, i, g, hz, c)
+            compute_cone_dual_from_slack(e, i, g, hz, c)
             x = -cone_gap(c, n)
             worst_u = x if x > worst_u else worst_u
-            store_dual(e, i, g, c, u1, u2)
+            store_cone_dual(e, i, g, c, u1, u2)
             degree += 1.0
     worst_z = worst_z + size if worst_z > -1e-8 * size else 0.0
     worst_u = worst_u + dual * size if worst_u > -1e-8 * size else 0.0
@@ -108,7 +109,7 @@ cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, 
     return degree
 
 
-cdef inline bint is_soft(const elements_t* e, int32_t i) noexcept nogil:
+cdef inline bint has_row_with_compliance(const elements_t* e, int32_t i) noexcept nogil:
     """Return whether a row of element i has compliance."""
     cdef int32_t j
     for j in range(e.ptr[i], e.ptr[i + 1]):
@@ -184,13 +185,13 @@ cdef inline void compute_scaling(const elements_t* e, const interior_t* p, doubl
         for g in range(e.part[i], e.part[i + 1]):
             n = cone_size(e, g)
             # The cones of a contact share its normal, where their weights add in parallel.
-            load_cone(e, i, g, z, s)
-            load_dual(e, i, g, u1, u2, u)
+            load_cone_variable(e, i, g, z, s)
+            load_cone_dual(e, i, g, u1, u2, u)
             y = 0.0 if more else total
             for k in range(n):
                 y += s[k] * u[k]
             total = total + y if more else y
-            scale_cone(s, u, n, e.reach[g], delta, scaling_of(e, g), &cone)
+            compute_cone_scaling(s, u, n, e.reach[g], delta, scaling_of(e, g), &cone)
             x = x * (cone.x / (x + cone.x)) if more else cone.x
             more = True
             first = e.first[g] - j
@@ -205,7 +206,7 @@ cdef inline void compute_scaling(const elements_t* e, const interior_t* p, doubl
         r = sqrt(x)
         for k in range(nr):
             bt[q + k] = r * a[k]
-        if is_soft(e, i):
+        if has_row_with_compliance(e, i):
             add_compliance(e, i, v + q, bt + q)
     gap[0] = total
 
@@ -226,16 +227,16 @@ cdef inline double limit_affine_step(const elements_t* e, const interior_t* p, c
             if has_lower_bound(e, j):
                 a = z[j] - e.lower[j]
                 x = -u1[j] - u1[j] / a * dz[j]
-                best = limit_step(a, dz[j], best)
-                best = limit_step(u1[j], x, best)
+                best = limit_step_to_nonnegative(a, dz[j], best)
+                best = limit_step_to_nonnegative(u1[j], x, best)
                 t00 += a * u1[j]
                 t01 += a * x + u1[j] * dz[j]
                 t11 += x * dz[j]
             if has_upper_bound(e, j):
                 a = e.upper[j] - z[j]
                 x = -u2[j] + u2[j] / a * dz[j]
-                best = limit_step(a, -dz[j], best)
-                best = limit_step(u2[j], x, best)
+                best = limit_step_to_nonnegative(a, -dz[j], best)
+                best = limit_step_to_nonnegative(u2[j], x, best)
                 t00 += a * u2[j]
                 t01 += a * x - u2[j] * dz[j]
                 t11 -= x * dz[j]
@@ -244,11 +245,11 @@ cdef inline double limit_affine_step(const elements_t* e, const interior_t* p, c
             n = cone_size(e, g)
             v = scaling_of(e, g) + SCALING_V
             if n == 3:
-                step_affine(e, i, g, dz, 3, y, back)
+                compute_affine_cone_step(e, i, g, dz, 3, y, back)
                 a = distance_to_boundary(v, y, 3)
                 b = distance_to_boundary(v, back, 3)
             else:
-                step_affine(e, i, g, dz, n, y, back)
+                compute_affine_cone_step(e, i, g, dz, n, y, back)
                 a = distance_to_boundary(v, y, n)
                 b = distance_to_boundary(v, back, n)
             best = a if a < best else best
@@ -289,11 +290,11 @@ cdef inline void form_combined_rhs(const elements_t* e, const interior_t* p, con
             continue
         for g in range(e.part[i], e.part[i + 1]):
             n = cone_size(e, g)
-            load_dual(e, i, g, u1, u2, u)
+            load_cone_dual(e, i, g, u1, u2, u)
             if n == 3:
-                combine_steps(e, i, g, da, sigma_mu, 3, t)
+                compute_combined_cone_rhs(e, i, g, da, sigma_mu, 3, t)
             else:
-                combine_steps(e, i, g, da, sigma_mu, n, t)
+                compute_combined_cone_rhs(e, i, g, da, sigma_mu, n, t)
             for k in range(n):
                 t[k] = u[k] - t[k]
             add_cone_transpose(e, i, g, t, rhs)
@@ -316,15 +317,15 @@ cdef inline double take_combined_step(const elements_t* e, const interior_t* p, 
                 a = z[j] - e.lower[j]
                 x = -u1[j] - u1[j] / a * da[j]
                 x = -u1[j] - (da[j] * x - sigma_mu) / a - u1[j] / a * dz[j]
-                best = limit_step(a, dz[j], best)
-                best = limit_step(u1[j], x, best)
+                best = limit_step_to_nonnegative(a, dz[j], best)
+                best = limit_step_to_nonnegative(u1[j], x, best)
                 du1[j] = x
             if has_upper_bound(e, j):
                 a = e.upper[j] - z[j]
                 x = -u2[j] + u2[j] / a * da[j]
                 x = -u2[j] - (-da[j] * x - sigma_mu) / a + u2[j] / a * dz[j]
-                best = limit_step(a, -dz[j], best)
-                best = limit_step(u2[j], x, best)
+                best = limit_step_to_nonnegative(a, -dz[j], best)
+                best = limit_step_to_nonnegative(u2[j], x, best)
                 du2[j] = x
             continue
         for g in range(e.part[i], e.part[i + 1]):
@@ -333,7 +334,7 @@ cdef inline double take_combined_step(const elements_t* e, const interior_t* p, 
                 best = limit_cone_step(e, i, g, dz, best, 3, du)
             else:
                 best = limit_cone_step(e, i, g, dz, best, n, du)
-            store_dual(e, i, g, du, du1, du2)
+            store_cone_dual(e, i, g, du, du1, du2)
     best = best * damping
     for j in range(e.m):
         z[j] += best * dz[j]
@@ -346,9 +347,9 @@ cdef inline double take_combined_step(const elements_t* e, const interior_t* p, 
                 u2[j] += best * du2[j]
             continue
         for g in range(e.part[i], e.part[i + 1]):
-            load_dual(e, i, g, u1, u2, du)
-            load_dual(e, i, g, du1, du2, u)
+            load_cone_dual(e, i, g, u1, u2, du)
+            load_cone_dual(e, i, g, du1, du2, u)
             for k in range(cone_size(e, g)):
                 du[k] += best * u[k]
-            store_dual(e, i, g, du, u1, u2)
+            store_cone_dual(e, i, g, du, u1, u2)
     return best

@@ -14,10 +14,11 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.newton.elements cimport load_components, elements_t, invert_small, is_row
+from lavender_ext.newton.elements cimport load_components, elements_t, invert_small_matrix, is_row
 
 
-cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s, double* f,
+cdef inline void evaluate_contact_natural_map(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s,
+                                              double* f,
                                  double* p) noexcept nogil:
     """Compute F (nr) and P (nr, nr) of one contact, with Pi in the metric of d."""
     cdef double out[6]
@@ -26,7 +27,7 @@ cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, co
     evaluate_natural_map(law, &q, e.ptr[i + 1] - e.ptr[i], z, s, out, f, p)
 
 
-cdef inline double natural(const elements_t* e, const double* z, const double* s, int32_t law, double eps,
+cdef inline double evaluate_all_natural_maps(const elements_t* e, const double* z, const double* s, int32_t law, double eps,
                                double* f, double* p, double* einv, double* v) noexcept nogil:
     """Compute F, P, E^-1 and V = E^-1 P of (5) for every element; return |F|, the judge's energy error.
 
@@ -49,7 +50,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
                 einv[q] = 1.0 / (e.theta[j] + eps) if side == 0 else 1.0
                 v[q] = einv[q] if side == 0 else 0.0
             continue
-        natural_contact(e, i, law, z + j, s + j, f + j, p + q)
+        evaluate_contact_natural_map(e, i, law, z + j, s + j, f + j, p + q)
         for k in range(nr):
             total += f[j + k] * f[j + k]
         if v != NULL:
@@ -58,7 +59,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
                     x = p[q + k * nr + l]
                     a[k * nr + l] = x * (e.theta[j + l] + eps) - x
                 a[k * nr + k] += 1.0
-            invert_small(a, einv + q, nr)
+            invert_small_matrix(a, einv + q, nr)
             for k in range(nr):
                 for l in range(nr):
                     x = 0.0
@@ -68,7 +69,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
     return sqrt(total)
 
 
-cdef inline void convex_error(const elements_t* e, const double* z, const double* hz, const double* speed,
+cdef inline void compute_convex_residual(const elements_t* e, const double* z, const double* hz, const double* speed,
                                   double* energy, double* velocity) noexcept nogil:
     """Compute |F| of the convex natural map, and the largest speed |f| of a bounded row or friction component."""
     cdef int32_t i, j, k, g, nr
@@ -91,7 +92,7 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
         nr = e.ptr[i + 1] - j
         for k in range(nr):
             s[k] = hz[j + k] - e.g[j + k]
-        natural_contact(e, i, CONE, z + j, s, f, p)
+        evaluate_contact_natural_map(e, i, CONE, z + j, s, f, p)
         for k in range(nr):
             total += f[k] * f[k]
         x = fabs(f[0]) * speed[j]

@@ -5,7 +5,7 @@ from lavender_ext.factor.factors cimport block_matrix_t
 from lavender_ext.newton.elements cimport elements_t
 
 
-cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr,
+cdef inline void add_transposed_product(double* out, const double* left, const double* right, int32_t nr,
                              const int32_t s) noexcept nogil:
     """Add left^T right to out, of nr rows with stride 2 s, s columns each."""
     cdef int32_t i, j, r
@@ -22,7 +22,8 @@ cdef inline void add_product(double* out, const double* left, const double* righ
             out[i * s + j] = row[j]
 
 
-cdef inline void multiply_small(const double* v, const double* rows, double* t, int32_t nr, const int32_t s) noexcept nogil:
+cdef inline void multiply_by_small_matrix(const double* v, const double* rows, double* t, int32_t nr,
+                                          const int32_t s) noexcept nogil:
     """Compute t = V rows (nr, 2 s)."""
     cdef int32_t r, k, c
     cdef double x
@@ -39,7 +40,7 @@ cdef inline void multiply_small(const double* v, const double* rows, double* t, 
             t[r * 2 * s + c] = row[c]
 
 
-cdef inline void add_elements(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu,
+cdef inline void form_normal_matrix_of_width(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu,
                               const int32_t s) noexcept nogil:
     """Form N for a constant number of columns s."""
     cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], n_done
@@ -72,20 +73,20 @@ cdef inline void add_elements(const elements_t* e, const double* v, const block_
             while i < e.group[h + 1] and n_done <= 12:
                 nr = e.ptr[i + 1] - e.ptr[i]
                 if nr == 1:
-                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 1, s)
+                    multiply_by_small_matrix(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 1, s)
                 elif nr == 3:
-                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 3, s)
+                    multiply_by_small_matrix(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 3, s)
                 else:
-                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, nr, s)
+                    multiply_by_small_matrix(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, nr, s)
                 n_done += nr
                 i += 1
-            add_product(f.nval + slot[0] * b, pr, t, n_done, s)
+            add_transposed_product(f.nval + slot[0] * b, pr, t, n_done, s)
             if second >= 0:
-                add_product(f.nval + slot[1] * b, pr + s, t + s, n_done, s)
-                add_product(f.nval + slot[2] * b, pr, t + s, n_done, s)
+                add_transposed_product(f.nval + slot[1] * b, pr + s, t + s, n_done, s)
+                add_transposed_product(f.nval + slot[2] * b, pr, t + s, n_done, s)
                 if lu:
                     # Block (second, first) of K^T V K, transposed: (V K_first)^T K_second.
-                    add_product(f.mval + slot[2] * b, t, pr + s, n_done, s)
+                    add_transposed_product(f.mval + slot[2] * b, t, pr + s, n_done, s)
     if lu:
         # The upper copy of a diagonal block is its transpose.
         for i in range(f.n):
@@ -98,10 +99,10 @@ cdef inline void add_elements(const elements_t* e, const double* v, const block_
 cdef inline void form_normal_matrix(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu) noexcept nogil:
     """Form N of elements.pxd (2) in the blocks of `f`; with `lu` also its upper blocks."""
     if f.s == 1:
-        add_elements(e, v, f, lu, 1)
+        form_normal_matrix_of_width(e, v, f, lu, 1)
     elif f.s == 3:
-        add_elements(e, v, f, lu, 3)
+        form_normal_matrix_of_width(e, v, f, lu, 3)
     elif f.s == 6:
-        add_elements(e, v, f, lu, 6)
+        form_normal_matrix_of_width(e, v, f, lu, 6)
     else:
-        add_elements(e, v, f, lu, f.s)
+        form_normal_matrix_of_width(e, v, f, lu, f.s)

@@ -43,14 +43,15 @@ from libc.string cimport memset
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
-from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
+from lavender_ext.newton.elements cimport elements_t, invert_small_matrix, is_row
 from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
-                                      pop_phase, push_phase, score_point)
-from lavender_ext.newton.system cimport NATURAL, solve_natural, system_factor, determinant_sign, system_times
+                                      pop_phase, push_phase, judge_and_keep_best_point)
+from lavender_ext.newton.system cimport (NATURAL, solve_natural_map_system, factor_newton_system, determinant_sign,
+                                         multiply_system_matrix)
 
 
-cdef inline double exponential(double x) noexcept nogil:
+cdef inline double compute_exponential(double x) noexcept nogil:
     """Return e^x to 1e-15 by a sum with the same bits on every machine, unlike the C library."""
     cdef double k, r, term = 1.0, total = 1.0
     cdef int i, _i, n
@@ -70,7 +71,7 @@ cdef inline double exponential(double x) noexcept nogil:
     return total
 
 
-cdef inline double logarithm(double x) noexcept nogil:
+cdef inline double compute_logarithm(double x) noexcept nogil:
     """Return ln x of x > 0 to 1e-15, with the same bits on every machine: 2 artanh((m - 1) / (m + 1)) for x = m 2^k, m near 1."""
     cdef double k = 0.0, y, square, term, total = 0.0
     cdef int i, _i
@@ -163,7 +164,8 @@ cdef struct smooth_t:           # the smoothed map of one element of n rows
     double ft[6]                # dF / d log tau
 
 
-cdef inline void smooth_row(const elements_t* e, int32_t j, double z, double s, double tau, smooth_t* out) noexcept nogil:
+cdef inline void evaluate_smoothed_row_map(const elements_t* e, int32_t j, double z, double s, double tau,
+                                           smooth_t* out) noexcept nogil:
     """Compute the smoothed map of a bounded row."""
     cdef double y = z - s, x
     out.f[0], out.p[0], out.rest[0], out.ft[0] = s, 1.0, 0.0, 0.0
@@ -180,7 +182,8 @@ cdef inline void smooth_row(const elements_t* e, int32_t j, double z, double s, 
         out.ft[0] += smooth_max_log_tau_derivative(x, tau)
 
 
-cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
+cdef inline void evaluate_smoothed_contact_map(const elements_t* e, int32_t i, const double* z, const double* s, double tau,
+                                               double wide,
                                 smooth_t* out) noexcept nogil:
     """Compute (1) of one contact and its derivatives, I - P without cancellation; `wide` is c tau."""
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, g
@@ -219,7 +222,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
                 out.p[k * nr + l] = (1.0 if k == l else 0.0) - out.rest[k * nr + l]
 
 
-cdef inline void smooth_map(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
+cdef inline void evaluate_smoothed_map(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
     """Compute F of z into n.f and y into n.t1; with `derived` also the small matrices and dF / d log tau (n.c)."""
     cdef const elements_t* e = n.s.e
     cdef double eps = n.path.eps
@@ -235,9 +238,9 @@ cdef inline void smooth_map(newton_t* n, const double* z, double tau, bint deriv
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
         if is_row(e, i):
-            smooth_row(e, j, z[j], n.slack[j], tau, &own)
+            evaluate_smoothed_row_map(e, j, z[j], n.slack[j], tau, &own)
         else:
-            smooth_contact(e, i, z + j, n.slack + j, tau, n.path.friction_ratio * tau, &own)
+            evaluate_smoothed_contact_map(e, i, z + j, n.slack + j, tau, n.path.friction_ratio * tau, &own)
         for k in range(nr):
             n.f[j + k] = own.f[k]
         if not derived:
@@ -247,7 +250,7 @@ cdef inline void smooth_map(newton_t* n, const double* z, double tau, bint deriv
             for l in range(nr):
                 n.s.p[q + k * nr + l] = own.p[k * nr + l]
                 own.rest[k * nr + l] += own.p[k * nr + l] * (e.theta[j + l] + eps)
-        invert_small(own.rest, n.s.einv + q, nr)
+        invert_small_matrix(own.rest, n.s.einv + q, nr)
         for k in range(nr):
             for l in range(nr):
                 x = 0.0
@@ -259,14 +262,14 @@ cdef inline void smooth_map(newton_t* n, const double* z, double tau, bint deriv
 cdef inline void compute_change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
     """Compute dy = dz - (H + eps) dz."""
     cdef int32_t j
-    system_times(&n.s, dz, dy)
+    multiply_system_matrix(&n.s, dz, dy)
     for j in range(n.s.e.m):
         dy[j] = dz[j] - dy[j] - n.path.eps * dz[j]
 
 
-cdef inline double compute_rate(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
+cdef inline double compute_coordinate_rate(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
                            double* turned) noexcept nogil:
-    """Return the rate of a coordinate along (dy, dl) at the y of the last `smooth_map`; write that of the direction of y_t."""
+    """Return the rate of a coordinate along (dy, dl) at the last evaluated y; write that of the direction of y_t."""
     cdef const elements_t* e = n.s.e
     cdef int32_t i = (which - FIRST_COORDINATE) // COORDINATES_PER_ELEMENT
     cdef int32_t part = (which - FIRST_COORDINATE) % COORDINATES_PER_ELEMENT, j, k, first, size
@@ -301,7 +304,7 @@ cdef inline double compute_rate(const newton_t* n, int32_t which, const double* 
     return (dx - x * dl) / sqrt(x * x + 4.0 * wide * wide)
 
 
-cdef inline double find_fastest(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
+cdef inline double find_fastest_coordinate(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
                            double* turned) noexcept nogil:
     """Return the largest rate of a coordinate; write the coordinate, and the largest rate of a direction."""
     cdef const elements_t* e = n.s.e
@@ -316,7 +319,7 @@ cdef inline double find_fastest(const newton_t* n, const double* dy, double dl, 
                     continue
             elif part > e.part[i + 1] - e.part[i]:
                 continue
-            x = fabs(compute_rate(n, COORDINATES_PER_ELEMENT * i + FIRST_COORDINATE + part, dy, dl, tau, &turn))
+            x = fabs(compute_coordinate_rate(n, COORDINATES_PER_ELEMENT * i + FIRST_COORDINATE + part, dy, dl, tau, &turn))
             turned[0] = turned[0] if turn <= turned[0] else turn
             if not x <= worst:
                 worst = x
@@ -324,10 +327,10 @@ cdef inline double find_fastest(const newton_t* n, const double* dy, double dl, 
     return worst
 
 
-cdef inline double largest_change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
+cdef inline double find_largest_coordinate_change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
     """Return the largest change of a coordinate or direction by (dy, dl)."""
     cdef int32_t which
-    cdef double turned, worst = find_fastest(n, dy, dl, tau, &which, &turned)
+    cdef double turned, worst = find_fastest_coordinate(n, dy, dl, tau, &which, &turned)
     return worst if not worst < turned else turned
 
 
@@ -345,7 +348,7 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     for j in range(m):
         x.size += n.s.e.g[j] * n.s.e.g[j]
     x.size = sqrt(x.size / m)
-    x.start = x.l = logarithm(0.3 * x.size)
+    x.start = x.l = compute_logarithm(0.3 * x.size)
     x.tolerance = curve_tolerance()
     x.eps = path_compliance()
     x.trial_residual = 1e-2
@@ -358,16 +361,16 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
         push_phase(n, PATH)
 
 
-cdef inline bint factor_path(newton_t* n, const double* z, double tau) noexcept nogil:
+cdef inline bint compute_path_directions(newton_t* n, const double* z, double tau) noexcept nogil:
     """Compute a of (3) into n.dz and b into x.b, and their changes of y into n.t2 and n.psi; return whether they are finite."""
     cdef int32_t j, m = n.s.e.m
-    smooth_map(n, z, tau, True)
+    evaluate_smoothed_map(n, z, tau, True)
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
-    system_factor(&n.s, NATURAL, n.path.eps)
+    factor_newton_system(&n.s, NATURAL, n.path.eps)
     n.path.sign = determinant_sign(&n.s)
-    solve_natural(&n.s, n.f, n.dz)
-    solve_natural(&n.s, n.c, n.path.b)
+    solve_natural_map_system(&n.s, n.f, n.dz)
+    solve_natural_map_system(&n.s, n.c, n.path.b)
     for j in range(m):
         n.dz[j] = -n.dz[j]
         n.path.b[j] = -n.path.b[j]
@@ -376,21 +379,22 @@ cdef inline bint factor_path(newton_t* n, const double* z, double tau) noexcept 
     return all_finite(n.dz, m) and all_finite(n.path.b, m)
 
 
-cdef inline double project_on_parameter(newton_t* n, double tau, double* change) noexcept nogil:
+cdef inline double eliminate_parameter_change(newton_t* n, double tau, double* change) noexcept nogil:
     """Return dl of (3) and replace a in n.dz by dz = a + b dl; write the largest change of a coordinate."""
     cdef path_t* x = &n.path
     cdef int32_t j
     cdef double turned, dl = 0.0
     if x.parameter != LOG_TAU:
-        dl = -compute_rate(n, x.parameter, n.t2, 0.0, tau, &turned) / compute_rate(n, x.parameter, n.psi, 1.0, tau, &turned)
+        dl = -compute_coordinate_rate(n, x.parameter, n.t2, 0.0, tau, &turned) / compute_coordinate_rate(n, x.parameter, n.psi,
+                                                                                                         1.0, tau, &turned)
     for j in range(n.s.e.m):
         n.dz[j] += x.b[j] * dl
         n.t2[j] += n.psi[j] * dl
-    change[0] = largest_change(n, n.t2, dl, tau)
+    change[0] = find_largest_coordinate_change(n, n.t2, dl, tau)
     return dl
 
 
-cdef inline void add_step(newton_t* n, double* z, double* l, double dl) noexcept nogil:
+cdef inline void add_path_step(newton_t* n, double* z, double* l, double dl) noexcept nogil:
     """Add n.dz to z, and dl to log tau."""
     cdef int32_t j
     for j in range(n.s.e.m):
@@ -398,7 +402,7 @@ cdef inline void add_step(newton_t* n, double* z, double* l, double dl) noexcept
     l[0] += dl
 
 
-cdef inline void compute_tangent(newton_t* n, double tau) noexcept nogil:
+cdef inline void compute_path_tangent(newton_t* n, double tau) noexcept nogil:
     """Compute the tangent from the last b, with the direction that follows from the sign of the determinant.
 
     If the sign is unknown, the parameter continues in its direction.
@@ -408,12 +412,12 @@ cdef inline void compute_tangent(newton_t* n, double tau) noexcept nogil:
     cdef double turned
     x.tl = -1.0 if x.sign > 0 else 1.0
     if x.sign == 0:
-        x.tl = 1.0 if compute_rate(n, x.parameter, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
+        x.tl = 1.0 if compute_coordinate_rate(n, x.parameter, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
     for j in range(n.s.e.m):
         x.t[j] = x.tl * x.b[j]
 
 
-cdef inline void save_point(newton_t* n) noexcept nogil:
+cdef inline void save_path_point(newton_t* n) noexcept nogil:
     """Save the last point, to which the path returns if steps fail. Two points are saved; a third one replaces the older."""
     cdef path_t* x = &n.path
     cdef double* z = x.saved_z[0]
@@ -426,7 +430,7 @@ cdef inline void save_point(newton_t* n) noexcept nogil:
     x.n_saved = 2 if x.n_saved else 1
 
 
-cdef inline bint return_to_saved_point(newton_t* n) noexcept nogil:
+cdef inline bint return_to_saved_path_point(newton_t* n) noexcept nogil:
     """Return to the newest saved point with half the step and a smaller tolerance; return False if no point is saved."""
     cdef path_t* x = &n.path
     cdef double* z = x.saved_z[0]
@@ -444,15 +448,15 @@ cdef inline bint return_to_saved_point(newton_t* n) noexcept nogil:
     return True
 
 
-cdef inline void predict_point(newton_t* n) noexcept nogil:
+cdef inline void predict_path_point(newton_t* n) noexcept nogil:
     """Scale the tangent by its fastest coordinate and follow it by h, into n.u and x.next."""
     cdef path_t* x = &n.path
     cdef int32_t j
-    cdef double fast, turned, ignored, tau = exponential(x.l)
-    smooth_map(n, x.z, tau, False)
+    cdef double fast, turned, ignored, tau = compute_exponential(x.l)
+    evaluate_smoothed_map(n, x.z, tau, False)
     compute_change_of_y(n, x.t, n.t2)
-    fast = find_fastest(n, n.t2, x.tl, tau, &x.parameter, &turned)
-    x.speed = compute_rate(n, x.parameter, n.t2, x.tl, tau, &ignored)
+    fast = find_fastest_coordinate(n, n.t2, x.tl, tau, &x.parameter, &turned)
+    x.speed = compute_coordinate_rate(n, x.parameter, n.t2, x.tl, tau, &ignored)
     fast = fast if not fast < turned else turned
     for j in range(n.s.e.m):
         x.t[j] /= fast
@@ -464,43 +468,43 @@ cdef inline void predict_point(newton_t* n) noexcept nogil:
     x.stage = CORRECTING
 
 
-cdef inline int32_t correct_point(newton_t* n) noexcept nogil:
+cdef inline int32_t correct_path_point(newton_t* n) noexcept nogil:
     """Take a Newton step (3) on n.u; return ON_CURVE, CONVERGING, or DIVERGING if the step from the last point fails."""
     cdef path_t* x = &n.path
-    cdef double tau = exponential(x.next), dl, change
-    if not factor_path(n, n.u, tau):
+    cdef double tau = compute_exponential(x.next), dl, change
+    if not compute_path_directions(n, n.u, tau):
         return DIVERGING
-    dl = project_on_parameter(n, tau, &change)
+    dl = eliminate_parameter_change(n, tau, &change)
     if x.factors == 0:
         x.first_change = change
     x.factors += 1
     if not change < (0.5 * x.change if x.change < 2.0 else 1.0):
         return DIVERGING
-    add_step(n, n.u, &x.next, dl)
+    add_path_step(n, n.u, &x.next, dl)
     if change < x.tolerance:
         return ON_CURVE
     x.change = change
     return CONVERGING if x.factors < MAX_CORRECTIONS else DIVERGING
 
 
-cdef inline void accept_point(newton_t* n) noexcept nogil:
+cdef inline void accept_path_point(newton_t* n) noexcept nogil:
     """Make n.u the last point, choose the next step length, and try to end the path by damped Newton."""
     cdef path_t* x = &n.path
     cdef double factor, residual
-    save_point(n)
+    save_path_point(n)
     copy_vector(n, x.z, n.u)
     x.l = x.next
-    compute_tangent(n, exponential(x.l))
+    compute_path_tangent(n, compute_exponential(x.l))
     x.halvings = 0
     x.steps_since_return += 1
     if x.steps_since_return > STEPS_TO_FULL_TOLERANCE:
         x.tolerance = curve_tolerance()
     # The first correction should change the coordinates by 0.12; it grows with the third power of h.
-    factor = exponential(logarithm(0.12 / (x.first_change if x.first_change > 1e-9 else 1e-9)) / 3.0)
+    factor = compute_exponential(compute_logarithm(0.12 / (x.first_change if x.first_change > 1e-9 else 1e-9)) / 3.0)
     x.h *= 2.0 if factor > 2.0 else 0.5 if factor < 0.5 else factor
     x.h = x.h if x.h < 1.5 else 1.5
     x.stage = STEPPING
-    residual = score_point(n, x.z)
+    residual = judge_and_keep_best_point(n, x.z)
     if residual < x.trial_residual and not is_finished(n):
         x.trial_residual = 0.1 * residual
         x.stage = TRYING
@@ -508,22 +512,22 @@ cdef inline void accept_point(newton_t* n) noexcept nogil:
         push_damped_newton(n, TRIAL_FACTORISATIONS)
 
 
-cdef inline bint repeat_correction(newton_t* n) noexcept nogil:
+cdef inline bint correct_path_point_further(newton_t* n) noexcept nogil:
     """Correct the last point further, and store the result in n.u; return False if that fails."""
     cdef path_t* x = &n.path
-    cdef double tau = exponential(x.next), dl, change
+    cdef double tau = compute_exponential(x.next), dl, change
     x.factors += 1
-    if not factor_path(n, n.u, tau):
+    if not compute_path_directions(n, n.u, tau):
         return False
-    dl = project_on_parameter(n, tau, &change)
+    dl = eliminate_parameter_change(n, tau, &change)
     if not (change < x.change and change <= 1.0):
         return False
-    add_step(n, n.u, &x.next, dl)
+    add_path_step(n, n.u, &x.next, dl)
     x.change = change
     if change < 0.02:
         copy_vector(n, x.z, n.u)
         x.l = x.next
-        compute_tangent(n, exponential(x.l))
+        compute_path_tangent(n, compute_exponential(x.l))
         x.stage = STEPPING
     return x.stage == STEPPING or x.factors < MAX_REPEATED_CORRECTIONS
 
@@ -531,24 +535,24 @@ cdef inline bint repeat_correction(newton_t* n) noexcept nogil:
 cdef inline void start_path(newton_t* n) noexcept nogil:
     """Take a Newton step at the first tau. If the steps do not converge, raise tau and begin again."""
     cdef path_t* x = &n.path
-    cdef double tau = exponential(x.l), change
+    cdef double tau = compute_exponential(x.l), change
     x.factors += 1
     x.parameter = LOG_TAU
     x.speed = -1.0
-    if x.factors > MAX_START_STEPS or not factor_path(n, x.z, tau):
+    if x.factors > MAX_START_STEPS or not compute_path_directions(n, x.z, tau):
         x.raises += 1
         if x.raises > MAX_TAU_RAISES:
             pop_phase(n)
         # The lowest contacts of a stack carry a multiple of the load that g suggests, and a compliance acts on them as much more.
-        x.l += logarithm(10.0)
+        x.l += compute_logarithm(10.0)
         x.eps *= 0.1
         x.start, x.factors = x.l, 0
         memset(x.z, 0, n.s.e.m * sizeof(double))
         return
-    project_on_parameter(n, tau, &change)
-    add_step(n, x.z, &x.l, 0.0)
+    eliminate_parameter_change(n, tau, &change)
+    add_path_step(n, x.z, &x.l, 0.0)
     if change < x.tolerance:
-        compute_tangent(n, tau)
+        compute_path_tangent(n, tau)
         x.stage = STEPPING
 
 
@@ -558,24 +562,24 @@ cdef inline void step_path(newton_t* n) noexcept nogil:
     cdef int32_t outcome
     if x.stage == TRYING:
         x.stage = STEPPING
-    if is_finished(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < logarithm(1e-13 * x.size):
+    if is_finished(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < compute_logarithm(1e-13 * x.size):
         pop_phase(n)
         return
     if x.stage == STARTING:
         start_path(n)
         return
     if x.stage == REPEATING:
-        if repeat_correction(n):
+        if correct_path_point_further(n):
             return
-        if not return_to_saved_point(n):
+        if not return_to_saved_path_point(n):
             pop_phase(n)
             return
         x.stage = STEPPING
     if x.stage == STEPPING:
-        predict_point(n)
-    outcome = correct_point(n)
+        predict_path_point(n)
+    outcome = correct_path_point(n)
     if outcome == ON_CURVE:
-        accept_point(n)
+        accept_path_point(n)
     if outcome != DIVERGING:
         return
     # The step fails: halve it; after every second failure correct the last point further.

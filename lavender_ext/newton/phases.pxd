@@ -22,7 +22,7 @@ from lavender_ext.core.block_projection cimport classify_active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative_residual
-from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone
+from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone_variable
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, INTERIOR_POINT,
                                       INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_ACTIVE_SET, N_AUGMENTED_DE_SAXCE,
@@ -30,10 +30,11 @@ from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTO
                                       active_set_t, augmented_newton_t, begin_separate_best, compute_slack,
                                       convex_residual, copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, newton_t, pop_phase, progress_t, push_phase,
-                                      score_point, stretches_t)
-from lavender_ext.newton.steps cimport interior_step
-from lavender_ext.newton.system cimport (BARRIER, NATURAL, solve_natural, solve_refined, system_factor, system_natural,
-                                         system_solve, system_t, system_times)
+                                      judge_and_keep_best_point, stretches_t)
+from lavender_ext.newton.steps cimport take_interior_point_step
+from lavender_ext.newton.system cimport (BARRIER, NATURAL, solve_natural_map_system, solve_natural_map_system_refined,
+                                         factor_newton_system, evaluate_system_natural_map,
+                                         solve_newton_system, system_t, multiply_system_matrix)
 
 
 cdef enum:                      # active set
@@ -116,7 +117,7 @@ cdef inline void begin_active_set(newton_t* n, const double* z) noexcept nogil:
     cdef active_set_t* x = &n.active
     copy_vector(n, x.z, z)
     copy_vector(n, x.best_z, z)
-    system_times(&n.s, x.z, x.hz)
+    multiply_system_matrix(&n.s, x.z, x.hz)
     x.best = convex_residual(n, x.z, x.hz)
     x.is_scored = x.first_changes = x.exchanges = x.stalled = 0
     x.fewest_changes = UNLIMITED
@@ -131,20 +132,20 @@ cdef inline bint exchange_rows(newton_t* n) noexcept nogil:
     for j in range(n.s.e.m):
         n.slack[j] = x.hz[j] - n.s.e.g[j]
     store_active_bounds(n.s.e, x.z, x.hz, x.bound)
-    system_natural(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
-    system_factor(&n.s, NATURAL, exchange_weight())
+    evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
+    factor_newton_system(&n.s, NATURAL, exchange_weight())
     for j in range(n.s.e.m):
         n.f[j] = -n.f[j]
-    solve_refined(&n.s, n.f, n.dz, n.r, n.da)
+    solve_natural_map_system_refined(&n.s, n.f, n.dz, n.r, n.da)
     finite = all_finite(n.dz, n.s.e.m)
     if finite:
         for j in range(n.s.e.m):
             x.z[j] += n.dz[j]
-        system_times(&n.s, x.z, x.hz)
+        multiply_system_matrix(&n.s, x.z, x.hz)
     return finite
 
 
-cdef inline bint predicts_too_many(int32_t first, int32_t now, int32_t exchanges) noexcept nogil:
+cdef inline bint predicts_too_many_exchanges(int32_t first, int32_t now, int32_t exchanges) noexcept nogil:
     """Return whether (3) predicts more exchanges than an interior point takes steps."""
     cdef double a = 1.0, b = 1.0
     cdef int32_t _
@@ -162,7 +163,7 @@ cdef inline bint predicts_too_many(int32_t first, int32_t now, int32_t exchanges
 cdef inline void end_active_set(newton_t* n) noexcept nogil:
     """Judge the best z and end the phase."""
     if not n.active.is_scored:
-        score_point(n, n.active.best_z)
+        judge_and_keep_best_point(n, n.active.best_z)
     pop_phase(n)
 
 
@@ -174,7 +175,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
     cdef bint gains
     if x.best <= n.tol and not x.is_scored:
         x.is_scored = 1
-        if score_point(n, x.best_z) <= n.tol:
+        if judge_and_keep_best_point(n, x.best_z) <= n.tol:
             pop_phase(n)
             return
     if is_finished(n):
@@ -194,12 +195,12 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
     x.fewest_changes = changed if changed < x.fewest_changes else x.fewest_changes
     # With the same active rows, further exchanges only remove the effect of eps; they continue while that lowers the residual.
     if x.best > n.tol and (not gains if changed == 0 else x.stalled >= MAX_STALLED_EXCHANGES
-                           or predicts_too_many(x.first_changes, changed, x.exchanges)):
+                           or predicts_too_many_exchanges(x.first_changes, changed, x.exchanges)):
         end_active_set(n)
         return
     if not gains and n.tol < x.best < 1e-5:
         x.is_scored = 1
-        score_point(n, x.best_z)
+        judge_and_keep_best_point(n, x.best_z)
         if is_at_roundoff(n):
             pop_phase(n)
             return
@@ -210,7 +211,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
 # -- interior points of the convex law -----------------------------------------------------------------------------------
 
 
-cdef inline void begin_progress(newton_t* n, double trial_residual) noexcept nogil:
+cdef inline void reset_interior_progress(newton_t* n, double trial_residual) noexcept nogil:
     """Reset the progress of an interior point."""
     cdef progress_t* k = &n.progress
     k.lowest = 1.0 / 0.0
@@ -221,12 +222,12 @@ cdef inline void begin_progress(newton_t* n, double trial_residual) noexcept nog
 
 cdef inline void begin_interior_steps(newton_t* n, bint bounded_rows) noexcept nogil:
     """Begin interior point steps from `begin_interior_point`."""
-    begin_progress(n, 1e-2)
+    reset_interior_progress(n, 1e-2)
     n.progress.bounded_rows = bounded_rows
     push_phase(n, INTERIOR_POINT)
 
 
-cdef inline bint leaves_bounds(const elements_t* e, int32_t i, const double* y) noexcept nogil:
+cdef inline bint ray_leaves_bounds(const elements_t* e, int32_t i, const double* y) noexcept nogil:
     """Return whether the ray along y leaves the bounds or a cone of element i."""
     cdef int32_t g
     cdef double x[4]
@@ -234,13 +235,13 @@ cdef inline bint leaves_bounds(const elements_t* e, int32_t i, const double* y) 
         return ((y[e.ptr[i]] < 0.0 and has_lower_bound(e, e.ptr[i]))
                 or (y[e.ptr[i]] > 0.0 and has_upper_bound(e, e.ptr[i])))
     for g in range(e.part[i], e.part[i + 1]):
-        load_cone(e, i, g, y, x)
+        load_cone_variable(e, i, g, y, x)
         if cone_gap(x, cone_size(e, g)) < 0.0:
             return True
     return False
 
 
-cdef inline void fix_direction(newton_t* n, int32_t i) noexcept nogil:
+cdef inline void clear_direction_of_element(newton_t* n, int32_t i) noexcept nogil:
     """Set `direction` and the weights of element i to 0."""
     cdef int32_t k
     memset(n.direction + n.s.e.ptr[i], 0, (n.s.e.ptr[i + 1] - n.s.e.ptr[i]) * sizeof(double))
@@ -270,19 +271,19 @@ cdef inline void find_interior_certificate(newton_t* n) noexcept nogil:
         j = e.ptr[i]
         if (not fabs(n.ip.z[j]) > fabs(n.ip.u1[j]) or s.v[e.wptr[i]] * 0.0 != 0.0
                 or (is_row(e, i) and has_lower_bound(e, j) and has_upper_bound(e, j))):
-            fix_direction(n, i)
+            clear_direction_of_element(n, i)
     while n_fixed and factors_left and not is_budget_spent(n):
         factors_left -= 1
-        system_factor(s, BARRIER, 0.0)
+        factor_newton_system(s, BARRIER, 0.0)
         for _ in range(CERTIFICATE_REFINEMENTS):
-            system_times(s, n.direction, n.slack)
-            system_solve(s, BARRIER, n.slack, n.trial)
+            multiply_system_matrix(s, n.direction, n.slack)
+            solve_newton_system(s, BARRIER, n.slack, n.trial)
             for j in range(e.m):
                 n.direction[j] -= n.trial[j]
         n_fixed = 0
         for i in range(e.n):
-            if leaves_bounds(e, i, n.direction):
-                fix_direction(n, i)
+            if ray_leaves_bounds(e, i, n.direction):
+                clear_direction_of_element(n, i)
                 n_fixed += 1
     n.needs_check = n_fixed == 0
 
@@ -295,7 +296,7 @@ cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nog
     cdef progress_t* k = &n.progress
     pop_phase(n)
     if k.lowest < n.best:
-        score_point(n, k.best_z)
+        judge_and_keep_best_point(n, k.best_z)
     if may_continue and not k.bounded_rows and k.lowest < roundoff_residual() and not is_finished(n) and not is_at_roundoff(n):
         begin_damped_newton(n, k.best_z, CONE, k.lowest, MAX_INNER_STEPS)
         push_damped_newton(n, CONE_END_FACTORISATIONS)
@@ -309,7 +310,7 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
     cdef double residual
     cdef bint gains
     if not k.trial_runs:
-        if k.steps == MAX_INTERIOR_STEPS or is_finished(n) or not interior_step(n):
+        if k.steps == MAX_INTERIOR_STEPS or is_finished(n) or not take_interior_point_step(n):
             end_interior_steps(n, True)
             return
         k.steps += 1
@@ -321,7 +322,7 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
         if residual < k.lowest:
             k.lowest = residual
             copy_vector(n, k.best_z, n.ip.z)
-        if residual <= n.tol and score_point(n, n.ip.z) <= n.tol:
+        if residual <= n.tol and judge_and_keep_best_point(n, n.ip.z) <= n.tol:
             end_interior_steps(n, False)
             return
         if k.bounded_rows and residual < k.trial_residual:
@@ -359,20 +360,20 @@ cdef inline void push_damped_newton(newton_t* n, int32_t limit) noexcept nogil:
     cdef damped_newton_t* x = &n.damped
     x.last = n.s.factorisations + limit if limit < UNLIMITED - n.s.factorisations else UNLIMITED
     x.free_iterations = x.stage = 0
-    score_point(n, x.z)
+    judge_and_keep_best_point(n, x.z)
     push_phase(n, DAMPED_NEWTON)
 
 
-cdef inline double compute_trial_norm(newton_t* n, const damped_newton_t* x, double t) noexcept nogil:
+cdef inline double compute_trial_residual_norm(newton_t* n, const damped_newton_t* x, double t) noexcept nogil:
     """Return |F_c| at z + t dz, which is written to `trial`."""
     cdef int32_t j
     for j in range(n.s.e.m):
         n.trial[j] = n.u[j] + t * n.dz[j]
         n.slack[j] = n.hz[j] + t * n.hdz[j] - n.s.e.g[j] + x.alpha * (n.trial[j] - n.c[j])
-    return system_natural(&n.s, n.trial, n.slack, x.law, 0.0, n.f)
+    return evaluate_system_natural_map(&n.s, n.trial, n.slack, x.law, 0.0, n.f)
 
 
-cdef inline bint take_inner_step(newton_t* n, damped_newton_t* x) noexcept nogil:
+cdef inline bint take_inner_newton_step(newton_t* n, damped_newton_t* x) noexcept nogil:
     """Take a Newton step of the inner problem from z in n.u; return False if the inner problem ends."""
     cdef system_t* s = &n.s
     cdef int32_t j, k, _, m = s.e.m
@@ -382,7 +383,7 @@ cdef inline bint take_inner_step(newton_t* n, damped_newton_t* x) noexcept nogil
     # Value and derivative of F_c.
     for j in range(m):
         n.slack[j] = n.hz[j] - s.e.g[j] + x.alpha * (n.u[j] - n.c[j])
-    size = system_natural(s, n.u, n.slack, x.law, x.alpha, n.f)
+    size = evaluate_system_natural_map(s, n.u, n.slack, x.law, x.alpha, n.f)
     x.history[x.inner_steps] = size
     x.inner_steps += 1
     if (size <= 0.1 * x.history[0] and x.inner_steps > 1) or size == 0.0:
@@ -391,18 +392,18 @@ cdef inline bint take_inner_step(newton_t* n, damped_newton_t* x) noexcept nogil
     if is_budget_spent(n):
         return False
     # Newton direction.
-    system_factor(s, NATURAL, x.alpha)
+    factor_newton_system(s, NATURAL, x.alpha)
     for j in range(m):
         n.f[j] = -n.f[j]
-    solve_natural(s, n.f, n.dz)
+    solve_natural_map_system(s, n.f, n.dz)
     if not all_finite(n.dz, m):
         return False
-    system_times(s, n.dz, n.hdz)
+    multiply_system_matrix(s, n.dz, n.hdz)
     # Non-monotone line search.
     for k in range(x.inner_steps - LINE_SEARCH_MEMORY if x.inner_steps > LINE_SEARCH_MEMORY else 0, x.inner_steps):
         bound = x.history[k] if x.history[k] > bound else bound
     for _ in range(MAX_STEP_HALVINGS):
-        value = compute_trial_norm(n, x, t)
+        value = compute_trial_residual_norm(n, x, t)
         if value < best:
             best, at = value, t
         if value <= (1.0 - 1e-4 * t) * bound:
@@ -411,10 +412,10 @@ cdef inline bint take_inner_step(newton_t* n, damped_newton_t* x) noexcept nogil
     for j in range(m):
         n.u[j] += at * n.dz[j]
         n.hz[j] += at * n.hdz[j]
-    return score_point(n, n.u) > n.tol
+    return judge_and_keep_best_point(n, n.u) > n.tol
 
 
-cdef inline void adapt_alpha(damped_newton_t* x, int32_t factorisations, bint idle) noexcept nogil:
+cdef inline void adapt_proximal_weight(damped_newton_t* x, int32_t factorisations, bint idle) noexcept nogil:
     """Lower the proximal weight after a solved inner problem, or raise it after a failure.
 
     The factors are larger for inner problems with few factorisations. After a single step the active pieces are known,
@@ -470,10 +471,10 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
         x.stage = 1
         copy_vector(n, n.c, x.z)
         copy_vector(n, n.u, x.z)
-        system_times(&n.s, n.u, n.hz)
+        multiply_system_matrix(&n.s, n.u, n.hz)
     # Take a step of its inner problem.
     if x.stage == 1:
-        if take_inner_step(n, x):
+        if take_inner_newton_step(n, x):
             return
         if x.is_solved or x.history[x.inner_steps - 1] <= x.history[0]:
             copy_vector(n, x.z, n.u)
@@ -492,19 +493,19 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
     if n.best > 0.5 * x.earlier_best and is_at_roundoff(n):
         pop_phase(n)
         return
-    adapt_alpha(x, factorisations, idle)
+    adapt_proximal_weight(x, factorisations, idle)
     x.free_iterations = x.free_iterations + 1 if factorisations == 0 else 0
     x.is_stuck = x.is_stuck or x.free_iterations > MAX_FREE_ITERATIONS
 
 
-cdef inline void begin_stretches(newton_t* n, int32_t length, double residual) noexcept nogil:
+cdef inline void begin_damped_newton_stretches(newton_t* n, int32_t length, double residual) noexcept nogil:
     """Begin a damped Newton phase whose first stretch of `length` factorisations must halve `residual`."""
     n.stretches.residual, n.stretches.length = residual, length
     n.stretches.is_running = n.stretches.stretches = 0
     push_phase(n, DAMPED_STRETCHES)
 
 
-cdef inline void step_stretches(newton_t* n) noexcept nogil:
+cdef inline void continue_damped_newton_stretches(newton_t* n) noexcept nogil:
     """Continue damped Newton by another stretch if the last stretch halved the residual; else end the phase."""
     cdef stretches_t* x = &n.stretches
     cdef double best
@@ -531,7 +532,7 @@ cdef inline void step_stretches(newton_t* n) noexcept nogil:
 
 cdef inline void begin_interior_with_newton(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
     """Begin steps of De Saxce's interior point, or of an augmented one, with attempts to finish by Newton steps of `law`."""
-    begin_progress(n, 1e-5 if augmented else 1e-3)
+    reset_interior_progress(n, 1e-5 if augmented else 1e-3)
     n.progress.law, n.progress.augmented = law, augmented
     push_phase(n, INTERIOR_WITH_NEWTON)
 
@@ -543,7 +544,7 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
     cdef bint succeeded
     if not k.trial_runs:
         n.s.augmented = k.augmented
-        succeeded = k.steps < MAX_HYBRID_STEPS and not is_finished(n) and interior_step(n)
+        succeeded = k.steps < MAX_HYBRID_STEPS and not is_finished(n) and take_interior_point_step(n)
         n.s.augmented = 0
         if not succeeded:
             pop_phase(n)
@@ -553,7 +554,7 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
             n.counts[N_AUGMENTED_INTERIOR] += 1
         else:
             n.counts[N_AUGMENTED_DE_SAXCE if k.augmented else N_DE_SAXCE] += 1
-        residual = score_point(n, n.ip.z)
+        residual = judge_and_keep_best_point(n, n.ip.z)
         k.idle = 0 if residual < 0.5 * k.lowest else k.idle + 1
         if residual < k.lowest:
             k.lowest = residual
@@ -582,7 +583,7 @@ cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept n
     """Begin Newton steps on the augmented system from z."""
     cdef augmented_newton_t* x = &n.augmented
     copy_vector(n, x.z, z)
-    x.best = score_point(n, z)
+    x.best = judge_and_keep_best_point(n, z)
     x.failed = 0
     x.steps_left = AUGMENTED_TRIAL_STEPS
     push_phase(n, AUGMENTED_NEWTON)
@@ -599,19 +600,19 @@ cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
     x.steps_left -= 1
     n.s.augmented = 1
     compute_slack(n, x.z, n.slack)
-    system_natural(&n.s, x.z, n.slack, n.progress.law, augmented_shift(), n.f)
-    system_factor(&n.s, NATURAL, augmented_shift())
+    evaluate_system_natural_map(&n.s, x.z, n.slack, n.progress.law, augmented_shift(), n.f)
+    factor_newton_system(&n.s, NATURAL, augmented_shift())
     n.counts[N_AUGMENTED_NEWTON] += 1
     for j in range(n.s.e.m):
         n.f[j] = -n.f[j]
-    solve_refined(&n.s, n.f, n.dz, n.r, n.da)
+    solve_natural_map_system_refined(&n.s, n.f, n.dz, n.r, n.da)
     n.s.augmented = 0
     for j in range(n.s.e.m):
         x.z[j] += n.dz[j]
     if not all_finite(x.z, n.s.e.m):
         pop_phase(n)
         return
-    residual = score_point(n, x.z)
+    residual = judge_and_keep_best_point(n, x.z)
     x.failed = 0 if residual < 0.5 * x.best else x.failed + 1
     x.best = residual if residual < x.best else x.best
     if x.failed >= MAX_FAILED_AUGMENTED_STEPS or (x.failed and is_at_roundoff(n)):

@@ -39,17 +39,17 @@ from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
                                          begin_damped_newton, begin_interior_steps, begin_interior_with_newton,
-                                         begin_stretches, push_damped_newton, step_active_set, step_augmented_newton,
+                                         begin_damped_newton_stretches, push_damped_newton, step_active_set, step_augmented_newton,
                                          step_damped_newton, step_interior_point, step_interior_with_newton,
-                                         step_stretches)
+                                         continue_damped_newton_stretches)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
                                       PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, compute_slack, copy_vector,
                                       de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
                                       is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
-                                      restore_earlier_best, score_point, store_earlier_best, write_unknown)
-from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, proximal_weight
-from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, system_factor, system_solve
+                                      restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
+from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
+from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, factor_newton_system, solve_newton_system
 
 
 cdef enum:                      # states of PLAN_CONVEX
@@ -134,7 +134,7 @@ cdef inline void refine_point(newton_t* n, double* z, int32_t max_refinements, d
         size += n.r[j] * n.r[j]
     size = sqrt(size)
     for _ in range(max_refinements):
-        system_solve(&n.s, BARRIER, n.r, n.dz)
+        solve_newton_system(&n.s, BARRIER, n.r, n.dz)
         for j in range(m):
             z[j] -= n.dz[j]
         n.counts[N_REFINEMENTS] += 1
@@ -150,7 +150,7 @@ cdef inline void refine_point(newton_t* n, double* z, int32_t max_refinements, d
         if not size < contraction * before or residual <= 1e-3 * n.tol:
             break
     if residual <= n.tol:
-        score_point(n, z)
+        judge_and_keep_best_point(n, z)
 
 
 cdef inline bint is_inside_bounds(newton_t* n, const double* z, bint require_free) noexcept nogil:
@@ -169,7 +169,7 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
     cdef int32_t j
     cdef double* z = n.ip.unbounded_z
     cdef bint is_linear
-    begin_interior_point(n, proximal_weight(), 0.0)
+    begin_interior_point(n, compute_proximal_weight(), 0.0)
     is_linear = is_inside_bounds(n, z, True)
     if not is_linear and (n.s.form == BODIES or not is_inside_bounds(n, z, False)):
         return
@@ -180,8 +180,8 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
         # The weight changes z on nearly dependent rows. A factor with nearly no weight is less exact, which refinement corrects.
         for j in range(n.s.e.m):
             n.s.v[j] = 1.0 / (n.s.e.theta[j] + 1e-12)
-        system_factor(&n.s, BARRIER, 0.0)
-        system_solve(&n.s, BARRIER, n.s.e.g, n.trial)
+        factor_newton_system(&n.s, BARRIER, 0.0)
+        solve_newton_system(&n.s, BARRIER, n.s.e.g, n.trial)
         refine_point(n, n.trial, EXACT_POINT_REFINEMENTS, 1.0)
 
 
@@ -200,7 +200,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     n.stage = state + 1
     if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_DAMPED_NEWTON:
         if not is_finished(n):
-            restore_earlier_best(n)
+            restore_best_before_phase(n)
     if state != START_ACTIVE_SET and state != FIRST_CONE_WEIGHT and is_over(n):
         state = CONVEX_END
     if state == START_ACTIVE_SET:
@@ -213,7 +213,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     elif state == ROWS_DAMPED_NEWTON:
         if n.s.form == BODIES or (n.s.form == SPARSE and not n.s.symmetric):
             begin_damped_newton(n, n.best_z, CONE, 1e-3, MAX_INNER_STEPS)
-            begin_stretches(n, STRETCH_FACTORISATIONS, 1.0 / 0.0)
+            begin_damped_newton_stretches(n, STRETCH_FACTORISATIONS, 1.0 / 0.0)
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
         n.stage = AUGMENTED_INTERIOR_POINT
@@ -221,7 +221,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_point(n, first_cone_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == SECOND_CONE_WEIGHT:
-        begin_interior_point(n, proximal_weight(), 0.0)
+        begin_interior_point(n, compute_proximal_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
         restore_best_of_all(n)
@@ -253,14 +253,15 @@ cdef inline void begin_augmented_de_saxce(newton_t* n) noexcept nogil:
     push_phase(n, DE_SAXCE)
 
 
-cdef inline void begin_de_saxce_end(newton_t* n, double alpha, int32_t max_inner_steps, int32_t limit) noexcept nogil:
+cdef inline void begin_damped_newton_after_de_saxce(newton_t* n, double alpha, int32_t max_inner_steps,
+                                                    int32_t limit) noexcept nogil:
     """Begin damped Newton from the best point of De Saxce's interior point."""
     begin_damped_newton(n, n.progress.best_z, COULOMB, alpha, max_inner_steps)
     begin_separate_best(n)
     push_damped_newton(n, limit)
 
 
-cdef inline void step_de_saxce(newton_t* n) noexcept nogil:
+cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     """Enter the next state of De Saxce's interior point."""
     cdef de_saxce_t* x = &n.de_saxce
     cdef int32_t state = x.stage
@@ -268,7 +269,7 @@ cdef inline void step_de_saxce(newton_t* n) noexcept nogil:
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
         n.s.augmented = x.augmented
-        begin_interior_point(n, augmented_shift() if x.augmented else proximal_weight(), x.derivative_fraction)
+        begin_interior_point(n, augmented_shift() if x.augmented else compute_proximal_weight(), x.derivative_fraction)
         n.s.augmented = 0
         begin_interior_with_newton(n, COULOMB, x.augmented)
         return
@@ -281,9 +282,9 @@ cdef inline void step_de_saxce(newton_t* n) noexcept nogil:
     elif state == DE_SAXCE_FIRST_END and best > x.max_residual:
         pop_phase(n)
     elif state == DE_SAXCE_FIRST_END:
-        begin_de_saxce_end(n, min(best, 1e-3), FIRST_END_INNER_STEPS, FIRST_END_FACTORISATIONS)
+        begin_damped_newton_after_de_saxce(n, min(best, 1e-3), FIRST_END_INNER_STEPS, FIRST_END_FACTORISATIONS)
     else:
-        begin_de_saxce_end(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
+        begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
@@ -297,7 +298,7 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         state = COULOMB_END
     if state == START_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
-        begin_stretches(n, START_FACTORISATIONS, 2.0 * max_start_gain() * n.best)
+        begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_gain() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
     elif state == FIRST_PATH:
@@ -330,7 +331,7 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
     elif phase == PLAN_COULOMB:
         enter_next_coulomb_state(n)
     elif phase == DE_SAXCE:
-        step_de_saxce(n)
+        enter_next_de_saxce_state(n)
     elif phase == ACTIVE_SET:
         step_active_set(n)
     elif phase == INTERIOR_POINT:
@@ -342,12 +343,12 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
     elif phase == DAMPED_NEWTON:
         step_damped_newton(n)
     elif phase == DAMPED_STRETCHES:
-        step_stretches(n)
+        continue_damped_newton_stretches(n)
     else:
         step_path(n)
 
 
-cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
+cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nogil:
     """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
@@ -363,12 +364,12 @@ cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     n.stage = FIRST_CONE_WEIGHT if has_cones and n.problem.p.law != COULOMB else 0
     write_unknown(n, lam, n.trial)
     copy_vector(n, n.best_z, n.trial)
-    score_point(n, n.trial)
+    judge_and_keep_best_point(n, n.trial)
     if not is_finished(n):
         push_phase(n, PLAN_COULOMB if n.problem.p.law == COULOMB and has_cones else PLAN_CONVEX)
 
 
-cdef inline int32_t newton_step(newton_t* n, int32_t work) noexcept nogil:
+cdef inline int32_t step_newton_solve(newton_t* n, int32_t work) noexcept nogil:
     """Do at least `work` factorisations, unless the solve ends before; return the outcome so far."""
     cdef int32_t last = n.s.factorisations + work
     n.needs_check = 0

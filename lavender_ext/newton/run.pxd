@@ -1,6 +1,6 @@
 """The state of one solve by Newton's method: phases, vectors, budget, and the best point.
 
-Points are compared by the judge's relative residual alone (`score_point`). The active phases form a stack. A call of the
+`judge_and_keep_best_point` compares points by the judge's relative residual. The active phases form a stack. A call of the
 phase on top does at most one factorisation, except for requests of a certificate, so that the caller can check a clock
 in between.
 """
@@ -17,10 +17,10 @@ from lavender_ext.judge.best cimport (
 from lavender_ext.judge.measure cimport residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.newton.interior cimport interior_t
-from lavender_ext.newton.natural_map cimport convex_error
+from lavender_ext.newton.natural_map cimport compute_convex_residual
 from lavender_ext.newton.scaling cimport (bind_element_workspace, bind_scaling_workspace, scale_elements,
                                           scaled_index_size, scaled_real_size, scaled_t)
-from lavender_ext.newton.system cimport system_t, system_times
+from lavender_ext.newton.system cimport system_t, multiply_system_matrix
 
 
 cdef enum:                      # phases
@@ -330,7 +330,7 @@ cdef inline void copy_vector(const newton_t* n, double* to, const double* x) noe
 cdef inline void compute_slack(newton_t* n, const double* z, double* slack) noexcept nogil:
     """Compute s = H z - g."""
     cdef int32_t j
-    system_times(&n.s, z, slack)
+    multiply_system_matrix(&n.s, z, slack)
     for j in range(n.s.e.m):
         slack[j] -= n.s.e.g[j]
 
@@ -386,7 +386,7 @@ cdef inline double judge_point(newton_t* n, const double* z, bint floor) noexcep
     return residual
 
 
-cdef inline double score_point(newton_t* n, const double* z) noexcept nogil:
+cdef inline double judge_and_keep_best_point(newton_t* n, const double* z) noexcept nogil:
     """Judge z and return its residual. Keep z if it is the best point so far, and keep the best impulse of each island.
 
     The best impulses of the islands together may be within tol before a single point is.
@@ -406,7 +406,7 @@ cdef inline double score_point(newton_t* n, const double* z) noexcept nogil:
 cdef inline double convex_residual(newton_t* n, const double* z, const double* hz) noexcept nogil:
     """Return the relative residual of the convex law from hz = H z, without the judge."""
     cdef double energy, velocity
-    convex_error(n.s.e, z, hz, n.sc.speed, &energy, &velocity)
+    compute_convex_residual(n.s.e, z, hz, n.sc.speed, &energy, &velocity)
     return relative_residual(energy, velocity, n.problem.e0, n.problem.v0)
 
 
@@ -436,7 +436,7 @@ cdef inline bint is_over(newton_t* n) noexcept nogil:
 # -- the best point --------------------------------------------------------------------------------------------------
 
 
-cdef inline void restore_earlier_best(newton_t* n) noexcept nogil:
+cdef inline void restore_best_before_phase(newton_t* n) noexcept nogil:
     """Continue from the best point before the last phase, and save the phase's own best point for `restore_best_of_all`."""
     if n.best < n.earlier_best:
         n.has_saved_best = 1

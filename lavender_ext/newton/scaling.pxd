@@ -31,7 +31,7 @@ cdef struct scaled_t:
     int32_t whole               # whether no row is fixed
 
 
-cdef inline bint is_known(const blocks_t* p) noexcept nogil:
+cdef inline bint is_problem_supported(const blocks_t* p) noexcept nogil:
     """Return whether the method accepts the problem: no round cones of more than two tangents."""
     cdef int32_t i
     for i in range(p.n_blocks):
@@ -55,7 +55,7 @@ cdef inline double upper_bound(const blocks_t* p, int32_t i, int32_t j) noexcept
     return p.upper[j] if has_independent_rows(p, i) else 1.0 / 0.0
 
 
-cdef inline double component_coefficient(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+cdef inline double get_component_coefficient(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
     """Return the friction coefficient of the component of row j (not the normal) of contact i."""
     cdef friction_components_t q
     cdef int32_t g = 0
@@ -100,7 +100,7 @@ cdef inline bint is_fixed(const view_t* v, int32_t i, int32_t j, double* at) noe
     cdef double x, low, high
     at[0] = 0.0
     if not is_row(p, i):
-        return j > p.ptr[i] and component_coefficient(p, i, j) == 0.0
+        return j > p.ptr[i] and get_component_coefficient(p, i, j) == 0.0
     low, high = lower_bound(p, i, j), upper_bound(p, i, j)
     if low == high:
         at[0] = low
@@ -190,7 +190,7 @@ cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept n
 
 cdef inline double cone_coefficient(const scaled_t* s, const blocks_t* p, int32_t i, int32_t at) noexcept nogil:
     """Return the friction coefficient of element i at its row `at` in the scaled unknown."""
-    return component_coefficient(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
+    return get_component_coefficient(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
 
 
 cdef inline bint write_fixed_impulses(scaled_t* s, const view_t* v) noexcept nogil:

@@ -7,9 +7,9 @@ from lavender_ext.newton.elements cimport elements_t
 
 
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
-cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
+cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
 cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
-cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
-cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
+cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
+cdef int32_t step_newton_system(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                          info_t* info) noexcept nogil
 cdef const elements_t* elements_of(object solve) except NULL

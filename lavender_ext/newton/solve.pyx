@@ -27,19 +27,21 @@ from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_
                                          order_index_size, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
-from lavender_ext.newton.path cimport path_compliance, smooth_map
+from lavender_ext.newton.path cimport path_compliance, evaluate_smoothed_map
 from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
-from lavender_ext.newton.plan cimport newton_start, newton_step
+from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, N_COUNTED, PATH, bind_index_workspace,
                                       bind_judge_workspace, bind_real_workspace, convex_residual, judge_workspace_size,
                                       method_index_size, method_real_size, newton_t, set_problem, set_reference,
                                       write_certificate, write_impulse)
-from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_known
-from lavender_ext.newton.steps cimport begin_interior_point, combine_pair, interior_step, multiply_duals, normal_shifts
+from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_problem_supported
+from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
+                                        multiply_cone_duals, compute_all_normal_shifts)
 from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, dense_workspace_size, external_t,
-                                         natural_times, solve_natural, solve_refined, system_factor, system_natural,
-                                         determinant_sign, system_solve, system_times)
+                                         multiply_by_natural_map_derivative, solve_natural_map_system,
+                                         solve_natural_map_system_refined, factor_newton_system, evaluate_system_natural_map,
+                                         determinant_sign, solve_newton_system, multiply_system_matrix)
 
 SYSTEMS = {"barrier": BARRIER, "pair": PAIR, "natural": NATURAL}
 #: Bits of `Solve.disabled_phases`.
@@ -91,16 +93,16 @@ cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) no
     """Start from lam (m). The workspace must be bound before."""
     n.tol, n.budget = o.tol, o.budget
     set_reference(&n.problem, o.e0, o.v0)
-    newton_start(n, lam)
+    start_newton_solve(n, lam)
     return MORE
 
 
-cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
+cdef int32_t step_newton_system(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                 info_t* info) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int32_t how
     n.budget, n.proven, n.stop = o.budget, o.proven, o.stop
-    how = newton_step(n, work)
+    how = step_newton_solve(n, work)
     if n.best <= n.tol or n.island_best.seen == 0:
         write_impulse(n, n.best_z, lam)
     else:
@@ -116,7 +118,7 @@ cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_
     cdef int64_t m = v.p.n_rows
     r.n_index = head() + method_index_size(m)
     r.n_real = judge_workspace_size(&v.p, NULL, NULL) + method_real_size(m, 6 * m) + 2 * m * m + dense_workspace_size(m, True) + 8
-    return is_known(&v.p)
+    return is_problem_supported(&v.p)
 
 
 cdef inline void bind_dense_system(newton_t* n, bint wide, const double* h, double* matrix, double* lower) noexcept nogil:
@@ -127,7 +129,7 @@ cdef inline void bind_dense_system(newton_t* n, bint wide, const double* h, doub
     n.s.form, n.s.h, n.s.multiplied = DENSE, h, lower
 
 
-cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
+cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int64_t m = v.p.n_rows
     cdef workspace_t need
@@ -154,7 +156,7 @@ cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspac
     return size > 0
 
 
-cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
+cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef pattern_t* a = &(<state_t*>r.index).a
     cdef int64_t below, first = head() + index_workspace_size(&v.p, v.r), needed
@@ -187,7 +189,7 @@ cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, c
 cdef class Solve(Method)        # defined below
 
 
-cdef int32_t call_factor(void* at, int32_t what, double eps) noexcept with gil:
+cdef int32_t call_linear_factor(void* at, int32_t what, double eps) noexcept with gil:
     cdef Solve self = <Solve>at
     try:
         return bool(self.others.factor(what, eps))
@@ -197,7 +199,7 @@ cdef int32_t call_factor(void* at, int32_t what, double eps) noexcept with gil:
         return 0
 
 
-cdef void call_solve(void* at, double* x) noexcept with gil:
+cdef void call_linear_solve(void* at, double* x) noexcept with gil:
     cdef Solve self = <Solve>at
     cdef double[::1] view = <double[:self.m]>x
     cdef const double[::1] solution
@@ -280,7 +282,7 @@ cdef class Solve(Method):
     data : Data
         With d and nu, and the error of the zero impulse.
     matrix : Data or None
-        A in compressed rows; None: over the bodies of `data`, or over the bodies that `graph.bodies_in` finds.
+        A in compressed rows; None: over the bodies of `data`, or over the bodies that `graph.find_bodies_of_velocities` finds.
     """
     cdef newton_t* n
     cdef external_t calls
@@ -294,9 +296,9 @@ cdef class Solve(Method):
 
     def __init__(self, Data data, Data matrix=None):
         cdef newton_t* n
-        cdef view_t v = data.view() if matrix is None else view_t(data.blocks, &matrix.csr, NULL, NULL)
+        cdef view_t v = data.get_pointers() if matrix is None else view_t(data.blocks, &matrix.csr, NULL, NULL)
         cdef int64_t rows = data.blocks.n_rows, k
-        self.data, self.view, self.own = data, data.view(), method_t(NULL, NULL, system_step)
+        self.data, self.view, self.own = data, data.get_pointers(), method_t(NULL, NULL, step_newton_system)
         self.index = np.zeros(head() + method_index_size(rows) + 1, np.int32)
         self.space.index = <int32_t*>get_data_pointer(self.index)
         n = self.n = state_of(&self.space)
@@ -321,7 +323,7 @@ cdef class Solve(Method):
         self.v, self.einv = part(self.real, n.s.v, n.sc.small), part(self.real, n.s.einv, n.sc.small)
         self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
         self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
-        self.calls = external_t(<void*>self, call_factor, call_solve)
+        self.calls = external_t(<void*>self, call_linear_factor, call_linear_solve)
         self.interrupt = interrupt_t(<void*>self, is_interrupted, 0.0, 0)
 
     @property
@@ -340,7 +342,7 @@ cdef class Solve(Method):
         """Set the object that factors the augmented system."""
         self.others, self.n.s.others = others, &self.calls
 
-    def over_rows(self, double[:, ::1] h, bint symmetric, bint wide):
+    def use_dense_matrix(self, double[:, ::1] h, bint symmetric, bint wide):
         """Use H (m, m), dense."""
         cdef double[::1] whole = np.empty(self.m * self.m + 1)
         cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
@@ -348,7 +350,7 @@ cdef class Solve(Method):
         self.n.s.symmetric = symmetric
         bind_dense_system(self.n, wide and has_wide(), &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
 
-    def over_entries(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
+    def use_sparse_matrix(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
         """Use H in compressed rows. Its linear system `linear` has the pattern of the graph (to, other) of elements.
 
         h has the entries of H in these rows, diagonal (m,) those on the diagonal.
@@ -360,15 +362,15 @@ cdef class Solve(Method):
         self.n.s.a.data = <double*>get_data_pointer(values)
         self.n.s.coupled.to, self.n.s.coupled.other = <int32_t*>get_data_pointer(to), <int32_t*>get_data_pointer(other)
         self.n.s.coupled.diagonal, self.n.s.coupled.h = <int32_t*>get_data_pointer(diagonal), <double*>get_data_pointer(h)
-        linear.lend(np.asarray(matrix)[:len(h)], PIVOT_TOLERANCE)
+        linear.factor_rows_of_kernel(np.asarray(matrix)[:len(h)], PIVOT_TOLERANCE)
         self.n.s.coupled.indptr = linear.f.rows.indptr
         self.linear, self.n.s.linear = linear, &linear.f
 
     def jacobian(self, const int32_t[:, ::1] pair, const int32_t[::1] column=None):
         """Return K = D^-1/2 J M^-1/2 (rows, 12) of the bodies and the used columns of a body: 1, 2, 3 or all 6.
 
-        pair (blocks, 2) are the bodies of each block; with J and M also column (nv,), of `graph.bodies_in`. A column with
-        entries up to 1e-9 (spheres turned by the rounding of their arms) is dropped: H = K K^T + theta has a unit
+        pair (blocks, 2) are the bodies of each block; with J and M also column (nv,), from `find_bodies_of_velocities`. A
+        column with entries up to 1e-9 (spheres turned by the rounding of their arms) is dropped: H = K K^T + theta has a unit
         diagonal and changes by 1e-18.
         """
         cdef const rows_t* r = &self.data.rows
@@ -390,7 +392,7 @@ cdef class Solve(Method):
         columns = [c for c in range(6) if used >> c & 1] or [0]
         return panel, np.array(columns if len(columns) <= 3 else range(6), np.int32)
 
-    def over_bodies(self, panel, const int32_t[::1] columns, Layout layout, bint lu, bint wide):
+    def use_bodies(self, panel, const int32_t[::1] columns, Layout layout, bint lu, bint wide):
         """Use K of `jacobian`, which is overwritten, with these columns of each body; lu: N may have to be factored as L U."""
         cdef block_matrix_t* f = &self.n.linear.blocks
         cdef pattern_t a = layout.a
@@ -443,38 +445,38 @@ cdef class Solve(Method):
 
     # -- single operations, for tests --------------------------------------------------------------
 
-    def times(self, const double[::1] x):
+    def multiply_matrix(self, const double[::1] x):
         """Return H x."""
         out_array = np.empty(self.m)
         cdef double[::1] out = out_array
-        system_times(&self.n.s, &x[0], &out[0])
+        multiply_system_matrix(&self.n.s, &x[0], &out[0])
         return out_array
 
-    def natural(self, const double[::1] z, const double[::1] s, int law, double eps):
+    def evaluate_natural_map(self, const double[::1] z, const double[::1] s, int law, double eps):
         """Return F (m,) of the natural map of `law`; the small matrices of its derivative go to p, einv and v."""
         f_array = np.empty(self.m)
         cdef double[::1] f = f_array
-        system_natural(&self.n.s, &z[0], &s[0], law, eps, &f[0])
+        evaluate_system_natural_map(&self.n.s, &z[0], &s[0], law, eps, &f[0])
         return f_array
 
-    def smooth(self, const double[::1] z, double tau, double ratio=1.0):
+    def evaluate_smoothed_natural_map(self, const double[::1] z, double tau, double ratio=1.0):
         """Return F (m,) of path.pxd with c = ratio, and dF / d log tau (m,); small matrices go to p, einv and v."""
         cdef newton_t* n = self.n
         n.s.law, n.path.friction_ratio, n.path.eps = COULOMB, ratio, path_compliance()
-        smooth_map(n, &z[0], tau, True)
+        evaluate_smoothed_map(n, &z[0], tau, True)
         return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
 
-    def natural_times(self, const double[::1] dz):
+    def multiply_by_natural_map_derivative(self, const double[::1] dz):
         """Return (I - P) dz + P H dz."""
         out_array = np.empty(self.m)
         cdef double[::1] out = out_array
-        natural_times(&self.n.s, &dz[0], &out[0])
+        multiply_by_natural_map_derivative(&self.n.s, &dz[0], &out[0])
         return out_array
 
     def factor(self, str what, double eps=0.0, bint augmented=False):
         """Factor the system "barrier", "pair" or "natural"; return whether no pivot failed."""
         self.n.s.augmented = augmented
-        return bool(system_factor(&self.n.s, SYSTEMS[what], eps))
+        return bool(factor_newton_system(&self.n.s, SYSTEMS[what], eps))
 
     @property
     def sign(self):
@@ -486,11 +488,11 @@ cdef class Solve(Method):
         out_array = np.empty(self.m)
         cdef double[::1] out = out_array
         if what != "natural":
-            system_solve(&self.n.s, SYSTEMS[what], &r[0], &out[0])
+            solve_newton_system(&self.n.s, SYSTEMS[what], &r[0], &out[0])
         elif refined:
-            solve_refined(&self.n.s, &r[0], &out[0], self.n.r, self.n.da)
+            solve_natural_map_system_refined(&self.n.s, &r[0], &out[0], self.n.r, self.n.da)
         else:
-            solve_natural(&self.n.s, &r[0], &out[0])
+            solve_natural_map_system(&self.n.s, &r[0], &out[0])
         return out_array
 
     def exchange_rows(self, const double[::1] z):
@@ -511,7 +513,7 @@ cdef class Solve(Method):
 
     def step_interior(self):
         """Take an interior point step; return (succeeded, length, gap before, |F| and velocity error after it)."""
-        went = interior_step(self.n)
+        went = take_interior_point_step(self.n)
         return went, self.n.ip.length, self.n.ip.gap, self.n.ip.energy, self.n.ip.velocity
 
     @property
@@ -533,14 +535,14 @@ cdef class Solve(Method):
         """Return phi (on normals) and psi (m,) of s (m,)."""
         phi_array, psi_array = np.empty(self.m), np.empty(self.m)
         cdef double[::1] phi = phi_array, psi = psi_array
-        normal_shifts(self.n.s.e, &s[0], fraction, &phi[0], &psi[0])
+        compute_all_normal_shifts(self.n.s.e, &s[0], fraction, &phi[0], &psi[0])
         return phi_array, psi_array
 
-    def combine_pair(self, double fraction):
+    def form_de_saxce_matrices(self, double fraction):
         """Compute the small matrices of De Saxce's form at the interior point, into pair or v; return psi (m,)."""
-        multiply_duals(self.n.s.e, &self.n.ip, self.n.u)
-        normal_shifts(self.n.s.e, self.n.u, fraction, self.n.c, self.n.psi)
-        combine_pair(&self.n.s, self.n.psi)
+        multiply_cone_duals(self.n.s.e, &self.n.ip, self.n.u)
+        compute_all_normal_shifts(self.n.s.e, self.n.u, fraction, self.n.c, self.n.psi)
+        form_de_saxce_matrices(&self.n.s, self.n.psi)
         return np.asarray(<double[:self.m]>self.n.psi).copy()
 
 

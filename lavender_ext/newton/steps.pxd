@@ -28,17 +28,17 @@ from libc.string cimport memset
 
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.newton.cones cimport add_cone_transpose, has_lower_bound, has_upper_bound, load_dual
+from lavender_ext.newton.cones cimport add_cone_transpose, has_lower_bound, has_upper_bound, load_cone_dual
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.interior cimport (compute_scaling, form_combined_rhs, interior_t, limit_affine_step,
                                            place_inside_cones, take_combined_step)
-from lavender_ext.newton.natural_map cimport convex_error
+from lavender_ext.newton.natural_map cimport compute_convex_residual
 from lavender_ext.newton.run cimport copy_vector, newton_t
-from lavender_ext.newton.system cimport (BARRIER, PAIR, set_first_weights, system_factor, system_solve, system_t,
-                                         system_times)
+from lavender_ext.newton.system cimport (BARRIER, PAIR, set_first_weights, factor_newton_system, solve_newton_system, system_t,
+                                         multiply_system_matrix)
 
 
-cdef inline double proximal_weight() noexcept nogil:
+cdef inline double compute_proximal_weight() noexcept nogil:
     """Return the proximal weight of an interior point, as a fraction of d.
 
     A larger weight changes the steps; a smaller one is lost in the rounding of a pivot (2^-53).
@@ -98,24 +98,24 @@ cdef inline void begin_interior_point(newton_t* n, double delta, double derivati
     p.length = 1.0
     memset(p.u1, 0, m * sizeof(double))
     memset(p.u2, 0, m * sizeof(double))
-    set_first_weights(s, 1e-6, proximal_weight())
-    system_factor(s, BARRIER, 0.0)
-    system_solve(s, BARRIER, s.e.g, p.z)
+    set_first_weights(s, 1e-6, compute_proximal_weight())
+    factor_newton_system(s, BARRIER, 0.0)
+    solve_newton_system(s, BARRIER, s.e.g, p.z)
     copy_vector(n, p.unbounded_z, p.z)
-    system_times(s, p.z, p.hz)
+    multiply_system_matrix(s, p.z, p.hz)
     if not has_only_free_rows(s.e):
-        system_solve(s, BARRIER, p.hz, n.trial)
+        solve_newton_system(s, BARRIER, p.hz, n.trial)
         for j in range(m):
             size += p.z[j] * p.z[j]
             reached += n.trial[j] * n.trial[j]
         if reached < unreachable_fraction() * size:
             copy_vector(n, p.z, n.trial)
-            system_times(s, p.z, p.hz)
+            multiply_system_matrix(s, p.z, p.hz)
     p.degree = place_inside_cones(s.e, p, first_dual_fraction())
-    system_times(s, p.z, p.hz)
+    multiply_system_matrix(s, p.z, p.hz)
 
 
-cdef inline void multiply_duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
+cdef inline void multiply_cone_duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
     """Compute G^T u on every row."""
     cdef int32_t i, j, g
     cdef double x[4]
@@ -126,11 +126,12 @@ cdef inline void multiply_duals(const elements_t* e, const interior_t* p, double
             continue
         memset(u + j, 0, (e.ptr[i + 1] - j) * sizeof(double))
         for g in range(e.part[i], e.part[i + 1]):
-            load_dual(e, i, g, p.u1, p.u2, x)
+            load_cone_dual(e, i, g, p.u1, p.u2, x)
             add_cone_transpose(e, i, g, x, u)
 
 
-cdef inline double contact_shift(const elements_t* e, int32_t i, const double* s, double fraction, double* psi) noexcept nogil:
+cdef inline double compute_contact_normal_shift(const elements_t* e, int32_t i, const double* s, double fraction,
+                                                double* psi) noexcept nogil:
     """Return phi for the slack s of one contact; write `fraction` times the derivative of phi to psi."""
     cdef int32_t k, g, first, n
     cdef double t, a, phi = 0.0
@@ -150,7 +151,8 @@ cdef inline double contact_shift(const elements_t* e, int32_t i, const double* s
     return phi
 
 
-cdef inline void normal_shifts(const elements_t* e, const double* u, double fraction, double* phi, double* psi) noexcept nogil:
+cdef inline void compute_all_normal_shifts(const elements_t* e, const double* u, double fraction, double* phi,
+                                           double* psi) noexcept nogil:
     """Compute phi (m), which is 0 except on the normals of contacts, and psi (m)."""
     cdef int32_t i, j
     memset(phi, 0, e.m * sizeof(double))
@@ -159,7 +161,7 @@ cdef inline void normal_shifts(const elements_t* e, const double* u, double frac
         if is_row(e, i):
             psi[j] = 0.0
         else:
-            phi[j] = contact_shift(e, i, u + j, fraction, psi + j)
+            phi[j] = compute_contact_normal_shift(e, i, u + j, fraction, psi + j)
 
 
 cdef inline void add_normal_products(const elements_t* e, const double* psi, const double* x, double* r) noexcept nogil:
@@ -173,7 +175,7 @@ cdef inline void add_normal_products(const elements_t* e, const double* psi, con
         r[e.ptr[i]] += t
 
 
-cdef inline void combine_pair(system_t* s, const double* psi) noexcept nogil:
+cdef inline void form_de_saxce_matrices(system_t* s, const double* psi) noexcept nogil:
     """Compute (theta + C W)^-1 = V (I + e_n c^T) = L P into `v` and P into `pair`, from V = (W + theta)^-1 = L L^T,
 
         c = (psi - t) / (1 + t_n),   t = V theta psi                 (c = psi without compliance)
@@ -202,7 +204,7 @@ cdef inline void combine_pair(system_t* s, const double* psi) noexcept nogil:
                 v[k * nr + l] += x * t[l]
 
 
-cdef inline bint interior_step(newton_t* n) noexcept nogil:
+cdef inline bint take_interior_point_step(newton_t* n) noexcept nogil:
     """Take one predictor-corrector step and compute the errors after it; return False if the factorisation or the step fails."""
     cdef system_t* s = &n.s
     cdef interior_t* p = &n.ip
@@ -212,10 +214,10 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
     # Scaling and matrix.
     compute_scaling(e, p, s.v, s.bt, &gap)
     if what == PAIR:
-        multiply_duals(e, p, n.u)
-        normal_shifts(e, n.u, p.derivative_fraction, n.c, n.psi)
-        combine_pair(s, n.psi)
-    if not system_factor(s, what, 0.0) and not gap - gap == 0.0:
+        multiply_cone_duals(e, p, n.u)
+        compute_all_normal_shifts(e, n.u, p.derivative_fraction, n.c, n.psi)
+        form_de_saxce_matrices(s, n.psi)
+    if not factor_newton_system(s, what, 0.0) and not gap - gap == 0.0:
         return False
     # Predictor, for which q of (3) is u itself.
     for j in range(e.m):
@@ -224,7 +226,7 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
             n.r[j] -= n.c[j]
     if what == PAIR:
         add_normal_products(e, n.psi, n.u, n.r)
-    system_solve(s, what, n.r, n.da)
+    solve_newton_system(s, what, n.r, n.da)
     if p.degree > 0.0 and gap > 0.0:
         limit_affine_step(e, p, n.da, &after)
         sigma = after / gap
@@ -238,7 +240,7 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
             n.u[j] -= p.hz[j] - e.g[j] + n.r[j]
             n.r[j] -= n.c[j]
         add_normal_products(e, n.psi, n.u, n.r)
-    system_solve(s, what, n.r, n.dz)
+    solve_newton_system(s, what, n.r, n.dz)
     if not all_finite(n.dz, e.m):
         return False
     # Step and errors.
@@ -246,6 +248,6 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
     p.min_gap = p.gap if p.gap < p.min_gap else p.min_gap
     p.gap = mu
     p.max_gap = mu if mu > p.max_gap else p.max_gap
-    system_times(s, p.z, p.hz)
-    convex_error(e, p.z, p.hz, n.sc.speed, &p.energy, &p.velocity)
+    multiply_system_matrix(s, p.z, p.hz)
+    compute_convex_residual(e, p.z, p.hz, n.sc.speed, &p.energy, &p.velocity)
     return p.length > 0.0

@@ -17,12 +17,13 @@ from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, cholesky_workspace_size, linear_factor,
-                                         linear_sign, linear_solve, linear_solve_checked, linear_t)
+from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, cholesky_workspace_size,
+                                         factor_linear_system_matrix,
+                                         compute_determinant_sign, solve_linear_system, solve_linear_system_checked, linear_t)
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
-from lavender_ext.newton.coupled cimport couple_entries, coupled_t
-from lavender_ext.newton.elements cimport element_times, elements_t, is_row
-from lavender_ext.newton.natural_map cimport natural
+from lavender_ext.newton.coupled cimport form_coupled_entries, coupled_t
+from lavender_ext.newton.elements cimport multiply_by_element_matrices, elements_t, is_row
+from lavender_ext.newton.natural_map cimport evaluate_all_natural_maps
 from lavender_ext.newton.normal_matrix cimport form_normal_matrix
 from lavender_ext.newton.panel cimport multiply_panel, multiply_panel_transpose
 
@@ -77,7 +78,7 @@ cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogi
     return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
-cdef inline void system_times(system_t* s, const double* x, double* out) noexcept nogil:
+cdef inline void multiply_system_matrix(system_t* s, const double* x, double* out) noexcept nogil:
     """Compute out = H x; out must not be x."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES:
@@ -96,7 +97,8 @@ cdef inline void system_times(system_t* s, const double* x, double* out) noexcep
 # -- dense rows ------------------------------------------------------------------------------------------------
 
 
-cdef inline void multiply_left(const elements_t* e, const double* w, const double* h, double* out) noexcept nogil:
+cdef inline void multiply_left_by_element_matrices(const elements_t* e, const double* w, const double* h,
+                                                   double* out) noexcept nogil:
     """Compute out = W H with one small matrix W for each element; both are (m, m), row-major."""
     cdef int32_t i, j, k, r, c, nr, m = e.m
     cdef double x
@@ -174,9 +176,9 @@ cdef inline void form_dense_matrix(system_t* s, int32_t what, double eps) noexce
         for j in range(m):
             s.linear.matrix[<int64_t>j * (m + 1)] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
     else:
-        multiply_left(e, s.bt if what == BARRIER else s.pair, s.h, s.multiplied)
+        multiply_left_by_element_matrices(e, s.bt if what == BARRIER else s.pair, s.h, s.multiplied)
         for j in range(m):
-            element_times(e, s.bt, s.multiplied + <int64_t>j * m, s.linear.matrix + <int64_t>j * m, False)
+            multiply_by_element_matrices(e, s.bt, s.multiplied + <int64_t>j * m, s.linear.matrix + <int64_t>j * m, False)
             s.linear.matrix[<int64_t>j * (m + 1)] += 1.0
 
 
@@ -185,9 +187,9 @@ cdef inline void form_sparse_matrix(system_t* s, int32_t what, double eps) noexc
     cdef int32_t j
     cdef double* values = s.linear.rows.data
     if what == NATURAL:
-        couple_entries(&s.coupled, s.e, s.p, s.p if s.bt == NULL else NULL, eps - 1.0, values)
+        form_coupled_entries(&s.coupled, s.e, s.p, s.p if s.bt == NULL else NULL, eps - 1.0, values)
     elif s.bt != NULL:
-        couple_entries(&s.coupled, s.e, s.bt if what == BARRIER else s.pair, s.bt, 0.0, values)
+        form_coupled_entries(&s.coupled, s.e, s.bt if what == BARRIER else s.pair, s.bt, 0.0, values)
     else:
         memcpy(values, s.coupled.h, s.coupled.indptr[s.e.m] * sizeof(double))
         for j in range(s.e.m):
@@ -207,7 +209,7 @@ cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcep
         f.by, f.d = CHOLESKY, s.q
         for j in range(s.e.m):
             s.q[j] = f.rows.data[s.coupled.diagonal[j]]         # A pivot is compared with its diagonal entry.
-    return linear_factor(f) == 0
+    return factor_linear_system_matrix(f) == 0
 
 
 cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept nogil:
@@ -215,18 +217,18 @@ cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept
     form_dense_matrix(s, what, eps)
     s.linear.n = s.e.m if s.n_free < 0 else s.n_free
     s.linear.by = CHOLESKY_OR_LU if s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER) else LU
-    return linear_factor(s.linear) == 0
+    return factor_linear_system_matrix(s.linear) == 0
 
 
 cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
     """Solve with the last dense factor, in place; infinite if the matrix is singular, so that the caller rejects the step."""
     cdef int32_t j
     if s.n_free < 0:
-        linear_solve(s.linear, x)
+        solve_linear_system(s.linear, x)
         return
     for j in range(s.n_free):
         s.q[j] = x[s.free[j]]
-    linear_solve(s.linear, s.q)
+    solve_linear_system(s.linear, s.q)
     for j in range(s.n_free):
         x[s.free[j]] = s.q[j]
 
@@ -234,8 +236,8 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
 # -- (1) to (3) ------------------------------------------------------------------------------------------------
 
 
-cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcept nogil:
-    """Factor (1), (2), or (3) with the last `system_natural`; return 0 if a pivot fails."""
+cdef inline int32_t factor_newton_system(system_t* s, int32_t what, double eps) noexcept nogil:
+    """Factor (1), (2), or (3) with the last `evaluate_system_natural_map`; return 0 if a pivot fails."""
     s.factorisations += 1
     if s.augmented:
         return s.others.factor(s.others.at, what, eps)
@@ -245,22 +247,22 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
         return factor_sparse(s, what, eps)
     s.linear.by = LU if what == PAIR or (what == NATURAL and s.law != CONE) else CHOLESKY
     form_normal_matrix(s.e, s.v, &s.linear.blocks, s.linear.by == LU)
-    return linear_factor(s.linear) == 0
+    return factor_linear_system_matrix(s.linear) == 0
 
 
 cdef inline int32_t determinant_sign(const system_t* s) noexcept nogil:
     """Return the sign of the determinant of the last matrix (3); 0 if it is not known."""
-    return 0 if s.augmented or s.form == SPARSE else linear_sign(s.linear)
+    return 0 if s.augmented or s.form == SPARSE else compute_determinant_sign(s.linear)
 
 
 cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) noexcept nogil:
     """Compute out = K N^-1 K^T x."""
     multiply_panel_transpose(s.e, s.linear.blocks.n, x, s.y)
-    linear_solve(s.linear, s.y)
+    solve_linear_system(s.linear, s.y)
     multiply_panel(s.e, s.y, out)
 
 
-cdef inline void solve_rows(system_t* s, double* x) noexcept nogil:
+cdef inline void solve_over_rows(system_t* s, double* x) noexcept nogil:
     """Solve over the rows of A with the last factor, in place."""
     cdef int32_t j
     if s.augmented:
@@ -269,55 +271,55 @@ cdef inline void solve_rows(system_t* s, double* x) noexcept nogil:
         solve_dense(s, x)
     else:
         memcpy(s.y, x, s.e.m * sizeof(double))
-        if not linear_solve_checked(s.linear, s.y, x, s.q):
+        if not solve_linear_system_checked(s.linear, s.y, x, s.q):
             for j in range(s.e.m):
                 x[j] = 1.0 / 0.0
 
 
-cdef inline void system_solve(system_t* s, int32_t what, const double* r, double* out) noexcept nogil:
+cdef inline void solve_newton_system(system_t* s, int32_t what, const double* r, double* out) noexcept nogil:
     """Solve (1) or (2) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
     cdef const double* left = s.pair if what == PAIR else s.bt
     if s.form == BODIES and not s.augmented:
-        element_times(s.e, s.v, r, s.t, False)
+        multiply_by_element_matrices(s.e, s.v, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)
         for j in range(m):
             s.q[j] = r[j] - s.q[j]
         if s.bt == NULL:
-            element_times(s.e, s.v, s.q, out, False)
+            multiply_by_element_matrices(s.e, s.v, s.q, out, False)
         else:
             # Apply B and B^T one after the other: in V the small entries of the scaling are lost in the large ones.
-            element_times(s.e, left, s.q, s.t, False)
-            element_times(s.e, s.bt, s.t, out, True)
+            multiply_by_element_matrices(s.e, left, s.q, s.t, False)
+            multiply_by_element_matrices(s.e, s.bt, s.t, out, True)
     elif s.bt != NULL:
-        element_times(s.e, left, r, s.t, False)
-        solve_rows(s, s.t)
-        element_times(s.e, s.bt, s.t, out, True)
+        multiply_by_element_matrices(s.e, left, r, s.t, False)
+        solve_over_rows(s, s.t)
+        multiply_by_element_matrices(s.e, s.bt, s.t, out, True)
     elif s.augmented:
-        element_times(s.e, s.v, r, out, False)
-        solve_rows(s, out)
+        multiply_by_element_matrices(s.e, s.v, r, out, False)
+        solve_over_rows(s, out)
     else:
         memcpy(out, r, m * sizeof(double))
-        solve_rows(s, out)
+        solve_over_rows(s, out)
 
 
-cdef inline double system_natural(system_t* s, const double* z, const double* slack, int32_t law, double eps,
+cdef inline double evaluate_system_natural_map(system_t* s, const double* z, const double* slack, int32_t law, double eps,
                                   double* f) noexcept nogil:
     """Compute F of the natural map of `law` into f, and the small matrices of its derivative; return |F|."""
     s.law = law
-    return natural(s.e, z, slack, law, eps, f, s.p, s.einv, s.v)
+    return evaluate_all_natural_maps(s.e, z, slack, law, eps, f, s.p, s.einv, s.v)
 
 
-cdef inline void solve_natural(system_t* s, const double* r, double* out) noexcept nogil:
+cdef inline void solve_natural_map_system(system_t* s, const double* r, double* out) noexcept nogil:
     """Solve (3) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES and not s.augmented:
-        element_times(s.e, s.einv, r, s.t, False)
+        multiply_by_element_matrices(s.e, s.einv, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)
-        element_times(s.e, s.p, s.q, s.t, False)
+        multiply_by_element_matrices(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             s.t[j] = r[j] - s.t[j]
-        element_times(s.e, s.einv, s.t, out, False)
+        multiply_by_element_matrices(s.e, s.einv, s.t, out, False)
         return
     if s.augmented or (s.form == SPARSE and s.bt != NULL):
         memcpy(out, r, m * sizeof(double))
@@ -329,38 +331,38 @@ cdef inline void solve_natural(system_t* s, const double* r, double* out) noexce
         else:
             for j in range(m):
                 s.t[j] = r[j] - s.p[j] * r[j]
-        system_times(s, s.t, s.q)
-        element_times(s.e, s.p, s.q, s.t, False)
+        multiply_system_matrix(s, s.t, s.q)
+        multiply_by_element_matrices(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             out[j] = r[j] - s.t[j]
-    solve_rows(s, out)
+    solve_over_rows(s, out)
 
 
-cdef inline void natural_times(system_t* s, const double* dz, double* out) noexcept nogil:
+cdef inline void multiply_by_natural_map_derivative(system_t* s, const double* dz, double* out) noexcept nogil:
     """Compute (I - P) dz + P H dz."""
     cdef int32_t j
-    system_times(s, dz, s.q)
+    multiply_system_matrix(s, dz, s.q)
     for j in range(s.e.m):
         s.q[j] -= dz[j]
-    element_times(s.e, s.p, s.q, out, False)
+    multiply_by_element_matrices(s.e, s.p, s.q, out, False)
     for j in range(s.e.m):
         out[j] += dz[j]
 
 
-cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
+cdef inline void solve_natural_map_system_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
     """Solve (3) with refinement, which removes the effect of eps; r, dx (m) are scratch."""
     cdef int32_t j, _, m = s.e.m
     cdef double left, last = 1.0 / 0.0, size = norm_inf(rhs, m)
-    solve_natural(s, rhs, x)
+    solve_natural_map_system(s, rhs, x)
     for _ in range(REFINEMENT_STEPS):
-        natural_times(s, x, r)
+        multiply_by_natural_map_derivative(s, x, r)
         for j in range(m):
             r[j] = rhs[j] - r[j]
         left = norm_inf(r, m)
         if not left < 0.5 * last or left <= 1e-16 * size:
             return
         last = left
-        solve_natural(s, r, dx)
+        solve_natural_map_system(s, r, dx)
         for j in range(m):
             x[j] += dx[j]
 

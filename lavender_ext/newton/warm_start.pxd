@@ -64,8 +64,8 @@ cdef inline void bind_warm_workspace(warm_t* s, double* real, int32_t* index, co
 cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil
 cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
                          double* violation) noexcept nogil
-cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil
+cdef int32_t compute_joint_bandwidth(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil
 cdef double judge_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
                           double v0) noexcept nogil
-cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
+cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil

@@ -11,7 +11,7 @@ from lavender_ext.core.rows cimport dot6
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.factor.linear cimport analyse_band, linear_factor, linear_solve, linear_t
+from lavender_ext.factor.linear cimport analyse_band, factor_linear_system_matrix, solve_linear_system, linear_t
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
@@ -62,7 +62,7 @@ cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s,
     violation[0] = low
 
 
-cdef inline void store_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
+cdef inline void store_score_in_trace(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
     """Store the work, energy and max |e_n| of a judged impulse in the trace, in place of an earlier one after the same work."""
     cdef int32_t i
     cdef double x, big = 0.0, work = s.sweeps + s.factorisations
@@ -88,13 +88,13 @@ cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, 
     compute_body_slack(p, r, lam, v, s.slack)
     score_given_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
-        store_score(p, r, s, x.energy)
+        store_score_in_trace(p, r, s, x.energy)
     if x.relative >= 0.0:                               # This is the residual of the worst island.
         return x.relative
     return relative_residual(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 
-cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
+cdef int32_t compute_joint_bandwidth(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
     """Return the width of the band of A in the given order; 0 unless all rows are joints without bounds."""
     cdef int32_t i, j, h, b, width = 1
     if r.n_contacts > 0 or r.n_joints == 0:
@@ -118,7 +118,7 @@ cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexc
     return width if width <= MAX_BAND_WIDTH else 0
 
 
-cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexcept nogil:
+cdef inline void form_joint_band(const blocks_t* p, const rows_t* r, warm_t* s) noexcept nogil:
     """Compute band[i width + t] = A[i + t, i] from the joints of each body."""
     cdef int32_t i, k, q, j, h, g, b, at
     for b in range(r.n_bodies):
@@ -158,22 +158,22 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
     """Solve the joints by (3)."""
     cdef linear_t band
     cdef int32_t j, attempt
-    fill_band(p, r, s)
+    form_joint_band(p, r, s)
     s.factorisations = 1
     analyse_band(&band, p.n_rows, s.width)
     band.matrix, band.d, band.tiny, band.shift = s.band, p.d, 1e-13, 0.0
     band.ahead = NULL
-    if linear_factor(&band) or band.pivots.negative:
+    if factor_linear_system_matrix(&band) or band.pivots.negative:
         return UNDECIDED
     for j in range(p.n_rows):
         lam[j] = p.b[j]
-    linear_solve(&band, lam)
+    solve_linear_system(&band, lam)
     for attempt in range(2):
         s.relative = judge_impulse(p, r, s, lam, v, e0, v0)
         if s.relative <= tol:
             return SOLVED
         if attempt == 0:                                   # Refine: lam <- lam - A^-1 w.
-            linear_solve(&band, s.slack)
+            solve_linear_system(&band, s.slack)
             for j in range(p.n_rows):
                 lam[j] -= s.slack[j]
     return UNDECIDED
@@ -208,7 +208,7 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     return UNDECIDED
 
 
-cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
+cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
     """Solve from lam (m), not zero, to tol in place; v (n_bodies, 6) becomes M^-1 J^T lam, and is so before with `has_velocity`."""
     cdef double e0, v0
@@ -244,10 +244,10 @@ def solve_from_guess(Data data, double[::1] impulse, double tol):
     if m == 0 or not data.factored:
         return 0, 0, 0
     cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
-    s.width = band_width(&data.blocks, &data.rows, &index[0])
+    s.width = compute_joint_bandwidth(&data.blocks, &data.rows, &index[0])
     cdef double[::1] real = np.empty(6 * data.rows.n_bodies + warm_workspace_size(&data.blocks, s.width))
     s.trace = NULL
     bind_warm_workspace(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
-        result = warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
+        result = solve_from_warm_start(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
     return result, s.sweeps, s.factorisations

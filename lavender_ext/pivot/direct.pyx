@@ -486,7 +486,7 @@ cdef class Pivoting:
         if outside is None and not symmetric and (band != m - 1 or order is not None):
             raise ValueError("LU needs a band of m - 1 and rows in their own order")
         self.p, self.judged, self.order, self.outside = p, p if judged is None else judged, order, outside
-        self.t.v = self.judged.view()
+        self.t.v = self.judged.get_pointers()
         self.t.e0, self.t.v0 = self.judged.reference_energy, self.judged.reference_velocity
         self.t.least = 1e-13
         self.t.linear, self.t.symmetric = linear, symmetric
@@ -522,7 +522,7 @@ cdef class Pivoting:
             code = factor_linear_system(&self.t)
         return self.raise_error(code)
 
-    def begin(self, const double[::1] start, double least, int sweeps):
+    def set_start(self, const double[::1] start, double least, int sweeps):
         """Begin at start (m,) [N s] with `sweeps` symmetric sweeps; a relative residual up to `least` is not refined."""
         self.t.least, self.t.sweeps = least, sweeps
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))

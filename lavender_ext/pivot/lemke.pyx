@@ -539,7 +539,7 @@ cdef class Lemke:
         self.rows, self.keep = rows, (real, index)
         bind_lemke_workspace(&self.l, &rows.t, &real[0], &index[0])
 
-    def begin(self, const double[::1] start):
+    def set_start(self, const double[::1] start):
         """Begin a solve at start (m,) [N s]."""
         begin_direct_solve(&self.rows.t, &start[0])
         begin_lemke_solve(&self.l)

@@ -16,8 +16,8 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block cimport project_row_update
 from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.factors cimport has_wide, no_pivots
-from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_band, analyse_dense, linear_factor, linear_solve
+from lavender_ext.factor.factors cimport has_wide, clear_pivot_statistics
+from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_band, analyse_dense, factor_linear_system_matrix, solve_linear_system
 from lavender_ext.judge.score cimport unit_roundoff
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, pivoting_t
 
@@ -32,13 +32,13 @@ cdef inline void call_outside_factor(pivoting_t* s) noexcept nogil:
     s.late = small < 0
     if s.late:
         return
-    no_pivots(&s.linear.pivots)
+    clear_pivot_statistics(&s.linear.pivots)
     s.linear.pivots.small = small
     s.factorisations += 1
     s.is_factored = 1
 
 
-cdef inline void fill_rows(pivoting_t* s) noexcept nogil:
+cdef inline void copy_free_rows_to_dense_matrix(pivoting_t* s) noexcept nogil:
     """Copy A_FF to the full matrix of L U."""
     cdef int32_t i, j, q, at, to
     cdef const csr_t* a = s.a
@@ -57,7 +57,7 @@ cdef inline void fill_rows(pivoting_t* s) noexcept nogil:
                 row[to] = a.data[q]
 
 
-cdef inline void fill_band(pivoting_t* s) noexcept nogil:
+cdef inline void copy_free_rows_to_band(pivoting_t* s) noexcept nogil:
     """Copy A_FF to the columns of its band."""
     cdef int32_t i, j, q, at, to
     cdef bint in_place = s.natural and s.n_free == s.n
@@ -101,10 +101,10 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
         call_outside_factor(s)
         return
     if s.linear.by == LU:
-        fill_rows(s)
+        copy_free_rows_to_dense_matrix(s)
     else:
-        fill_band(s)
-    linear_factor(&s.linear)
+        copy_free_rows_to_band(s)
+    factor_linear_system_matrix(&s.linear)
     s.factorisations += 1
     s.is_factored = 1
 
@@ -114,7 +114,7 @@ cdef inline void solve_free_rows(pivoting_t* s, double* y) noexcept nogil:
     if s.solve_outside != NULL:
         s.solve_outside(s.outside, s.n_free, y)
     else:
-        linear_solve(&s.linear, y)
+        solve_linear_system(&s.linear, y)
 
 
 cdef void factor_all_rows(pivoting_t* s) noexcept nogil:
@@ -256,7 +256,7 @@ cdef void solve_with_all_rows_free(pivoting_t* s) noexcept nogil:
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
     if s.linear.ahead != NULL:
-        linear_solve(&s.linear, s.x)
+        solve_linear_system(&s.linear, s.x)
         return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
@@ -349,7 +349,7 @@ cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
     for i in range(s.n):
         s.at[i] = FREE
     s.exchanged = s.factorisations = s.n_rounds = s.late = 0
-    no_pivots(&s.linear.pivots)
+    clear_pivot_statistics(&s.linear.pivots)
     set_diagonal_shift(s, 0.0)
 
 

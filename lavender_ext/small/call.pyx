@@ -461,7 +461,7 @@ cdef class Small:
 
     def __init__(self, Data data, Data over):
         self.data, self.over, self.count = data, over, 1
-        self.at.v, self.at.over = data.view(), over.view()
+        self.at.v, self.at.over = data.get_pointers(), over.get_pointers()
         self.at.zero_residual[0], self.at.zero_residual[1] = data.reference_energy, data.reference_velocity
         self.at.zero_residual[2] = data.relative_at_zero
         if not derive_small_problem(&self.at, &self.workspace):

@@ -4,7 +4,7 @@
 
 m: rows, m_c of which belong to contacts with friction and m_1 do not; Y: entries of J L^-1; w: multiply-adds to
 factorise N of every island; count: number of factorisations. Python
-calls this estimate, too (`estimate_velocity_cost` of `lavender/solvers/small.py`); the rates are in `rates.json` there.
+calls this estimate, too (`estimate_velocity_newton_cost` of `lavender/solvers/small.py`); the rates are in `rates.json` there.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
@@ -29,7 +29,7 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double coulomb_rows         # largest number of rows of an island under Coulomb's law
     double cone_rows            # the same under the cone law with a rigid contact; both limits apply only if
     double dense                # there are fewer than this many rows per velocity
-    double columns              # and no row has more than this many entries: velocities may then be of bodies (`graph.bodies_in`)
+    double columns              # and no row has more than this many entries: velocities may then belong to bodies
     double steps                # largest number of steps of all islands together
 
 

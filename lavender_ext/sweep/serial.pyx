@@ -226,7 +226,7 @@ cdef class Sweeps:
         cdef int32_t* first = &start[0] if prepares_blocks else NULL
         cdef double[::1] workspace
         cdef int64_t n
-        self.view = p.view()
+        self.view = p.get_pointers()
         c.order = &order[0] if order.shape[0] else NULL
         c.split, c.mode, c.rng, c.exact = split, mode, &rng[0], exact
         n = sweeps_workspace_size(&self.x, &self.view, first)

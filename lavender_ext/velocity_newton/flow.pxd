@@ -340,7 +340,7 @@ cdef inline void recompute_slack(const flow_t* f, int32_t island) noexcept nogil
             s[k] += phi[k] - b[k]
 
 
-cdef inline double measure_error(const flow_t* f, int32_t island, const double* lam, bint moves,
+cdef inline double measure_impulse_errors(const flow_t* f, int32_t island, const double* lam, bint moves,
                            double* velocity) noexcept nogil:
     """Compute the energy [sqrt J] and velocity [m/s] of the errors of lam; NaN if they are not finite.
 

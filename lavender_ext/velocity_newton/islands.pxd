@@ -247,7 +247,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
         need.values = max(need.values, values)
 
 
-cdef inline ssize_t real_size(const flow_t* f, const requirements_t* need) noexcept nogil:
+cdef inline ssize_t count_real_workspace(const flow_t* f, const requirements_t* need) noexcept nogil:
     """Return the number of doubles that `bind_real_workspace` assigns."""
     cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
     return (4 * max(<ssize_t>f.g.n, <ssize_t>f.p.n_rows) + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks]
@@ -256,7 +256,7 @@ cdef inline ssize_t real_size(const flow_t* f, const requirements_t* need) noexc
 
 
 cdef inline void bind_real_workspace(flow_t* f, const requirements_t* need, double* x) noexcept nogil:
-    """Assign the arrays of the iterate, of V and of N in x (`real_size`)."""
+    """Assign the arrays of the iterate, of V and of N in x (`count_real_workspace`)."""
     cdef ssize_t m = f.p.n_rows, n = max(<ssize_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
     cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
     f.y = x

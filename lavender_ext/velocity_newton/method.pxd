@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, require_workspace, options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
-from lavender_ext.velocity_newton.islands cimport (bind_real_workspace, find_islands_and_factor_patterns, real_size,
+from lavender_ext.velocity_newton.islands cimport (bind_real_workspace, find_islands_and_factor_patterns, count_real_workspace,
                                                    requirements_t, set_required_residual, structure_workspace_size)
 from lavender_ext.velocity_newton.newton cimport solve_islands
 from lavender_ext.velocity_newton.sparse cimport initial_entries_per_row
@@ -54,7 +54,7 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
                 or r.is_bound and max(need.values, need.row_matrix_values) > o.most):
             return UNFIT
         smallest.tries = r.tries = r.tries + (1 - r.is_bound)  # Retry with twice the entries per row.
-    if not require_workspace(r, r.n_index, real_size(&s.f, need)):
+    if not require_workspace(r, r.n_index, count_real_workspace(&s.f, need)):
         return NEEDS_WORKSPACE
     bind_real_workspace(&s.f, need, r.real)
     s.f.wide = o.wide

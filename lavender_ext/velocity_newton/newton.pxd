@@ -42,7 +42,7 @@ from lavender_ext.core.block_types cimport (
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
-                                                compute_island_impulses, copy_rows, descent_t, flow_t, measure_error,
+                                                compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
                                                 paused_t, recompute_slack, end_row_of_run, first_row_of_run)
 from lavender_ext.velocity_newton.normal cimport factor_normal_matrix, form_normal_matrix, is_v_unchanged, solve_step
 from lavender_ext.velocity_newton.soft cimport min_relative_compliance
@@ -234,7 +234,7 @@ cdef inline bint has_proximal_terms(const flow_t* f, int32_t island) noexcept no
     return False
 
 
-cdef inline double proximal_error(const flow_t* f, int32_t island) noexcept nogil:
+cdef inline double compute_proximal_energy_error(const flow_t* f, int32_t island) noexcept nogil:
     """Return the energy error due to the proximal terms, rho (lambda - c)."""
     cdef int32_t a, k
     cdef double x, out = 0.0
@@ -245,7 +245,7 @@ cdef inline double proximal_error(const flow_t* f, int32_t island) noexcept nogi
     return sqrt(out)
 
 
-cdef inline double error_over_limits(const flow_t* f, double energy, double velocity) noexcept nogil:
+cdef inline double compute_error_over_limits(const flow_t* f, double energy, double velocity) noexcept nogil:
     """Return the error as a multiple of its limits: at most 1 if it is within tol, NaN if it is not finite."""
     cdef double x = 0.0, v = 0.0
     if energy != energy or velocity != velocity:
@@ -272,11 +272,11 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double er
 
 
 cdef inline double store_iterate_if_best(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
-    """Return the error of lambda over its limits (`u` as in `measure_error`), and keep lambda in `best` if it is lower."""
+    """Return the error of lambda over its limits (`u` as in `measure_impulse_errors`), and keep lambda in `best` if it is lower."""
     cdef descent_t* x = &f.descent
     cdef double velocity, over
-    energy[0] = measure_error(f, island, f.lam, moves, &velocity)
-    over = error_over_limits(f, energy[0], velocity)
+    energy[0] = measure_impulse_errors(f, island, f.lam, moves, &velocity)
+    over = compute_error_over_limits(f, energy[0], velocity)
     if over < x.lowest_error:
         x.idle_steps = x.idle_steps if over > 0.9 * x.lowest_error else 0
         x.lowest_error = over
@@ -337,7 +337,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.steps += 1
         if x.idle_steps > MAX_IDLE_STEPS:
             return STUCK
-        if rigid and (size <= 0.1 * energy and size <= 0.1 * proximal_error(f, island) or size == 0.0):
+        if rigid and (size <= 0.1 * energy and size <= 0.1 * compute_proximal_energy_error(f, island) or size == 0.0):
             # The softened problem is solved well enough: move its centre.
             move_proximal_centre(f, island)
             x.center_moved = 1
@@ -380,7 +380,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.response_is_known = 1
 
 
-cdef inline double normal_shift(const flow_t* f, int32_t i) noexcept nogil:
+cdef inline double compute_normal_shift(const flow_t* f, int32_t i) noexcept nogil:
     """Return phi of (3) for block i from w, whose normal row must exclude phi."""
     cdef int32_t g
     cdef double out = 0.0
@@ -395,11 +395,11 @@ cdef inline void compute_normal_shifts(const flow_t* f, int32_t island, const do
     """Compute phi (3) from the slack of lam. phi must be 0 before the call."""
     cdef int32_t a, i
     cdef double velocity
-    measure_error(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
+    measure_impulse_errors(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
             if not has_independent_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
-                f.phi[f.p.ptr[i]] = normal_shift(f, i)
+                f.phi[f.p.ptr[i]] = compute_normal_shift(f, i)
 
 
 cdef inline void clear_normal_shift(const flow_t* f, int32_t island) noexcept nogil:
@@ -420,14 +420,14 @@ cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const do
 
 
 cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
-    """Keep lam in `island_best` if its error under the problem's own law is lower; phi must be 0, `u` as in `measure_error`.
+    """Keep lam in `island_best` if its error under the problem's own law is lower; phi must be 0.
 
     Return whether the error is lower than that of the points at which no call ended.
     """
     cdef double energy, velocity, over
     f.p.law = f.law
-    energy = measure_error(f, island, lam, moves, &velocity)
-    over = error_over_limits(f, energy, velocity)
+    energy = measure_impulse_errors(f, island, lam, moves, &velocity)
+    over = compute_error_over_limits(f, energy, velocity)
     if over < f.paused.island_error:
         f.paused.island_error = over
         copy_rows(f, island, lam, f.island_best)
@@ -519,7 +519,7 @@ cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogi
     f.panel_of_column[0] = UNFORMED
 
 
-cdef inline bint is_at_rest(flow_t* f, int32_t island, double* impulse) noexcept nogil:
+cdef inline bint is_island_inactive(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """Return whether no row of the island acts; its impulse is then the zero impulse, which solves it."""
     cdef int32_t a, k
     if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]] >= 0.0:
@@ -537,7 +537,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
     f.island = island
     if not waits:
         choose_island_unknowns(f, island)
-        if is_at_rest(f, island, impulse):
+        if is_island_inactive(f, island, impulse):
             return REACHED
         restart_island_from_impulse(f, island, impulse)
         clear_normal_shift(f, island)

@@ -16,7 +16,8 @@ from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport has_independent_rows
-from lavender_ext.factor.linear cimport CHOLESKY, LU, analyse_dense, analyse_tree, linear_factor, linear_solve, linear_t
+from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
+                                         solve_linear_system, linear_t)
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_run, form_column_of_a, flow_t, multiply_y
 
@@ -119,7 +120,7 @@ cdef inline void weighted_row(const flow_t* f, const double* y, int32_t nc, int3
         r += 1
 
 
-cdef inline void add_to_pattern(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
+cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
     """Add Y^T (V Y) of one panel to N in the pattern of L."""
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, at, i, k
     cdef int32_t c0 = f.cptr[f.island]
@@ -150,7 +151,7 @@ cdef inline void add_to_pattern(const flow_t* f, int32_t panel, int32_t n, int32
             to[at] += line[b]
 
 
-cdef inline void add_to_dense(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
+cdef inline void add_panel_to_dense_matrix(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
     """Add Y^T (V Y) of one panel to the full matrix N.
 
     Its first row is that of the last velocity: if leaves are eliminated before their ancestors, most entries of L and U are 0.
@@ -191,7 +192,7 @@ cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
 # -- over rows: S of (1), or I + A V of (3) ---------------------------------------------------------------------------------
 
 
-cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* x) noexcept nogil:
+cdef inline int32_t compute_or_list_free_rows(const flow_t* f, const double* t, double* x) noexcept nogil:
     """Compute x = V t of (3); if t is NULL, list the free rows instead and write the rows of V A to x. Return their number."""
     cdef int32_t a, i, r, k, size, end, place = 0, n = 0
     cdef const double* v
@@ -225,7 +226,7 @@ cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
     cdef const double* column
     cdef double* to = f.factor
     if not f.bounded_rows_only:
-        f.n_free = n = visit_free_blocks(f, NULL, f.normal)
+        f.n_free = n = compute_or_list_free_rows(f, NULL, f.normal)
         for a in range(n):
             for b in range(n):
                 to[b] = f.normal[<ssize_t>b * f.rows + f.places[a]]     # V A transposed: both are symmetric.
@@ -253,10 +254,10 @@ cdef inline void solve_row_step(flow_t* f) noexcept nogil:
     cdef double* x = z
     for a in range(f.n_free):
         z[a] = f.grad[f.unknowns[f.places[a]]]
-    linear_solve(&f.linear, z)
+    solve_linear_system(&f.linear, z)
     if not f.bounded_rows_only:
         x = f.sum + f.rows
-        visit_free_blocks(f, z, x)
+        compute_or_list_free_rows(f, z, x)
     combine_rows(f.wide, f.rows, f.n_free, f.a, f.columns, x, f.sum)
     for a in range(f.n_unknowns):
         k = f.unknowns[a]
@@ -302,9 +303,9 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noex
             for i in range(f.pblock[b], last):
                 n = multiply_block_by_v(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
             if n > 0 and square:
-                add_to_dense(f, b, n, size)
+                add_panel_to_dense_matrix(f, b, n, size)
             elif n > 0:
-                add_to_pattern(f, b, n, size)
+                add_panel_to_sparse_matrix(f, b, n, size)
 
 
 cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
@@ -328,7 +329,7 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
         analyse_tree(n, size, lptr, f.lidx, f.factor - lptr[0], f.factor + values)
         for a in range(size):
             n.scale[a] = n.diagonal[a]
-    return linear_factor(n) == 0
+    return factor_linear_system_matrix(n) == 0
 
 
 cdef inline void solve_step(flow_t* f, int32_t island, bint square) noexcept nogil:
@@ -340,13 +341,13 @@ cdef inline void solve_step(flow_t* f, int32_t island, bint square) noexcept nog
     if square:
         for a in range(size):
             f.local_rhs[size - 1 - a] = -f.grad[f.icols[c0 + a]]
-        linear_solve(&f.linear, f.local_rhs)
+        solve_linear_system(&f.linear, f.local_rhs)
         for a in range(size):
             f.step[f.icols[c0 + a]] = f.local_rhs[size - 1 - a]
     else:
         for a in range(size):
             f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
-        linear_solve(&f.linear, f.local_rhs)
+        solve_linear_system(&f.linear, f.local_rhs)
         for a in range(size):
             f.step[f.icols[c0 + a]] = f.local_rhs[a]
     multiply_y(f, island, f.step, f.q)

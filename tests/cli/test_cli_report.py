@@ -301,7 +301,9 @@ def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
     assert code == cli.EXIT_UNMET
     said = "; ".join(
         f"robots need {package}: pip install {package} ({n} cases)"
-        for package, n in Counter(map(steps.get_package_name_of_case, suite.names("@robots"))).items()
+        for package, n in Counter(
+            map(steps.get_package_name_of_case, suite.get_case_names_of_set("@robots"))
+        ).items()
     )
     assert f"nothing was measured: {said}\n" in out
     summary = (tmp_path / "out" / "summary.md").read_text()

@@ -26,8 +26,8 @@ from lavender import registry
 from lavender.contract.checks import make_problems_of_every_kind
 from lavender.contract.enumeration import random_bounds
 from lavender.contract.problems import make_problem_with_other_numbers
-from lavender.judge.residuals import get_reference
-from lavender.solvers.auto import Tree, make_step
+from lavender.judge.residuals import get_zero_impulse_reference
+from lavender.solvers.auto import DecisionTree, create_solver_step
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.solve_log import SolveLog
@@ -162,7 +162,7 @@ def run_path(problem, sizes):
     """Lemke's path, nine times begun anew where a ray ends it."""
     rows = PivotState(problem).rows
     paths = Lemke(rows)
-    paths.begin(problem.start())
+    paths.set_start(problem.start())
     codes = [paths.run(n) for n in [*sizes, *9 * [10_000]]]
     return codes[-1], paths.pivots, paths.paths, rows.work, rows.best.impulse.tobytes()
 
@@ -174,7 +174,7 @@ def run_driver(problem, sizes):
 
 
 def run_over_velocities(problem, sizes):
-    kernel, impulse = general.prepare(problem), problem.start().copy()
+    kernel, impulse = general.prepare_islands(problem), problem.start().copy()
     kernel.start(impulse, 1e-9, 300)
     while kernel.step(sizes[0], impulse) == OUTCOMES["more"]:
         pass
@@ -183,10 +183,10 @@ def run_over_velocities(problem, sizes):
 
 def run_step_of_auto(problem, sizes, kind):
     """What a step remembers between its turns is not computed anew from the best impulse."""
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     log = SolveLog(problem, 1e-14, 10**6)
-    log.offer(problem.start())
-    step = make_step(kind, log, Tree(problem))
+    log.judge_and_store_best(problem.start())
+    step = create_solver_step(kind, log, DecisionTree(problem))
     for n in sizes:
         step.run(n)
     return log.iterations, step.impulse.tobytes()

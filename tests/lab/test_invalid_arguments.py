@@ -78,7 +78,7 @@ CALLS = {
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),
-    "suite.names": Call(suite.names, {"text": "@hard"}, {"text": "set"}),
+    "suite.get_case_names_of_set": Call(suite.get_case_names_of_set, {"text": "@hard"}, {"text": "set"}),
     "motion.store_reference_if_better": Call(
         motion.store_reference_if_better, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
         accepts={"solver": ("an object", "an ellipsis", "bytes")},

@@ -195,7 +195,7 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
 def test_warm_starts_keep_their_matches_for_ten_minutes():
     sim = lv.Simulation(lv.Scene("stack", solver_iterations=4))
     for _ in range(600):
-        status, done = sim.state.kernel.substeps(240)
+        status, done = sim.state.kernel.run_substeps(240)
         assert (status, done) == (0, 240)
         head = sim.state.head
         assert head[HEAD["contacts"]] == head[HEAD["matches"]] == 24

@@ -546,7 +546,7 @@ def test_ctrl_c_stops_a_step_of_very_many_substeps():
         limits.append(most)
         if len(limits) == 4:
             _thread.interrupt_main()  # the flag of the signal: Python looks at it before its next line
-        return kernel.substeps(most)
+        return kernel.run_substeps(most)
 
     sim.state.kernel = ReplacedCalls(kernel, substeps=substeps)
     with pytest.raises(KeyboardInterrupt):

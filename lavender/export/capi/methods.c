@@ -52,7 +52,7 @@ static int32_t start_sweeps(lav_solver *s) {
   memset(workspace, 0, (size_t)(numbers + more) * sizeof(double));
   sweep_serial_start_sweeps(x, &s->read, place, workspace);
 #ifndef LAV_SWEEPS_ONLY
-  if (x->packing.single) accelerate_accelerated_begin_accelerated_sweeps(x, &s->acceleration, memory, convex, o->keeps, workspace + numbers);
+  if (x->packing.single) accelerate_accelerated_start_accelerated_sweeps(x, &s->acceleration, memory, convex, o->keeps, workspace + numbers);
   if (sweep_serial_can_pack_blocks(x, &s->read)) {
     x->context.packing = &x->packing;
     x->packing.workspace = TAKE(s, double, sweep_packed_packed_workspace_size_of_blocks(&s->p, &s->r));
@@ -247,7 +247,7 @@ static int32_t factor_shifted(lav_solver *s) {
       row[s->a.indices[q]] = s->a.data[q] / (root[i] * root[s->a.indices[q]]);
     row[i] += s->splitting.rho;
   }
-  return factor_linear_linear_factor(&s->linear) == 0;
+  return factor_linear_factor_linear_system_matrix(&s->linear) == 0;
 }
 
 static void admm_step(void *context, double *lam, int32_t first, int32_t n) {

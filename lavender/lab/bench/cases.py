@@ -184,7 +184,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
                 f"{source}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
         else:
-            selected = [_make_item_of_name(name) for name in suite.names(str(source))]
+            selected = [_make_item_of_name(name) for name in suite.get_case_names_of_set(str(source))]
             items += (
                 _convert_to_sequence_steps(selected)
                 if str(source).removeprefix("@") == "sequences"

@@ -31,7 +31,7 @@ from lavender.base.arrays import FloatArray
 from lavender.batch.solve import solve_many
 from lavender.io import mujoco as adapter
 from lavender.io.recording import make_controller
-from lavender.judge.residuals import get_reference, residual
+from lavender.judge.residuals import get_zero_impulse_reference, residual
 from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry_impulses
 from lavender.problem import Problem
@@ -197,7 +197,7 @@ def measure_model(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
     for step, data, problem in _iterate_problems(mj, path, model, 20 * steps * every, every):
-        if problem is None or get_reference(problem)[1] < 1e-9:
+        if problem is None or get_zero_impulse_reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = time_mujoco_newton(mj, model, data, problem)
         ours, batch_time, residual_found = time_cold_solves(problem)
@@ -246,7 +246,7 @@ def measure_model_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
         start = problem.start() if before is None else carry_impulses(*before, problem)
         ours, solution = time_one_call(problem, start)
         before = problem, solution.impulse
-        if get_reference(problem)[1] < 1e-9:
+        if get_zero_impulse_reference(problem)[1] < 1e-9:
             continue
         out.append(
             WarmStep(

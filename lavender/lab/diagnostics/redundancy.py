@@ -359,7 +359,7 @@ def _find_dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> In
 
     for pivot in (*LEFT_OUT_PIVOTS, limit):
         system.factor(values, None, 0.0, pivot)
-        left = system.lost_rows()
+        left = system.list_lost_rows()
         random, new = np.random.default_rng(0), np.zeros(len(left))
         for _ in range(N_PROBE_VECTORS if len(left) else 0):
             z = np.zeros(n)

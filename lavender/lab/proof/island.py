@@ -118,7 +118,7 @@ class Island:
 
     def compute_slope_as_floats(self, x: list[Any], speeds: Any) -> Rounded:
         """Return the slope as float64 numbers with error bounds."""
-        a, n = self.part.rounded_matrix, len(x)
+        a, n = self.part.matrix_with_error_bounds, len(x)
         if not self.sliding:
             return a
         left, right = self.compute_slope(x, speeds)

@@ -91,7 +91,7 @@ class Part:
         return [p + t * q if t else p for p, t, q in zip(y, self._soft, x, strict=True)]
 
     @cached_property
-    def rounded_matrix(self) -> Rounded:
+    def matrix_with_error_bounds(self) -> Rounded:
         """Return A as float64 numbers with error bounds."""
         if self._operator.transposed is None:
             a = self._operator.rows[self.which][:, self.which]

@@ -64,12 +64,12 @@ __all__ = [
     "explain_missing_packages",
     "families",
     "friction",
+    "get_case_names_of_set",
     "get_package_name_of_case",
     "get_package_versions",
     "granular",
     "hang",
     "hard",
-    "names",
     "parse_case_name",
     "pyramid",
     "random_spd",
@@ -177,12 +177,12 @@ def cases(text: str) -> Iterator[Case]:
     UnknownName, InputError
         As `case`, when called.
     """
-    if (selected := names(text)) == (text,):
+    if (selected := get_case_names_of_set(text)) == (text,):
         return iter([case(text)])
     return (case(name) for name in selected)
 
 
-def names(text: str) -> tuple[str, ...]:
+def get_case_names_of_set(text: str) -> tuple[str, ...]:
     """Return the names of a set's cases ("default", "@hard"), or the given name alone.
 
     Raises

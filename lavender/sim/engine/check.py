@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.problem.cones import get_kinds
+from lavender.problem.cones import get_block_kinds
 from lavender.sim.engine.layout import HEAD, SETTING, SIZE
 from lavender.sim.engine.state import KEPT, State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
@@ -128,7 +128,12 @@ def _check_contacts(new: State) -> None:
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])
-    if c and (b["kind"][: kj + c] != get_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)).any():
+    if (
+        c
+        and (
+            b["kind"][: kj + c] != get_block_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)
+        ).any()
+    ):
         raise _make_damaged_state_error("kind does not match the rows of a block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):

@@ -23,7 +23,7 @@ RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 
 
 def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
-    """Return the velocity problem of a substep after `kernel.prepare()` has built its rows; arrays are copied.
+    """Return the velocity problem of a substep after `kernel.prepare_substep()` has built its rows; arrays are copied.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class Simulation(Stepping):
         state = self.state.copy()
         if self._restored:
             invalidate_pair_list(state)
-        while state.kernel.prepare() == NEED_CAPACITY:
+        while state.kernel.prepare_substep() == NEED_CAPACITY:
             state = state.with_larger_buffers()
         return self._build_problem(state)
 

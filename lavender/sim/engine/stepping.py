@@ -360,7 +360,7 @@ class Stepping:
         """Do the substeps with the compiled sweeps; enlarge the buffers if they are too small."""
         remaining = self._parameters.substeps
         while True:
-            status, done = self.state.kernel.substeps(min(remaining, SUBSTEPS_PER_CALL))
+            status, done = self.state.kernel.run_substeps(min(remaining, SUBSTEPS_PER_CALL))
             remaining -= done
             if status == NEED_CAPACITY:
                 self.state = self.state.with_larger_buffers()
@@ -369,7 +369,7 @@ class Stepping:
 
     def prepare_substep(self) -> None:
         """Detect collisions and build the rows of the next substep in `state`."""
-        while self.state.kernel.prepare() == NEED_CAPACITY:
+        while self.state.kernel.prepare_substep() == NEED_CAPACITY:
             self.state = self.state.with_larger_buffers()
 
     def _solve_substeps(self) -> None:
@@ -388,14 +388,14 @@ class Stepping:
                     return
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
-                kernel.apply()
-            if kernel.finish() != OK:
+                kernel.apply_impulses()
+            if kernel.finish_substep() != OK:
                 return
 
     def _end_run_at_lost_body(self) -> None:
         """End the run after a prepared problem that is not valid, at the body that `finish()` reports."""
-        self.state.kernel.apply()
-        if self.state.kernel.finish() == OK:
+        self.state.kernel.apply_impulses()
+        if self.state.kernel.finish_substep() == OK:
             bodies = [*self.state.a["contact_pair"][:1].ravel().tolist(), int(self.state.a["body_of"][0])]
             self.state.head[HEAD["lost"]] = next(i for i in bodies if self.state.a["dyn"][i] >= 0)
 

@@ -27,7 +27,7 @@ from lavender.solvers.costs import RATES, estimate_import_cost, estimate_sparse_
 from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
 
-class Augmented:
+class AugmentedSystem:
     """Factorisation of (1) and (2), which the kernel's `Solve` calls. K is built at the first call."""
 
     def __init__(self, kernel: Solve, layout: Layout, bodies: Any) -> None:
@@ -47,7 +47,7 @@ class Augmented:
             It would end after the deadline.
         """
         if self.k is None:
-            if self.deadline.passed(1e-9 * RATES["scipy calls"]):
+            if self.deadline.has_passed(1e-9 * RATES["scipy calls"]):
                 raise TooLate
             self.k = self._build_jacobian()
             # The system contains K twice, and the block matrices.
@@ -57,14 +57,14 @@ class Augmented:
                 + RATES["sparse factor"] * estimate_sparse_work(entries, sum(self.k.shape))
                 + estimate_import_cost("scipy.sparse.linalg")
             )
-        if self.deadline.passed(self.seconds):
+        if self.deadline.has_passed(self.seconds):
             raise TooLate
         watch = Stopwatch()
-        succeeded = self._factor_kind(what, eps)
-        self.seconds = watch.seconds
+        succeeded = self._build_and_factor_system(what, eps)
+        self.seconds = watch.elapsed_seconds
         return succeeded
 
-    def _factor_kind(self, what: int, eps: float) -> bool:
+    def _build_and_factor_system(self, what: int, eps: float) -> bool:
         """Build and factor the blocks of the system that `what` names, (1) or (2)."""
         s = self.kernel
         if what == SYSTEMS["natural"]:

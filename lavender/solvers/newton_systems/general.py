@@ -11,7 +11,7 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.judge.residuals import get_reference, judge_impulse
+from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES
@@ -46,7 +46,7 @@ UNLIMITED_STEPS = 2**31 - 1  # The kernel has no limit of steps, because `run` c
 _WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
-def prepare(problem: Problem, work: float = inf) -> Driver | None:
+def prepare_islands(problem: Problem, work: float = inf) -> Driver | None:
     """Prepare the islands and their workspace.
 
     Returns
@@ -54,12 +54,12 @@ def prepare(problem: Problem, work: float = inf) -> Driver | None:
     Driver or None
         None if N of an island is too large, or if its factor needs more than `work` multiply-adds.
     """
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     kernel = Driver(problem.metric, MAX_MATRIX_ENTRIES, work)
     return kernel if kernel.fits else None
 
 
-def run(
+def run_newton_steps(
     problem: Problem,
     kernel: Driver,
     impulse: FloatArray,
@@ -86,7 +86,7 @@ def run(
     if time_limit is not None:
         steps = max(1, int(min(CALL_TIME_FRACTION * time_limit / slow, clock)))
     while counts[0] < max_iter:
-        if deadline.passed(min(step, 1e6)):
+        if deadline.has_passed(min(step, 1e6)):
             status = Status.TIME_LIMIT
             break
         if not is_continued:
@@ -108,18 +108,18 @@ def run(
                 status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
             break
-        last, now = now, watch.seconds
-        left = deadline.remaining()
+        last, now = now, watch.elapsed_seconds
+        left = deadline.get_remaining_seconds()
         if left is not None and left <= 0.0:
             status = Status.TIME_LIMIT
             break
         if left is not None:
             step = max(now / max(1, counts[0]), (now - last) / max(1, done[0]))
             steps = max(1, int(min(clock, CALL_TIME_FRACTION * left / max(step, counted, 1e-9))))
-    return replace(claim(status, counts), judged=judged)
+    return replace(make_claim(status, counts), judged=judged)
 
 
-def claim(status: Status, counts: Any) -> Claim:
+def make_claim(status: Status, counts: Any) -> Claim:
     """Return the claim for counts of (steps, factorisations, Coulomb rounds, line evaluations)."""
     done, *parts = counts
     work = {kind: n for kind, n in zip(_WORK_KINDS, parts, strict=True) if n or kind == _WORK_KINDS[0]}

@@ -14,15 +14,20 @@ from lavender.base.arrays import IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import splu
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.solvers.costs import count_dense_work
 from lavender.solvers.factors import MAX_DENSE_ROWS, USE_WIDE_LANES
-from lavender.solvers.newton_systems.augmented import Augmented
+from lavender.solvers.newton_systems.augmented import AugmentedSystem
 from lavender_ext.factor import graph
 from lavender_ext.factor.linear import LinearSystem
-from lavender_ext.factor.sparse import is_mirrored
-from lavender_ext.newton.coupled import coupled_entries, coupled_rows, element_graph, scaled_entries
+from lavender_ext.factor.sparse import has_symmetric_pattern
+from lavender_ext.newton.coupled import (
+    copy_coupled_entries,
+    find_element_graph,
+    list_coupled_rows,
+    scale_matrix_entries,
+)
 from lavender_ext.newton.solve import Layout, Solve
 
 MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse factor.
@@ -66,7 +71,7 @@ def find_bodies(problem: Problem) -> Bodies | None:
         return Bodies(problem.rows.block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
     if problem.generalized is None or problem.cones.has_round:
         return None
-    parts = graph.bodies_in(problem.metric, problem.generalized.order)
+    parts = graph.find_bodies_of_velocities(problem.metric, problem.generalized.order)
     return None if parts is None else Bodies(*parts)
 
 
@@ -83,7 +88,7 @@ class System:
         self.problem, self.solve = problem, solve
 
     @property
-    def seconds(self) -> float:
+    def expected_factor_seconds(self) -> float:
         """Estimated time of the next factor [s]."""
         return self.pace * self.work
 
@@ -111,10 +116,10 @@ class VelocitySystem(System):
         reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
         self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
-        solve.over_bodies(
+        solve.use_bodies(
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
         )
-        self.augmented = Augmented(solve, self.layout, bodies)
+        self.augmented = AugmentedSystem(solve, self.layout, bodies)
         solve.set_external(self.augmented)
 
     def set_deadline(self, deadline: Deadline) -> None:
@@ -142,10 +147,10 @@ class MatrixSystem(System):
             self.h = a.toarray()
             self.h *= solve.scale[:, None]
             self.h *= solve.scale
-            solve.over_rows(self.h, self.symmetric, USE_WIDE_LANES)
+            solve.use_dense_matrix(self.h, self.symmetric, USE_WIDE_LANES)
             self.work = count_dense_work(m)
         else:
-            values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
+            values = scale_matrix_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
             self._bind_rows()
             self.work = (1.0 if self.symmetric else 2.0) * self.sparse.cost
@@ -154,14 +159,14 @@ class MatrixSystem(System):
         """Pass H to the kernel in compressed rows, and in the pattern of its elements."""
         solve, h = self.solve, self.h
         to, other, indptr, indices, entries = h.indptr, h.indices, h.indptr, h.indices, h.data
-        if solve.has_friction or not (is_mirrored(to, other) and h.diagonal().all()):
+        if solve.has_friction or not (has_symmetric_pattern(to, other) and h.diagonal().all()):
             to, other = _find_element_graph(solve, h)
-            indptr, indices = coupled_rows(solve.ptr, to, other)
-            entries = coupled_entries(h.indptr, h.indices, h.data, indptr, indices)
+            indptr, indices = list_coupled_rows(solve.ptr, to, other)
+            entries = copy_coupled_entries(h.indptr, h.indices, h.data, indptr, indices)
         row = np.repeat(np.arange(solve.m, dtype=np.int32), np.diff(indptr))
         diagonal = np.flatnonzero(row == indices).astype(np.int32)
         self.sparse = LinearSystem((indptr, indices), USE_WIDE_LANES, splu)
-        solve.over_entries(
+        solve.use_sparse_matrix(
             h.indptr, h.indices, h.data, self.sparse, to, other, entries, diagonal, self.symmetric
         )
 
@@ -170,10 +175,10 @@ def _find_element_graph(solve: Solve, a: sp.csr_array) -> tuple[IntArray, IntArr
     """Return (indptr, indices) of the symmetric graph of the elements that A couples, with all diagonal entries."""
     n = len(solve.ptr) - 1
     element = np.repeat(np.arange(n, dtype=np.int32), np.diff(solve.ptr))
-    to, other = element_graph(solve.ptr, element, a.indptr, a.indices)
+    to, other = find_element_graph(solve.ptr, element, a.indptr, a.indices)
     graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))
     graph.sort_indices()
-    if not (is_mirrored(graph.indptr, graph.indices) and graph.diagonal().all()):
+    if not (has_symmetric_pattern(graph.indptr, graph.indices) and graph.diagonal().all()):
         graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
         graph.sort_indices()
     return graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
@@ -194,7 +199,7 @@ def make_system(
     bodies : Bodies, optional
         Default: `find_bodies`.
     """
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     if form == "impulse":
         return MatrixSystem(problem)
     bodies = bodies or find_bodies(problem)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavender.base.lu import splu
-from lavender_ext.factor.graph import least_degree
+from lavender_ext.factor.graph import order_by_minimum_degree
 from lavender_ext.factor.linear import LinearSystem
-from lavender_ext.factor.sparse import free_part, is_mirrored
+from lavender_ext.factor.sparse import extract_free_part, has_symmetric_pattern
 
 EPS = np.finfo(float).eps
 
@@ -81,7 +81,7 @@ def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
     for i, j in pairs:
         if i < n and j < n:
             met[i, j] = met[j, i] = 1.0
-    order = least_degree(*raw(met - np.eye(n)))
+    order = order_by_minimum_degree(*raw(met - np.eye(n)))
     assert np.array_equal(np.sort(order), np.arange(n))
     of = np.repeat(np.arange(n), 1 + np.arange(n) % heavy)
     panels = LinearSystem(raw(met[of][:, of]))
@@ -127,7 +127,7 @@ def factor_of(matrix, order):
 def test_columns_of_one_pattern_stand_beside_each_other():
     """Places are those of a postorder: what is below a vertex and not below its parent comes right before it."""
     matrix = grid(12)
-    order = least_degree(*raw(matrix))
+    order = order_by_minimum_degree(*raw(matrix))
     lptr, lind = factor_of(matrix, order)
     size = np.ones(len(order), int)  # of the subtree of each
     has_parent = np.flatnonzero(np.diff(lptr))
@@ -150,7 +150,7 @@ def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
     scale = sp.diags_array(10.0 ** rng.uniform(-4.0, 4.0, n))
     a = sp.csr_array(scale @ a @ scale)
     a.sort_indices()
-    assert is_mirrored(*raw(a))
+    assert has_symmetric_pattern(*raw(a))
     d, b = a.diagonal(), rng.normal(size=n)
     found = []
     for wide in (True, False):
@@ -185,7 +185,7 @@ def test_shifts_parts_and_lost_pivots():
     np.testing.assert_allclose((a + 1e-3 * sp.diags_array(d)) @ f.solve(b), b, atol=1e-9)
     free = rng.random(n) < 0.5
     place = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
-    ptr, ind, val = free_part(*raw(a), a.data, place, int(free.sum()))
+    ptr, ind, val = extract_free_part(*raw(a), a.data, place, int(free.sum()))
     np.testing.assert_array_equal(sp.csr_array((val, ind, ptr)).toarray(), a.toarray()[np.ix_(free, free)])
     lost = LinearSystem(raw(a)).factor(np.full(a.nnz, np.nan), d, 0.0, 1e-13, True)
     assert lost > 0
@@ -223,10 +223,10 @@ def interrupt(_):
 
 def test_what_is_no_mirror_is_seen():
     a = sp.csr_array(np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]]))
-    assert not is_mirrored(*raw(a))
-    assert not is_mirrored(*raw(sp.csr_array(a.T)))
-    assert is_mirrored(*raw(sp.csr_array(a + a.T)))
-    assert is_mirrored(*raw(sp.csr_array((4, 4))))
+    assert not has_symmetric_pattern(*raw(a))
+    assert not has_symmetric_pattern(*raw(sp.csr_array(a.T)))
+    assert has_symmetric_pattern(*raw(sp.csr_array(a + a.T)))
+    assert has_symmetric_pattern(*raw(sp.csr_array((4, 4))))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a timer that sends a signal is of POSIX")

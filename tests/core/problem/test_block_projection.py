@@ -7,7 +7,7 @@ from judge_twin import ROUND, project_cone, spec_of
 from judge_twin import Problem as Twin
 
 import lavender as lv
-from lavender.judge.states import linearise_at
+from lavender.judge.states import judge_and_linearise_impulse
 
 L = np.longdouble
 H = L(1e-7)  # step of central differences: 1e-14 of truncation, 1e-12 of rounding in long double
@@ -63,7 +63,7 @@ def test_projection_and_its_derivatives_are_those_of_a_dense_twin(kind, law):
     problem = lv.Problem(rng.standard_normal(m), cones, sp.block_diag(blocks, format="csr"), friction=law)
     impulse = rng.standard_normal(m)
     impulse[ptr[:-1]] += 0.5
-    linear, disk = linearise_at(problem, impulse), problem.disk
+    linear, disk = judge_and_linearise_impulse(problem, impulse), problem.disk
     twin, root = Twin(spec_of(disk)), linear.root.astype(L)
     z, s = root * linear.impulse, linear.slack / root
     y = z - s
@@ -123,5 +123,5 @@ def test_projection_and_its_derivatives_are_those_of_a_dense_twin(kind, law):
 def test_not_a_number_is_not_hidden(law):
     cones = lv.Cones.contacts(np.full(1, 0.5))
     problem = lv.Problem(np.zeros(3), cones, np.eye(3), friction=law)
-    linear = linearise_at(problem, np.array([1.0, np.nan, 0.0]))
+    linear = judge_and_linearise_impulse(problem, np.array([1.0, np.nan, 0.0]))
     assert np.isnan(linear.residual).any()

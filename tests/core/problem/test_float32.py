@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, tree_mass
 
 import lavender as lv
-from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_errors
+from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_slack_errors
 
 # -- the floor --------------------------------------------------------------------------------------
 
@@ -50,7 +50,7 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
             acts = (lam != p.cones.lower) & (lam != p.cones.upper) & (lam != 0.0)
             seen = jac**2 @ x**2 + p.b**2 + p.compliance**2 * lam**2
             velocities = a**2 @ np.where(acts, seen / p.compliance**2, 0.0)
-    for got, want in zip(estimate_float32_errors(p, lam), (own, data, velocities), strict=True):
+    for got, want in zip(estimate_float32_slack_errors(p, lam), (own, data, velocities), strict=True):
         np.testing.assert_allclose(got, UNIT_ROUNDOFF_FLOAT32**2 * want, rtol=1e-9, atol=1e-30)
 
 

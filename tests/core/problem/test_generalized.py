@@ -277,7 +277,7 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
     problem = random_generalized_problem(
         seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts
     )
-    kernel = general.prepare(problem)
+    kernel = general.prepare_islands(problem)
     trees = np.bincount(problem.generalized.trees)
     if friction != "coulomb":  # whose matrix lacks symmetry and is kept whole
         assert width(problem, kernel) <= max(40, trees.max() // 2)
@@ -343,7 +343,7 @@ def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
     problem = cloth(24, seed)
     assert problem.generalized.order is not None
     # Its factor costs what a dense one of 96 velocities costs; in the order that was drawn, one of 430.
-    assert width(problem, general.prepare(problem)) <= 120
+    assert width(problem, general.prepare_islands(problem)) <= 120
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
     assert solution.success
     other = lv.solve(problem, "newton", form="impulse", tol=1e-10)
@@ -358,7 +358,7 @@ def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
 def test_room_for_a_pattern_grows():
     """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
     problem = cloth(50, 0)
-    kernel = general.prepare(problem)
+    kernel = general.prepare_islands(problem)
     assert kernel.fits and width(problem, kernel) < 200
     assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
     assert lv.solve_many([problem], tol=1e-6)[0].success
@@ -383,8 +383,8 @@ def test_few_rows_on_many_velocities_that_all_meet_are_solved_over_a():
     problem = lv.Problem.from_jacobian(
         rng.normal(size=(12, n)), mass, rng.normal(size=n), cones=cones, friction="coulomb"
     )
-    assert general.prepare(problem).fits
-    assert general.prepare(problem, 1e5) is None  # left before its pattern is whole
+    assert general.prepare_islands(problem).fits
+    assert general.prepare_islands(problem, 1e5) is None  # left before its pattern is whole
     for form, word in (("auto", "impulse"), ("velocity", "generalized velocities")):
         solver, impulse = Newton(form=form), problem.start().copy()
         assert solver.run(solver.prepare(problem), impulse, 100, 1e-8).form == word
@@ -428,12 +428,12 @@ def test_the_pattern_of_a_factor_serves_again_where_it_is_the_same_and_nowhere_e
         lower = sp.csr_array(np.tril(tree_mass(rng, parent)))
         mass = lower.indptr.astype(np.int32), lower.indices.astype(np.int32), lower.data
         jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
-        return mass, lv.Generalized.compressed(jac, mass, np.zeros(len(parent)), like=like)
+        return mass, lv.Generalized.from_compressed_rows(jac, mass, np.zeros(len(parent)), like=like)
 
     _, before = made(other)
     mass, shared = made(tree, before.operator)
     jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
-    alone = lv.Generalized.compressed(jac, mass, np.zeros(n))
+    alone = lv.Generalized.from_compressed_rows(jac, mass, np.zeros(n))
     x = rng.normal(size=n)
     assert np.array_equal(shared.solve(x), alone.solve(x))
     assert np.array_equal(shared.operator.parents, alone.operator.parents)

@@ -23,7 +23,12 @@ import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import natural_map, qp_residual, siconos_error
-from lavender.judge.residuals import find_relative_at_zero, judge_impulse, judge_once, refine_residual
+from lavender.judge.residuals import (
+    find_relative_at_zero,
+    judge_impulse,
+    refine_residual,
+    reuse_or_judge_impulse,
+)
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -280,10 +285,10 @@ def test_a_pass_serves_its_own_impulse_and_problem_alone():
     other[-1] = np.nextafter(other[-1], 2.0)
     fresh = [lv.residual(problem, x) for x in (first, other)]
     judged = judge_impulse(problem, first.copy())
-    assert judge_once(problem, first, judged) is judged
-    assert judge_once(random_contact_problem(2), first, judged) is not judged
+    assert reuse_or_judge_impulse(problem, first, judged) is judged
+    assert reuse_or_judge_impulse(random_contact_problem(2), first, judged) is not judged
     for x, expected in ((other, fresh[1]), (first, fresh[0])):
-        found = refine_residual(problem, judge_once(problem, x, judged), 1e-6)
+        found = refine_residual(problem, reuse_or_judge_impulse(problem, x, judged), 1e-6)
         assert (found.relative, found.roundoff_floor, found.worst_row) == (
             expected.relative, expected.roundoff_floor, expected.worst_row
         )  # fmt: skip

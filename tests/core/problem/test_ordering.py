@@ -8,10 +8,10 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 import lavender as lv
 from lavender.problem.ordering import (
     SWEEP_ORDERS,
+    compute_block_colors,
+    compute_block_levels_from_ground,
     compute_block_order,
-    compute_colors,
-    compute_levels,
-    rank_bodies,
+    number_bodies_by_adjacency,
 )
 
 
@@ -29,7 +29,7 @@ def test_named_orders_are_permutations_with_joints_first(order, seed):
 @given(seed=seeds)
 def test_colors_share_no_moving_body(seed):
     problem = random_contact_problem(seed, bodies=6, contacts=20)
-    o, color = compute_block_order(problem, "colored"), compute_colors(problem)
+    o, color = compute_block_order(problem, "colored"), compute_block_colors(problem)
     body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
     for c in range(color.max() + 1):
         moving = body[color == c].ravel()
@@ -42,7 +42,7 @@ def test_colors_share_no_moving_body(seed):
 @given(seed=seeds)
 def test_colors_of_a_matrix_share_no_entry(seed):
     problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
-    color, a, ptr = compute_colors(problem), problem.dense(), problem.cones.ptr
+    color, a, ptr = compute_block_colors(problem), problem.dense(), problem.cones.ptr
     for i in range(problem.n_blocks):
         for j in range(i):
             if color[i] == color[j]:
@@ -53,7 +53,7 @@ def test_more_than_63_colors_are_found():
     """100 contacts of one body with 100 others: every one needs its own colour."""
     n = 100
     rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))
-    assert sorted(compute_colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
+    assert sorted(compute_block_colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
 
 
 def test_levels_count_from_the_ground():
@@ -62,14 +62,14 @@ def test_levels_count_from_the_ground():
     shuffled = np.random.default_rng(3).permutation(n)
     rows = touching(body[shuffled])
     problem = lv.Problem.from_rows(rows)
-    np.testing.assert_array_equal(compute_levels(problem), shuffled)
+    np.testing.assert_array_equal(compute_block_levels_from_ground(problem), shuffled)
     np.testing.assert_array_equal(shuffled[compute_block_order(problem, "bottom_up").blocks], np.arange(n))
     np.testing.assert_array_equal(
         shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1]
     )
     matrix = as_matrix(problem)
     ground = np.flatnonzero(shuffled == 0)
-    np.testing.assert_array_equal(compute_levels(matrix, ground), shuffled)
+    np.testing.assert_array_equal(compute_block_levels_from_ground(matrix, ground), shuffled)
     with pytest.raises(lv.CapabilityError, match="ground"):
         compute_block_order(matrix, "bottom_up")
 
@@ -88,7 +88,7 @@ def test_ranks_are_a_permutation_that_brings_neighbours_near():
     chain = rng.permutation(n)
     body = np.stack([chain[:-1], chain[1:]], axis=1)
     rows = touching(body, inv_inertia=np.zeros((n, 3, 3)))
-    rank = rank_bodies(lv.Problem.from_rows(rows))
+    rank = number_bodies_by_adjacency(lv.Problem.from_rows(rows))
     assert np.array_equal(np.sort(rank), np.arange(n))
     assert np.abs(np.diff(rank[body], axis=1)).max() == 1
 

@@ -15,7 +15,7 @@ from worked import python
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.problem.derived import computed_once
 from lavender.problem.operators import Operators
 from lavender.solvers import admm
@@ -78,7 +78,7 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
 @pytest.fixture
 def panels(clock, monkeypatch):
     """Sparse factors whose parts take what is counted, by a clock that is played; what was done, in turn."""
-    import_numerics()  # of SciPy, which is counted, too
+    import_numerical_modules()  # of SciPy, which is counted, too
     done, made = SimpleNamespace(names=[], entry=9e-8, first=0.0, flop=0.0), LinearSystem
 
     class Played(made):
@@ -169,9 +169,9 @@ def test_a_small_call_that_is_cut_short_ends_no_worse_than_it_began(form, law):
             problem = lv.Problem.lcp(problem.dense() + 0.1 * np.diag(problem.d), problem.b)
         for most in (0.0, 3e3, 1e4, 1e5, 1e6):
             small = fresh(problem)
-            found, counts = AUTO.attempt(small, None, 1e-9, most)
+            found, counts = AUTO.solve_and_judge(small, None, 1e-9, most)
             if found is not None:
-                claim = AUTO.claim(small, counts, None, found.relative, lv.Status.TIME_LIMIT)
+                claim = AUTO.make_claim(small, counts, None, found.relative, lv.Status.TIME_LIMIT)
                 assert claim.message and np.isfinite(found.impulse).all()
                 ended.append(found.relative <= 1e-9)
     assert any(ended) and not all(ended)

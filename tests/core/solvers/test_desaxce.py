@@ -63,7 +63,7 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
         solve.scale_interior(1e-10)
         w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
-        np.subtract.at(c, (first, np.arange(sc.m)), solve.combine_pair(0.9))
+        np.subtract.at(c, (first, np.arange(sc.m)), solve.form_de_saxce_matrices(0.9))
         assert solve.factor("pair", augmented=form == "augmented")
         r = np.random.default_rng(seed).normal(size=sc.m)
         x = solve.solve("pair", r)

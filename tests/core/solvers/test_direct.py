@@ -90,7 +90,7 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
     order = rng.permutation(m).astype(np.int32)
     for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
         rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
-        rows.begin(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
+        rows.set_start(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
         assert rows.advance(1) == principal.SOLVED
         expected = np.zeros(m)
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
@@ -258,7 +258,7 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10,
     a[2:4, 2:4] = 1.0  # and without one
     state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
-    state.rows.begin(np.zeros(m), 1e-13, 0)
+    state.rows.set_start(np.zeros(m), 1e-13, 0)
     assert [state.rows.advance(4) for _ in range(2)] == [SMALL_PIVOT, SMALL_PIVOT]
     assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
 

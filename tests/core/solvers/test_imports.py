@@ -79,7 +79,7 @@ class Watch:
         if self.running and name.partition(".")[0] == "scipy":
             raise AssertionError(name)
 
-watch, call, rng = Watch(), Loop.call, np.random.default_rng(0)
+watch, call, rng = Watch(), Loop.call_solver, np.random.default_rng(0)
 sys.meta_path.insert(0, watch)
 
 def watched(*given):
@@ -89,7 +89,7 @@ def watched(*given):
     finally:
         watch.running = False
 
-Loop.call = watched
+Loop.call_solver = watched
 m, b = 120, rng.normal(size=120)
 full, mu = rng.normal(size=(m, m + 20)), np.full(m // 3, 0.5)
 few = 8.0 * np.eye(m)

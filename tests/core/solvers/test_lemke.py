@@ -89,5 +89,5 @@ def test_a_factor_after_the_deadline_is_not_used_in_a_linear_problem():
     assert state.problem.law == "linear" and state.outside is not None
     state.set_deadline(Deadline(1e-9))
     paths = Lemke(state.rows)
-    paths.begin(np.zeros(100))
+    paths.set_start(np.zeros(100))
     assert paths.run(1000) == LATE

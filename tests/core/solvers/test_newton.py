@@ -56,21 +56,21 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     m, g, eps = solve.m, solve.g, 1e-3
     rng = np.random.default_rng(seed)
     z, dz = rng.normal(size=m), rng.normal(size=m)
-    solve.natural(z, solve.times(z) - g, law, eps)
-    slope = solve.natural_times(dz)
+    solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
+    slope = solve.multiply_by_natural_map_derivative(dz)
     # F is piecewise smooth: two nearby points on one piece give the derivative; other pieces tell nothing.
     p = solve.p.copy()
     step = 1e-7
     sides = []
     for sign in (1.0, -1.0):
         near = z + sign * step * dz
-        side = solve.natural(near, solve.times(near) - g, law, eps)
+        side = solve.evaluate_natural_map(near, solve.multiply_matrix(near) - g, law, eps)
         sides.append((side, np.abs(solve.p - p).max()))
     if max(change for _, change in sides) < 1e-4:
         difference = (sides[0][0] - sides[1][0]) / (2.0 * step)
         # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
         np.testing.assert_allclose(difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max()))
-    solve.natural(z, solve.times(z) - g, law, eps)
+    solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
     assert solve.factor("natural", eps, augmented=form == "augmented")
     r = rng.normal(size=m)
     x = solve.solve("natural", r)
@@ -124,7 +124,9 @@ def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
     solve = make_system(problem, "velocity").solve
     x = np.random.default_rng(seed).normal(size=solve.m)
     whole = solve.scale[:, None] * problem.dense()[solve.keep][:, solve.keep] * solve.scale
-    np.testing.assert_allclose(solve.times(x), whole @ x, atol=1e-12 * np.abs(whole).sum(axis=1).max())
+    np.testing.assert_allclose(
+        solve.multiply_matrix(x), whole @ x, atol=1e-12 * np.abs(whole).sum(axis=1).max()
+    )
 
 
 @given(seed=seeds)
@@ -231,7 +233,7 @@ def on_bodies(k, layout, lu, wide=True):
     solve = Solve(problem.metric, problem.csr_data)
     panel = np.zeros((m, 2, 6))
     panel[:, :, :s] = np.where(layout.swapped[:, None, None] > 0, k[:, ::-1], k)
-    solve.over_bodies(panel.reshape(m, 12), np.arange(s, dtype=np.int32), layout, lu, wide)
+    solve.use_bodies(panel.reshape(m, 12), np.arange(s, dtype=np.int32), layout, lu, wide)
     return solve
 
 
@@ -323,8 +325,8 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
 class NoPivot(systems.LinearSystem):
     """A system whose own factorisation loses every pivot."""
 
-    def lend(self, data, _tiny):
-        super().lend(data, 1e300)
+    def factor_rows_of_kernel(self, data, _tiny):
+        super().factor_rows_of_kernel(data, 1e300)
 
 
 def test_superlu_factors_if_pivots_are_lost(monkeypatch):

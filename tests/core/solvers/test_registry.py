@@ -236,7 +236,7 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
     entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "registered", {})
-    registry.fill.cache_clear()
+    registry.register_all_solvers.cache_clear()
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
@@ -246,6 +246,6 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
         assert "'broken'" in str(warning.message)
         assert sign in str(warning.message)
     finally:
-        registry.fill.cache_clear()
+        registry.register_all_solvers.cache_clear()
         monkeypatch.undo()
         registry.specs()

@@ -116,13 +116,13 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
         def __init__(self, worlds, stop):
             self.hand, self.stop = hand(worlds, stop), stop
 
-        def solve(self, *args):
+        def solve_worlds(self, *args):
             if solver == "pgs":
-                return self.hand.solve(*args)
+                return self.hand.solve_worlds(*args)
             interrupt()
             while not self.stop[0]:
                 time.sleep(1e-3)
-            return self.hand.solve(*args)
+            return self.hand.solve_worlds(*args)
 
     monkeypatch.setattr(many, "solve", slow)
     monkeypatch.setattr(loop, "Worker", SlowWorker)

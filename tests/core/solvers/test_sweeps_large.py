@@ -8,7 +8,7 @@ from random_problems import as_matrix, random_contact_problem, sweeps
 
 import lavender as lv
 from benchmarks.core_problems import lattice_pile
-from lavender.problem.ordering import compute_block_order, compute_colors, rank_bodies
+from lavender.problem.ordering import compute_block_colors, compute_block_order, number_bodies_by_adjacency
 from lavender.solvers import layout, sweeping
 
 NAME = "sequential_impulses"
@@ -84,7 +84,7 @@ def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatc
     free = replace(matrix, cones=lv.Cones.free(matrix.m))
     for problem in (pile, jointed, matrix, free):
         if lv.get(name).refuses(problem) is None:
-            color = compute_colors(problem)
+            color = compute_block_colors(problem)
             is_contact = np.arange(problem.n_blocks) >= compute_block_order(problem).split
             orders = [np.lexsort((rng.random(len(color)), color, is_contact)) for _ in range(3)]
             for budget in ({"tol": 0.0, "max_iter": 3}, {"tol": 1e-6, "max_iter": 60}):
@@ -98,7 +98,7 @@ def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     body = pile.rows.contact_body
     moving = (body >= 0).all(axis=1)
-    rank = rank_bodies(pile)
+    rank = number_bodies_by_adjacency(pile)
     assert sorted(rank.tolist()) == list(range(pile.rows.n_bodies))
     span = np.abs(np.diff(rank[body[moving]].astype(int))).mean()
     assert span < 0.5 * np.abs(np.diff(body[moving].astype(int))).mean()
@@ -123,7 +123,7 @@ def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
     prepared.solve(tol=0.0, max_iter=3)
     fresh = sweeps(other, NAME, 3, order=order)
     found = []
-    for module, name in ((sweeping, "compute_block_order"), (layout, "rank_bodies")):
+    for module, name in ((sweeping, "compute_block_order"), (layout, "number_bodies_by_adjacency")):
         true = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
     changed = prepared.solve(other, tol=0.0, max_iter=3)

@@ -104,9 +104,9 @@ def hostile(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "registered", dict(registry.specs()))
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setenv("FAKE_NOTE", str(tmp_path / "note"))
-    registry.fill.cache_clear()
+    registry.register_all_solvers.cache_clear()
     yield tmp_path / "note"
-    registry.fill.cache_clear()
+    registry.register_all_solvers.cache_clear()
 
 
 @pytest.fixture

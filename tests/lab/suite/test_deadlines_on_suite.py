@@ -11,9 +11,9 @@ from random_problems import as_matrix
 import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge import residuals
-from lavender.solvers.auto import Tree
+from lavender.solvers.auto import DecisionTree
 from lavender.solvers.costs import estimate_judge_setup_cost, estimate_result_cost
 from lavender.solvers.newton_systems import augmented
 from lavender.solvers.steps import Newton, Step, estimate_cost
@@ -54,7 +54,7 @@ def play(monkeypatch, clock, pace, problem):
         def played(self, n):
             claim = turn(self, n)
             quiet.append(1)
-            each = Tree(problem).newton / Tree(problem).states["newton"].steps
+            each = DecisionTree(problem).newton / DecisionTree(problem).states["newton"].steps
             quiet.clear()
             clock.now += 1e-9 * pace * max(claim.iterations, 1) * each
             return claim
@@ -144,7 +144,7 @@ def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
 @pytest.mark.parametrize("name", OWN)
 def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
     """Nobody else solves under its name: the better of the start and of doing nothing goes back."""
-    import_numerics()  # its time is part of the estimates, and does not count
+    import_numerical_modules()  # its time is part of the estimates, and does not count
     spec = registry.get(name)
     asked = 0
     for make in PROBLEMS.values():
@@ -207,7 +207,7 @@ def test_the_judge_begins_only_what_he_can_end(name, clock):
 def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
     """A was counted, and so nothing begun, for sweeps that never read it."""
     problem = PROBLEMS["J and M, dense"]()
-    residuals.get_reference(problem)
+    residuals.get_zero_impulse_reference(problem)
     monkeypatch.setattr(
         "lavender.problem.operators.assemble.form_gram_matrix", None
     )  # which A = Y Y^T is formed by

@@ -51,9 +51,9 @@ def test_islands_of_generalized_velocities_go_to_newton_where_they_are_small(see
 
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
     problem = wild(seed=7).problem
-    kernel = general.prepare(problem)
+    kernel = general.prepare_islands(problem)
     monkeypatch.setattr(general, "FLOP_TIME", 1e-6)  # a machine ten thousand times slower: 40 s a step
-    claim = general.run(problem, kernel, problem.start(), 100, 1e-9, 1.0)
+    claim = general.run_newton_steps(problem, kernel, problem.start(), 100, 1e-9, 1.0)
     assert claim.status is lv.Status.TIME_LIMIT
     assert claim.iterations == 0
 
@@ -63,7 +63,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
     clock, asked = [0.0], []
 
     class Kernel:
-        islands, work, counts = 1, general.prepare(problem).work, (0, 0, 0, 0)
+        islands, work, counts = 1, general.prepare_islands(problem).work, (0, 0, 0, 0)
 
         def start(self, impulse, tol, budget):
             pass
@@ -76,7 +76,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
 
     monkeypatch.setattr(general, "FLOP_TIME", 1e-8)
     monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])
-    claim = general.run(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
+    claim = general.run_newton_steps(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
     assert claim.status is lv.Status.TIME_LIMIT
     assert set(asked) == {1} and clock[0] <= 1.0 + 0.4
 
@@ -88,7 +88,7 @@ def test_an_island_without_a_solution_is_proof_enough():
     a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
     problem = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
     log = SolveLog(problem, 1e-6, 100)
-    log.offer(problem.start())
+    log.judge_and_store_best(problem.start())
     certify_infeasibility(log)
     assert log.certificate is not None
     assert not log.certificate[2:].any()
@@ -171,7 +171,7 @@ def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
-    assert registry.get(solver).small.attempt(problem, None, 1e-9)[0] is not None
+    assert registry.get(solver).small.solve_and_judge(problem, None, 1e-9)[0] is not None
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
@@ -186,7 +186,9 @@ def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, to
     assert said, found.message
     assert found.work["pivots"] == int(said[1]) + int(said[2])
     assert found.iterations > int(said[2])
-    assert registry.get("direct").small.attempt(problem, None, tol)[0] is None  # which is exchanges alone
+    assert (
+        registry.get("direct").small.solve_and_judge(problem, None, tol)[0] is None
+    )  # which is exchanges alone
 
 
 def test_small_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
@@ -215,7 +217,7 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
     )
     assert found is None and counts[0] > 0
     fresh = replace(problem, copy=False)
-    assert registry.get("auto").small.attempt(fresh, None, 1e-6)[0] is None
+    assert registry.get("auto").small.solve_and_judge(fresh, None, 1e-6)[0] is None
     solution = check(problem, "auto", tol=1e-6)
     first = solution.stages[0]
     assert first.solver == "newton" and first.before == first.after == 1.0, "the call that failed is told"

@@ -14,9 +14,9 @@ from random_problems import as_matrix, general, random_generalized_problem, rand
 import lavender as lv
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
-from lavender.judge.residuals import get_reference
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers import costs
-from lavender.solvers.auto import Tree, solve, tree_goes_on
+from lavender.solvers.auto import DecisionTree, can_factorise_later, solve
 from lavender.solvers.certify import certify_infeasibility
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, Newton, Step, Sweeps
@@ -81,8 +81,8 @@ def test_each_line_is_reached_and_named(name):
 
 @pytest.mark.parametrize("name", FIRST)
 def test_the_tail_doubles(name):
-    tree = Tree(FIRST[name][0]())
-    get_reference(tree.problem)
+    tree = DecisionTree(FIRST[name][0]())
+    get_zero_impulse_reference(tree.problem)
     stages = list(tree)
     first = next(i for i, stage in enumerate(stages) if stage.why.startswith("in turn"))
     in_turn = stages[first:]
@@ -100,22 +100,22 @@ def test_the_tail_doubles(name):
 
 def test_sweeps_use_up_a_limit_where_who_factors_had_no_time_and_not_where_they_ended():
     problem = suite.pyramid(k=4, friction="coulomb").problem
-    get_reference(problem)
-    tree = Tree(problem, Deadline(60.0))
+    get_zero_impulse_reference(problem)
+    tree = DecisionTree(problem, Deadline(60.0))
     steps = {name: Newton(name, SolveLog(problem, 1e-6, 10)) for name in tree.states}
-    assert steps and tree_goes_on(tree, steps, 1.0)
+    assert steps and can_factorise_later(tree, steps, 1.0)
     for step in steps.values():
         step.over = True
-    assert tree_goes_on(tree, steps, 1.0)
+    assert can_factorise_later(tree, steps, 1.0)
     for step in steps.values():
         step.late = True
-    assert not tree_goes_on(tree, steps, 1.0)
+    assert not can_factorise_later(tree, steps, 1.0)
 
 
 def test_turns_end_where_nobody_gains():
     problem = suite.granular(n=4, friction="coulomb").problem
-    get_reference(problem)
-    tree = Tree(problem)
+    get_zero_impulse_reference(problem)
+    tree = DecisionTree(problem)
     tree.best = 0.5
     turns = [stage.solver for stage in tree if stage.why.startswith("in turn")]
     assert turns == ["newton", "admm", "nncg", "anderson", "newton", "admm", "nncg"], "twice, sweeps once"
@@ -156,7 +156,7 @@ class Made(Step):
     def advance(self, n):
         self.impulse = self.log.problem.start() + self.found.pop(0)
         self.asked.append(n)
-        self.offer()
+        self.store_iterate_in_log()
         return lv.Claim(lv.Status.MAX_ITERATIONS, n)
 
 
@@ -164,13 +164,14 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
     problem = suite.stack(n=200).problem
     solved = lv.solve(problem, tol=1e-9).impulse
     found = [0.5, 0.99, 0.9, 0.7, 0.999, 1.0 - 1e-9]
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     log = SolveLog(problem, 1e-7, 10**6)
-    log.offer(problem.start())
-    made, tree = {}, Tree(problem)
+    log.judge_and_store_best(problem.start())
+    made, tree = {}, DecisionTree(problem)
     Made.found, Made.asked = [share * solved for share in found], []
     monkeypatch.setattr(
-        "lavender.solvers.auto.make_step", lambda name, log, tree: made.setdefault(name, Made(name, log))
+        "lavender.solvers.auto.create_solver_step",
+        lambda name, log, tree: made.setdefault(name, Made(name, log)),
     )
     solve(log, tree)
     assert not Made.found and set(made) <= {"anderson", "direct", "newton", "admm", "nncg"}, (
@@ -183,11 +184,11 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
 
 def test_newton_under_friction_starts_from_the_sweeps_and_then_from_zero(monkeypatch):
     problem = suite.pyramid(k=4, friction="coulomb").problem
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     log = SolveLog(problem, 1e-13, 10**6)
-    log.offer(lv.solve(problem, "anderson", max_iter=20, tol=1e-13).impulse)
+    log.judge_and_store_best(lv.solve(problem, "anderson", max_iter=20, tol=1e-13).impulse)
     step = Newton("newton", log)
-    step.state = Tree(problem).states["newton"]
+    step.state = DecisionTree(problem).states["newton"]
     starts, advance = [], type(step.solver).advance
 
     def stall(solver, state, impulse, *of):
@@ -202,9 +203,9 @@ def test_newton_under_friction_starts_from_the_sweeps_and_then_from_zero(monkeyp
 
 def test_sweeps_that_promise_little_give_way():
     problem = suite.case("pyramidF(k=8, mass_ratio=1e6)").problem
-    get_reference(problem)
+    get_zero_impulse_reference(problem)
     log = SolveLog(problem, 1e-12, 10**6)
-    log.offer(problem.start())
+    log.judge_and_store_best(problem.start())
     sweeps = Sweeps("anderson", log)
     sweeps.least = 10.0
     sweeps.run(1e5)
@@ -219,11 +220,11 @@ def test_sweeps_that_promise_little_give_way():
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(make):
     """With the least of time sweeps have all of it."""
     problem = make().problem
-    get_reference(problem)
-    tree = Tree(problem, Deadline(1e-4))
+    get_zero_impulse_reference(problem)
+    tree = DecisionTree(problem, Deadline(1e-4))
     assert tree.is_late and not tree.states
     log = SolveLog(problem, 1e-12, 10**6, tree.deadline)
-    log.offer(problem.start())
+    log.judge_and_store_best(problem.start())
     solve(log, tree)
     assert log.iterations > 0
     assert [stage.solver for stage in log.stages] == ["anderson"]
@@ -298,7 +299,9 @@ def test_what_a_turn_of_many_rows_on_few_velocities_cannot_pay_is_left_out_or_co
         (rng.normal(size=column.size), (np.repeat(row, 2), column.ravel())), shape=(len(row), n)
     )
     cones = lv.Cones.bounded(np.zeros(len(row)), np.full(len(row), np.inf))
-    tree = Tree(lv.Problem.from_jacobian(jac, sp.eye_array(n).tocsr(), rng.normal(size=n), cones=cones))
+    tree = DecisionTree(
+        lv.Problem.from_jacobian(jac, sp.eye_array(n).tocsr(), rng.normal(size=n), cones=cones)
+    )
     ran = []
     for stage in tree:
         tree.best = 1.0  # nobody gains
@@ -326,9 +329,9 @@ def test_lines_are_those_of_the_data_whatever_is_known_of_it(n, monkeypatch):
     problem = lv.Problem.from_jacobian(
         rng.standard_normal((8, n)), np.eye(n), rng.standard_normal(n), cones=cones, friction="cone"
     )
-    lines = [(stage.solver, stage.iterations) for stage in islice(Tree(problem), 30)]
+    lines = [(stage.solver, stage.iterations) for stage in islice(DecisionTree(problem), 30)]
     assert problem.csr.shape == (8, 8)  # which is kept
-    assert [(stage.solver, stage.iterations) for stage in islice(Tree(problem), 30)] == lines
+    assert [(stage.solver, stage.iterations) for stage in islice(DecisionTree(problem), 30)] == lines
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e47])
@@ -354,7 +357,7 @@ def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way(unit):
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
-    log.offer(problem.start())
+    log.judge_and_store_best(problem.start())
     monkeypatch.setattr("lavender.solvers.certify.find_certificate_by_linear_program", lambda *asked: 1 / 0)
     certify_infeasibility(log)
     assert not log.stages
@@ -379,15 +382,15 @@ def test_sweeps_go_on_from_a_stale_guess_that_doing_nothing_is_better_than():
     ]
     near, far = solved + sizes[0] * direction, solved + 1e9 * sizes[0] * direction
     begun = []
-    original = Sweeps.begin
+    original = Sweeps.prepare_and_set_start
 
-    def begin(self):
+    def prepare_and_set_start(self):
         original(self)
         begun.append(self.impulse.copy())
 
     for guess, kept in ((near, True), (far, False)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Sweeps, "begin", begin)
+            patch.setattr(Sweeps, "prepare_and_set_start", prepare_and_set_start)
             found = lv.solve(problem, impulse=guess, tol=1e-6, max_iter=20)
         assert np.array_equal(begun[-1], guess) == kept
         assert found.residual.relative <= 1.0

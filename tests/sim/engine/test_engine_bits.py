@@ -163,7 +163,7 @@ def test_what_lacks_room_says_so_before_any_state_has_changed():
     sim = lv.Simulation("stack")
     state = with_room(sim.state, sim.state.size[8], 5)
     before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
-    assert state.kernel.substeps(3) == (1, 0)
+    assert state.kernel.run_substeps(3) == (1, 0)
     assert state.head[HEAD["need_contacts"]] == 24
     for key, value in before.items():
         np.testing.assert_array_equal(state.a[key], value)

@@ -69,7 +69,7 @@ def test_the_builder_gives_the_recorded_rows():
     recorded = sim.constraint_problem()
     assert recorded.rows.n_contacts >= 4 and recorded.rows.n_joints == 5
     prepared = sim.state.copy()
-    prepared.kernel.prepare()
+    prepared.kernel.prepare_substep()
     built = rebuild(sim, prepared.a, recorded, scene.parameters.dt)
     assert built.m == recorded.m
     exact = {"rtol": 0.0, "atol": 1e-12}

@@ -36,9 +36,9 @@ ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "c
 
 def one_by_one(state):
     """A substep in stages: `solve` sweeps contact after contact."""
-    assert state.kernel.prepare() == 0
+    assert state.kernel.prepare_substep() == 0
     state.kernel.solve()
-    return state.kernel.finish()
+    return state.kernel.finish_substep()
 
 
 def same(a, b):
@@ -58,7 +58,7 @@ def test_packed_contacts_change_no_bit(name, more):
         sim.step()
         before = sim.state.copy()
         twin = before.copy()
-        assert before.kernel.substeps(1) == (0, 1)
+        assert before.kernel.run_substeps(1) == (0, 1)
         assert one_by_one(twin) == 0
         same(before, twin)
 
@@ -90,7 +90,7 @@ def test_packed_contacts_of_boxes_thrown_together(mixed):
     for _ in range(150):
         sim.step()
         before, twin = sim.state.copy(), sim.state.copy()
-        if before.kernel.substeps(1)[0] == 1:  # more contacts than there is room for: `step` makes it
+        if before.kernel.run_substeps(1)[0] == 1:  # more contacts than there is room for: `step` makes it
             continue
         assert one_by_one(twin) == 0
         same(before, twin)

@@ -36,9 +36,9 @@ def test_watched_sweeps_are_the_sweeps(name, order):
     simulation = after(30, name, order=order, solver_iterations=12)
     watched, plain = simulation.state.copy(), simulation.state.copy()
     for state in (watched, plain):
-        assert state.kernel.prepare() == 0
+        assert state.kernel.prepare_substep() == 0
     curve = np.full((13, 2), np.nan)
-    watched.kernel.solve_watched(curve)
+    watched.kernel.sweep_and_record_errors(curve)
     plain.kernel.solve()
     assert watched.real.tobytes() == plain.real.tobytes()
     assert watched.index.tobytes() == plain.index.tobytes()

@@ -19,7 +19,7 @@ def drift(name, seconds=SECONDS, *, dt=1 / 60, **parameters):
     for step in range(every, round(seconds / dt) + 1, every):
         left = every * sim.scene.parameters.substeps
         while left:
-            status, done = sim.state.kernel.substeps(left)
+            status, done = sim.state.kernel.run_substeps(left)
             left -= done
             if status == 1:
                 sim.state = sim.state.with_larger_buffers()

@@ -167,7 +167,7 @@ def dense_descent(sim, passes, keep, stiffening):
     j = rows.jacobian(p.cones).toarray()
     n = rows.n_bodies
     state = sim.state.copy()
-    state.kernel.prepare()
+    state.kernel.prepare_substep()
     gap = state.a["gap"][: rows.n_contacts]
     mass = np.zeros((6 * n, 6 * n))
     for i in range(n):
@@ -299,9 +299,9 @@ def test_a_stopped_prepare_leaves_no_softness_behind():
     # prepared twice, as a look at the problem does: the second must not see what the first has softened
     sim = after(5, "stack", stepper="soft_step")
     state = sim.state.copy()
-    state.kernel.prepare()
+    state.kernel.prepare_substep()
     first = state.a["b"].copy(), state.a["d"].copy()
-    state.kernel.prepare()
+    state.kernel.prepare_substep()
     assert state.a["b"].tobytes() == first[0].tobytes() and state.a["d"].tobytes() == first[1].tobytes()
     assert state.head[HEAD["stepper"]] == STEPPERS["soft_step"].number
 

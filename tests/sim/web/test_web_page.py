@@ -252,10 +252,10 @@ def test_plots_hold_the_native_errors(visit):
     for _ in range(9):
         simulation.step()
     state = simulation.state.copy()
-    assert state.kernel.substeps(1) == (0, 1)  # the last substep of two is watched
-    assert state.kernel.prepare() == 0
+    assert state.kernel.run_substeps(1) == (0, 1)  # the last substep of two is watched
+    assert state.kernel.prepare_substep() == 0
     curve = np.zeros((17, 2))
-    state.kernel.solve_watched(curve)
+    state.kernel.sweep_and_record_errors(curve)
     for k, name in enumerate(("normal", "energy")):
         assert v.js(f"lavender.charts.{name}.data[0]") == list(range(17))
         assert v.js(f"lavender.charts.{name}.data[1]") == curve[:, k].tolist()

@@ -22,8 +22,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import require_packages
-from lavender.base.lazy_import import import_numerics
-from lavender.judge.residuals import get_reference
+from lavender.base.lazy_import import import_numerical_modules
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Solution, Status, raise_if_interrupted
 from lavender.lab.bench import machine
 from lavender.lab.bench.record import ERROR, CaseInfo, Record, make_measurement_key
@@ -136,7 +136,7 @@ def _get_thread_pools(solver: str) -> Any:
     require_packages("a timed measurement", "threadpoolctl")
     from threadpoolctl import ThreadpoolController
 
-    import_numerics()
+    import_numerical_modules()
     return ThreadpoolController()
 
 
@@ -389,7 +389,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     arguments = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     # The runner has placed third-party solvers in a separate process already.
     prepared = prepare(fresh, task.solver, **{**arguments, **task.options})
-    get_reference(fresh)  # The judge's reference energies are computed before the clocks start.
+    get_zero_impulse_reference(fresh)  # The judge's reference energies are computed before the clocks start.
     if task.start == "cold":
         impulse = fresh.start()
     elif task.start == "warm":

@@ -14,7 +14,7 @@ from typing import Any
 from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
-from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.lab.bench.cases import hash_problem
@@ -148,7 +148,9 @@ def solve_isolated(
     """
     spec = registry.get(name)
     if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
-        import_numerics(*spec.requires)  # Import here, so that the first solve's time does not include it.
+        import_numerical_modules(
+            *spec.requires
+        )  # Import here, so that the first solve's time does not include it.
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
     Prepared(
         problem, spec, options, begin=False
