@@ -9,6 +9,7 @@ c[i, t] c[i, 0]. The method is right-looking: one division, one product and one 
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.factor.factors cimport clear_pivot_statistics, pivots_t
+from lavender_ext.factor.tiles cimport axpy_subtract
 
 
 cdef enum:
@@ -99,9 +100,8 @@ cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t wid
     If x is not NULL, `forward_substitute_band_ldl` is applied to it as well.
     """
     cdef int32_t i, s, t, last
-    cdef double inv, l
+    cdef double inv
     cdef double* col
-    cdef double* to
     for i in range(begin, end):
         col = c + <int64_t>i * width
         inv = invert_pivot_or_count_it(col[0], size[i], i, tiny, out)
@@ -112,14 +112,9 @@ cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t wid
         col[0] = inv
         last = height if height > 0 else end - i
         for s in range(1, last):
-            l = col[s] * inv
-            to = col + <int64_t>s * width
-            for t in range(s, last):
-                to[t - s] -= l * col[t]
+            axpy_subtract(last - s, col[s] * inv, col + s, col + <int64_t>s * width)
         if x != NULL:
-            l = x[i] * inv
-            for t in range(1, last):
-                x[i + t] -= col[t] * l
+            axpy_subtract(last - 1, x[i] * inv, col + 1, x + i + 1)
 
 
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
@@ -148,15 +143,12 @@ cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const doub
 cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                              double* x) noexcept nogil:
     """Solve with L for columns begin ... end - 1."""
-    cdef int32_t i, t, last
-    cdef double y
+    cdef int32_t i, last
     cdef const double* col
     for i in range(begin, end):
         col = c + <int64_t>i * width
-        y = x[i] * col[0]
         last = height if height > 0 else end - i
-        for t in range(1, last):
-            x[i + t] -= col[t] * y
+        axpy_subtract(last - 1, x[i] * col[0], col + 1, x + i + 1)
 
 
 cdef inline void back_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
