@@ -120,16 +120,24 @@ cdef void multiply_by_system_matrix(const linear_t* f, const double* x, double* 
 cdef int32_t compute_determinant_sign(const linear_t* f) noexcept nogil
 
 
+cdef class PythonCalls:
+    cdef interrupt_t interrupt                          # for `supernodal_t.interrupt`
+    cdef int32_t* stop                                  # set to 1 by an exception, or NULL
+    cdef object error                                   # the first exception that has not been raised
+
+    cdef void store_error(self, object error) noexcept
+    cdef int raise_error(self) except -1
+
+
 cdef class LinearSystem:
     cdef linear_t f
     cdef fallback_t calls
-    cdef interrupt_t interrupt                          # for ROWS: a signal's exception ends a factorisation
+    cdef PythonCalls python                             # for ROWS: an exception ends a factorisation
     cdef readonly object indptr, indices                # pattern of ROWS
     cdef readonly object data                           # (nnz) entries of the last factor of ROWS
-    cdef object analysis, numbers, upper, splu, other, error, held
+    cdef object analysis, numbers, upper, splu, other, held
     cdef readonly int64_t entries                       # number of values of L
 
     cpdef analyse(self)
     cpdef factor_rows_of_kernel(self, data, double tiny)
     cdef int allocate_factor_memory(self, bint lu) except -1
-    cdef int raise_error(self) except -1

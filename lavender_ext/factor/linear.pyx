@@ -16,8 +16,8 @@ from lavender_ext.factor.blocks cimport factor_blocks
 from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
                                         dense_lu_solve, dense_lu_solve_transposed, panel_offset)
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t, clear_pivot_statistics, supernodal_t
-from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, analyse_dense,
-                                         backward_tolerance, fallback_t, linear_t)
+from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, PythonCalls,
+                                         analyse_dense, backward_tolerance, fallback_t, linear_t)
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
 from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
                                              supernodal_scratch_size)
@@ -323,20 +323,40 @@ cdef int32_t compute_determinant_sign(const linear_t* f) noexcept nogil:
 # -- for Python --------------------------------------------------------------------------------------------------
 
 
-cdef int32_t is_interrupted(void* at) noexcept with gil:
-    """Run the handlers of signals that have arrived; their exception is raised by `raise_error`."""
-    cdef LinearSystem system = <LinearSystem>at
+cdef int32_t run_signal_handlers(void* at) noexcept with gil:
+    """Run the handlers of signals that have arrived; return whether one has raised an exception."""
     try:
         PyErr_CheckSignals()
     except BaseException as error:
-        system.error = error
+        (<PythonCalls>at).store_error(error)
         return 1
     return 0
 
 
+cdef class PythonCalls:
+    """Calls of a factorisation to Python, also to the handlers of signals. The first exception ends the work, and is then raised."""
+
+    def __cinit__(self):
+        self.interrupt = interrupt_t(<void*>self, run_signal_handlers, 0.0, 0)
+
+    cdef void store_error(self, object error) noexcept:
+        """Store an exception, unless an earlier one has not been raised yet, which may have caused it."""
+        if self.error is None:
+            self.error = error
+        if self.stop != NULL:
+            self.stop[0] = 1
+
+    cdef int raise_error(self) except -1:
+        """Raise the stored exception, if any, and allow further factorisations."""
+        error, self.error, self.interrupt.stopped = self.error, None, 0
+        if error is not None:
+            raise error
+        return 0
+
+
 cdef int32_t call_fallback(void* at) noexcept with gil:
     cdef LinearSystem system = <LinearSystem>at
-    if system.error is not None:                        # The caller is about to raise it.
+    if system.python.error is not None:                 # The caller is about to raise it.
         return 0
     try:
         system.other = system.splu(system)
@@ -344,7 +364,7 @@ cdef int32_t call_fallback(void* at) noexcept with gil:
     except RuntimeError:                                # The matrix is singular.
         return 0
     except BaseException as error:
-        system.error = error
+        system.python.store_error(error)
         return 0
 
 
@@ -356,7 +376,7 @@ cdef void solve_by_fallback(void* at, double* x) noexcept with gil:
         solution = system.other.solve(np.array(view))
         view[:] = solution
     except BaseException as error:
-        system.error = system.error or error
+        system.python.store_error(error)
         view[:] = np.nan
 
 
@@ -375,7 +395,7 @@ cdef class LinearSystem:
     """
 
     def __init__(self, pattern, bint wide=True, splu=None):
-        self.f.wide, self.splu = wide and has_wide(), splu
+        self.f.wide, self.splu, self.python = wide and has_wide(), splu, PythonCalls()
         if isinstance(pattern, int):
             analyse_dense(&self.f, pattern)
         else:
@@ -407,8 +427,7 @@ cdef class LinearSystem:
         f.link, f.next_row, f.row_indices = f.head + k, f.head + 2 * k, f.head + 3 * k
         f.value_offset, f.upper_offset = &offsets[0], &offsets[0] + k + 1
         f.n, f.supernodes, f.wide = n, k, self.f.wide
-        self.interrupt = interrupt_t(<void*>self, is_interrupted, 0.0, 0)
-        f.interrupt = &self.interrupt
+        f.interrupt = &self.python.interrupt
         self.entries = f.value_offset[k]
         index = self.indptr
         self.f.rows.indptr = &index[0]
@@ -447,13 +466,6 @@ cdef class LinearSystem:
             x, index = values, columns
             f.upper, self.f.rows.tdata = &x[0], &x[size]
             self.f.rows.tptr, self.f.rows.tind = &index[0], &index[0] + n + 2
-        return 0
-
-    cdef int raise_error(self) except -1:
-        """Raise the error of the fallback or of a signal's handler, if any."""
-        error, self.error = self.error, None
-        if error is not None:
-            raise error
         return 0
 
     cpdef factor_rows_of_kernel(self, data, double tiny):
@@ -505,12 +517,11 @@ cdef class LinearSystem:
             self.f.d = &metric[0]
         self.f.rows.data = self.f.matrix = <double*>&x[0]
         self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
-        self.interrupt.stopped = 0
         with nogil:
             lost = factor_linear_system_matrix(&self.f)
-        if self.interrupt.stopped:
+        if self.python.interrupt.stopped:
             self.f.factored = NO_FACTOR
-        self.raise_error()
+        self.python.raise_error()
         return lost
 
     def solve(self, const double[::1] r, bint checked=False):
@@ -532,7 +543,7 @@ cdef class LinearSystem:
         else:
             with nogil:
                 solve_linear_system(&self.f, &x[0])
-        self.raise_error()
+        self.python.raise_error()
         return out if is_good else None
 
     def multiply(self, const double[::1] x):

@@ -6,7 +6,6 @@ The unit of work is a factorisation; a step may do one or two more than requeste
 The method is compiled here once: other modules call the functions of `solve.pxd` by pointer. The classes give Python the
 same method, with arrays that `newton_t` points to, and its linear systems for tests.
 """
-from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
@@ -18,9 +17,9 @@ from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
-from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t
-from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, analyse_blocks, analyse_dense, block_factor_index_size,
-                                         block_factor_size, block_pattern_index_size)
+from lavender_ext.factor.factors cimport block_matrix_t, has_wide
+from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, PythonCalls, analyse_blocks, analyse_dense,
+                                         block_factor_index_size, block_factor_size, block_pattern_index_size)
 from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
                                          body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
                                          index_workspace_size, order_bodies, order_elements,
@@ -194,8 +193,7 @@ cdef int32_t call_linear_factor(void* at, int32_t what, double eps) noexcept wit
     try:
         return bool(self.others.factor(what, eps))
     except BaseException as error:                      # The step ends, and its caller raises the error, also for Ctrl-C.
-        self.raised = error
-        self.n.stop = 1
+        self.python.store_error(error)
         return 0
 
 
@@ -207,21 +205,8 @@ cdef void call_linear_solve(void* at, double* x) noexcept with gil:
         solution = self.others.solve(np.asarray(view))
         view[:] = solution
     except BaseException as error:
-        self.raised = self.raised or error              # The first error may have caused this one.
-        self.n.stop = 1
+        self.python.store_error(error)
         view[:] = np.nan
-
-
-cdef int32_t is_interrupted(void* at) noexcept with gil:
-    """Run the handlers of signals that have arrived; an exception ends the step."""
-    cdef Solve self = <Solve>at
-    try:
-        PyErr_CheckSignals()
-    except BaseException as error:
-        self.raised = error
-        self.n.stop = 1
-        return 1
-    return 0
 
 
 cdef inline object part(object array, const void* at, Py_ssize_t n):
@@ -286,9 +271,9 @@ cdef class Solve(Method):
     """
     cdef newton_t* n
     cdef external_t calls
-    cdef interrupt_t interrupt
+    cdef PythonCalls python
     cdef list held
-    cdef object others, raised, real, index
+    cdef object others, real, index
     cdef LinearSystem linear                            # of a sparse H
     cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
     cdef readonly object v, einv, p, pair, bt           # small matrices of all elements
@@ -324,7 +309,8 @@ cdef class Solve(Method):
         self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
         self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
         self.calls = external_t(<void*>self, call_linear_factor, call_linear_solve)
-        self.interrupt = interrupt_t(<void*>self, is_interrupted, 0.0, 0)
+        self.python = PythonCalls()
+        self.python.stop = &n.stop
 
     @property
     def whole(self):
@@ -405,28 +391,22 @@ cdef class Solve(Method):
         bind_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
                     <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
                     <double*>get_data_pointer(values) + factored)
-        f.factor.interrupt = &self.interrupt
+        f.factor.interrupt = &self.python.interrupt
 
     # -- start and step ----------------------------------------------------------------------------
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (rows,), to a relative residual of tol, with `budget` factorisations."""
         self.reset_target(tol, budget)
-        self.raised = None
         with nogil:
             begin(self.n, &self.options, &impulse[0])
 
     def step(self, int work, double[::1] impulse):
         """Do `work` factorisations or a few more. Write the best impulse (rows,) to `impulse`; return the outcome."""
-        self.interrupt.stopped = 0
-        if self.linear is not None:
-            self.linear.interrupt.stopped = 0
         Method.step(self, work, impulse)
         if self.linear is not None:
-            self.linear.raise_error()
-        if self.raised is not None:
-            error, self.raised = self.raised, None
-            raise error
+            self.linear.python.raise_error()
+        self.python.raise_error()
         return self.how
 
     @property
