@@ -11,7 +11,7 @@ from lavender.solvers.registry import SolverSpec
 
 __all__ = ["SPECS", "get_spec"]
 
-# Files in this folder with a SPEC, from exact to simple methods.
+# Names of the files in this folder that define a SPEC, from exact to simple methods.
 _TABLE = (
     "auto",
     "direct",

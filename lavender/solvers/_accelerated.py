@@ -24,8 +24,8 @@ from lavender_ext.core.order import SYMMETRIC
 
 SWEEPS = ("pgs", "blocks")
 MAX_MEMORY = 16
-# An accelerated sweep stalls after this many iterations without progress. With large mass ratios, the residual of
-# a conjugate gradient first rises for hundreds of iterations.
+# An accelerated sweep stops as STALLED after this many iterations without progress. At large mass ratios, the residual
+# of conjugate gradients first rises for hundreds of iterations.
 ACCELERATED_PATIENCE = 500
 # Sweeps use the rows of A instead of body velocities up to this many entries per row and in total. Measured: rows of A
 # are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570
@@ -113,9 +113,10 @@ def build_state_in_given_form(solver: Accelerated, problem: Problem) -> Accelera
 
 
 def choose_sweep_operator(problem: Problem) -> Any:
-    """Return the data that sweeps run over: rows of A if contacts have one row and few neighbours, else `swept`.
+    """Return the data that sweeps run over: rows of A if contacts have one row and few neighbours, else the given form.
 
-    For contacts of one row, rows of A cost as much as body velocities, and mixing does not recompute velocities.
+    For contacts of one row, a sweep over rows of A costs as much as one over body velocities, and combining iterates
+    needs no recomputation of velocities.
     """
     return choose_sweep_data(problem) if _max_entries(problem) is None else problem.csr_data
 
@@ -129,7 +130,7 @@ def estimate_sweep_work(problem: Problem) -> int:
 
 
 def _max_entries(problem: Problem) -> int | None:
-    """Return the number of entries of A if sweeps over its rows are faster than over body velocities, else None."""
+    """Return the number of entries of A if sweeps over rows of A are faster than over body velocities, else None."""
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None

@@ -3,11 +3,12 @@
     z = Pi_K(u),  y = rho (u - z),  (B + rho) x = c - s + rho z - y,  u <- u + alpha (x - z), then mixed
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the product of all bounds and cones, s De Saxce's shift of
-Coulomb's law (`lavender_ext/accelerate/admm.pyx`). An iteration is one triangular solve instead of a sweep. Large mass
-ratios and long chains need more factorisations (rho is adapted, at increasing intervals), but not more iterations.
-Coulomb friction starts from the solution of the convex relaxation. The factorisation is L L^T by panels of A, or of the
-body form if that has fewer unknowns than rows; L U by panels if A is not symmetric, or if the system is linear and A is
-not definite.
+Coulomb's law (`lavender_ext/accelerate/admm.pyx`), alpha the over-relaxation. An iteration is a forward and a backward
+substitution instead of a sweep. Large mass ratios and long chains need more factorisations (rho is adapted, at
+increasing intervals), but not more iterations. With Coulomb friction, the iteration starts from the solution of the
+convex relaxation. A is factored as L L^T in supernodes; if the bodies have fewer unknowns than there are rows, their
+matrix is factored instead. L U replaces L L^T if A is not symmetric, or if the problem is linear and A is not
+definite.
 """
 
 from __future__ import annotations
@@ -52,15 +53,15 @@ from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
 from lavender_ext.newton.coupled import scale_matrix_entries
 from lavender_ext.newton.solve import Layout
 
-_START_RHO = 0.1  # First penalty rho. B has unit diagonal, so its scale is 1. The value was measured.
-# The solver stalls after this many iterations without progress.
-# With large mass ratios, the residual rises while rho is adapted.
+_START_RHO = 0.1  # [-] First penalty rho, relative to the unit diagonal of B; found by measurements.
+# The solver stops as STALLED after this many iterations without progress. At large mass ratios, the residual rises
+# while rho is adapted.
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
 # `prepare` scales the problem if the estimated cost of scaling does not exceed this [ns]; otherwise `run` does.
 MAX_SETUP_SCALING_COST = 5e6
-# Estimated entries of J per row over two bodies, counted twice, and of J^T J per velocity.
+# Estimated number of entries of J and J^T together per row between two bodies, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
 
 
@@ -74,8 +75,8 @@ class AdmmState:
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
         get_zero_impulse_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
-        self.deadline = Deadline()  # No step starts that is expected to end after this deadline.
-        # Number of factorisations, and their number in earlier claims.
+        self.deadline = Deadline()  # A step does not start if it is expected to end after this deadline.
+        # Number of all factorisations, and number of those that earlier claims have reported.
         self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
@@ -113,7 +114,7 @@ class AdmmState:
         self.lu = self.full = False  # Whether the factor is L U, and whether its matrix is full.
         if _is_over_bodies(problem):
             form = problem.velocity_form()
-            # The form is scaled with D = diag d of the judge.
+            # `velocity_form` has scaled K and theta by the judge's d.
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
             self.is_scaled, self.next_cost = (
                 True,
@@ -131,7 +132,7 @@ class AdmmState:
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _estimate_first_factor_cost(self) -> float:
-        """Estimate the cost [ns] of the first factor from the structure; later factors cost as much as the last one."""
+        """Estimate the cost [ns] of the first factor from the structure; later costs are those of the last factor."""
         problem, rates = self.problem, RATES
         if self.is_over_bodies:
             assert problem.rows is not None
@@ -172,7 +173,7 @@ class AdmmState:
         _Breakdown
             No factorisation succeeds.
         TooLate
-            The last one would end after the deadline.
+            The last of these factorisations would end after the deadline.
         """
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
@@ -183,16 +184,16 @@ class AdmmState:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
             matrix, shift = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
-            # The pattern is analysed for each rho, because entries may cancel for some values of rho.
+            # Analyse the pattern for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
             extra = (*get_sorted_csr_arrays(k), e)
         done = _factor_shifted_matrix(system, matrix, shift, self.lu)
         if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
-            # L L^T needs a definite matrix, and a linear system may be indefinite.
+            # L L^T failed, as for an indefinite matrix: try L U.
             self.lu = True
             done = _factor_shifted_matrix(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
-            # L U by supernodes cannot exchange rows across supernodes, which is needed here.
+            # L U by supernodes failed, since it cannot exchange rows across supernodes: try L U of a full matrix.
             if self.deadline.has_passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
                 raise TooLate
             self.full = True
@@ -212,10 +213,11 @@ def _is_over_bodies(problem: Problem) -> bool:
 def _estimate_scaling_cost(problem: Problem) -> float:
     """Estimate the cost of scaling [ns]."""
     rates = RATES
-    if _is_over_bodies(problem):  # The cost is that of J, of the square root of M^-1, and of their product.
+    if _is_over_bodies(problem):  # Computes J, the square root of M^-1, and their product.
         return float(3.0 * rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m)
     entries, form = problem.max_entries, estimate_formation_cost(problem)
-    if problem.generalized is not None and entries == float(problem.m) ** 2:  # One product of dense matrices.
+    # A is a product of dense matrices.
+    if problem.generalized is not None and entries == float(problem.m) ** 2:
         product = rates["full layout entry"] * entries
         product += rates["dense factor"] * float(problem.metric.products_of_matrix)
         form = min(form, rates["set-up"] + product)
@@ -243,7 +245,7 @@ def _factor_shifted_matrix(system: LinearSystem, matrix: Any, shift: float, lu: 
     max |r - M x| <= BACKWARD_TOLERANCE (max |M_ij| max |x| + max |r|).
     """
     n = matrix.shape[0]
-    # L U overwrites a full matrix.
+    # Copy a full matrix, because L U overwrites it.
     values = matrix.copy() if isinstance(matrix, np.ndarray) else get_sorted_csr_arrays(matrix)[2]
     largest = np.abs(values).max()
     if not np.isfinite(largest) or _analyse_panels(system).factor(values, None, shift, PIVOT_TOLERANCE, lu):
@@ -284,7 +286,7 @@ class ADMM(Solver):
     def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
         """Start no step that is expected to end after `deadline`. Do the set-up now if it ends before."""
         state.deadline = deadline
-        with suppress(TooLate, _Breakdown, *BREAKDOWN):  # `run` meets the same error and reports it.
+        with suppress(TooLate, _Breakdown, *BREAKDOWN):  # `run` repeats the set-up and reports the error.
             state.scale_and_factor()
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -305,7 +307,7 @@ class ADMM(Solver):
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE_MESSAGE)
         splitting = state.splitting
         if state.watch.total == 0:
-            # The initial y is minus the shifted slack of the start; a solution is then a fixed point.
+            # Start with y = minus the shifted slack of the start, so that a solution is a fixed point.
             splitting.start(impulse, state.problem.slack(impulse))
         undone, message, total = splitting.undone, "", state.watch.total
 

@@ -1,4 +1,4 @@
-"""Anderson acceleration of projected Gauss-Seidel: combines the last few sweeps so that their steps nearly cancel.
+"""Anderson acceleration of projected Gauss-Seidel: combine the last few sweeps so that their steps nearly cancel.
 
     y = S(x),   f = D^1/2 (y - x),   x <- Pi(y - sum_i gamma_i (y_{i+1} - y_i)),
     gamma = argmin | f - sum_i gamma_i (f_{i+1} - f_i) |       over the last `memory` sweeps

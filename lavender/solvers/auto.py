@@ -1,24 +1,26 @@
 """Select and combine other solvers by their estimated costs (`Solver.cost`).
 
     start            if the start is a solution, nothing runs
-    compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method is
+    compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
+    is
                      estimated to cost no more than the first sweeps (`small.py`); attempted once
-    sweeps           (`anderson`, unless the problem is linear) `first_sweeps`, then as many as cost as much as the
-                     cheapest factorising solver, unless more are predicted to remain
+    sweeps           `anderson`, unless the problem is linear: `first_sweeps` sweeps. Sweeping continues up to the cost
+                     of the cheapest factorising solver, unless more sweeps than that are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
                      cheapest first, each up to `budget_ratio` times its estimated cost
-    certificate      that there is no solution: for J and M from the smallest violation, for others under Coulomb's law
-                     by a linear program
-    alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued, with doubled work in each
-                     round, until no solver improves the residual in two rounds or `total_ratio` is used up
-    end              a linear program searches for a certificate if none was tried (`certify.py`)
+    certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
+                     constraints, for other problems under Coulomb's law by a linear program
+    alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued where it stopped, with doubled
+                     work in each round, until no solver improves the residual in two rounds or the total cost exceeds
+                     `total_ratio` times the cost of the cheapest
+    end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix start with `direct`. A program with a singular P is solved by `PROGRAM_BACKENDS`, one
 after the other. The result is the best impulse of all stages. Costs are estimated, never measured, so the same problem
 is solved in the same way on every machine. Under a time limit, a factorising solver starts only if its estimated
 cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of the time, or all of it if no
 factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain` the stages that
-would run. These numbers decide (`decisions.py`):
+would run. The decisions depend on these numbers (`decisions.py`):
 
 """
 
@@ -70,9 +72,9 @@ from lavender.solvers.steps import (
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
-MAX_ALTERNATIONS = 12  # Largest number of rounds of alternation. The total cost ends most solves earlier.
-# A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp is always
-# installed.
+# Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
+MAX_ALTERNATIONS = 12
+# Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200
@@ -93,7 +95,7 @@ class Stage:
     why : str
         Reason, for `lavender.explain`.
     least : float
-        Sweeps stop if they predict that more than this number remain.
+        Sweeps stop if they predict that more than this number of sweeps is still needed.
     """
 
     solver: str
@@ -106,12 +108,13 @@ class Stage:
 class DecisionTree:
     """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
 
-    The caller sets `best`, the relative residual so far, and adds the cost of stages that it skips to `remaining_cost`.
+    The caller sets `best` to the smallest relative residual so far, and adds the cost of stages that it skips to
+    `remaining_cost`.
     """
 
-    remaining_cost = 0.0  # Cost [ns] that remains for the alternation.
+    remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
     compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
-    started_from_zero = False  # Whether that call started from the zero impulse.
+    started_from_zero = False  # Whether the compiled call started from the zero impulse.
     sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
     best = nan
 
@@ -130,12 +133,15 @@ class DecisionTree:
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
-        """States of Newton's method after its analysis, by form; empty if it is refused or too late."""
+        """States of Newton's method after the analysis of its matrix, by form.
+
+        It is empty if Newton's method refuses the problem, or if it would end after the deadline.
+        """
         is_possible = get("newton").refuses(self.problem) is None and not self.is_late
         return self.prepare_newton("newton") if is_possible else {}
 
     def prepare_newton(self, name: str) -> dict[str, NewtonState]:
-        """Return {name: state} of Newton's method in this form after its analysis; empty if the analysis fails."""
+        """Analyse the matrix of Newton's method in the form `name`; return {name: state}, or {} if that fails."""
         try:
             return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
         except BREAKDOWN:
@@ -143,16 +149,16 @@ class DecisionTree:
 
     @cached_property
     def row_form_cost(self) -> float:
-        """Lower bound of the cost [ns] of Newton's method over an A formed of J and M; inf if that is not possible."""
+        """Lower bound of the cost [ns] of Newton's method over A formed from J and M; inf if A cannot be formed."""
         p, state = self.problem, self.states.get("newton")
         if state is None or state.general is None or p.cones.has_round:
             return inf
         return estimate_cost("newton over rows", p).total
 
     def analyse_row_form_if_cheaper(self, max_cost: float) -> bool:
-        """Analyse A of J and M, too, if its Newton's method costs less than `max_cost` [ns] and has time.
+        """Add Newton's method over the rows of A = J M^-1 J^T to `states`, and return whether it was added.
 
-        Return whether a form was added.
+        It is added if it costs less than `max_cost` [ns] and can end before the deadline.
         """
         p, states = self.problem, self.states
         if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
@@ -167,7 +173,7 @@ class DecisionTree:
     @property
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
-        # `state.cost` is `Newton.cost` for this state.
+        # `state.cost` is the cost that `Newton.cost` returns with this state.
         found = {name: state.cost for name, state in self.states.items()}
         if self.can_pivot:
             found["direct"] = self.direct
@@ -176,7 +182,7 @@ class DecisionTree:
 
     @cached_property
     def can_pivot(self) -> bool:
-        """Whether `direct` is considered: for bounded rows, if A is given or costs less than the first sweeps."""
+        """Whether `direct` is considered: for bounded rows, if A is given or costs less to form than first sweeps."""
         if self.law != "lcp":
             return False
         if self.formation > DECISIONS.first_sweeps * self.sweep:
@@ -187,12 +193,12 @@ class DecisionTree:
 
     @cached_property
     def formation(self) -> float:
-        """Cost to form A of bodies or of J and M [ns], whether or not it is cached."""
+        """Cost to form A from bodies or from J and M [ns], whether or not A is cached."""
         return estimate_formation_cost(self.problem, self.problem.matrix is not None)
 
     @cached_property
     def direct(self) -> float:
-        """Cost of `direct` on bounded rows [ns], with the formation of A."""
+        """Cost of `direct` on bounded rows [ns], including the cost to form A."""
         return self.formation + estimate_cost("direct", self.problem).total
 
     @property
@@ -220,22 +226,22 @@ class DecisionTree:
     def factorises_first(self) -> bool:
         """Whether a factorising solver costs less than the first sweeps, or sweeps do not accept the problem.
 
-        Fill determines the cost of a factor of a matrix, and only an analysis gives it. Before the first sweeps, only
-        the cost of `direct` and the cost over bodies or velocities are known.
+        The cost to factor a sparse A depends on its fill-in, which only an analysis computes. Before the first sweeps,
+        therefore, only the costs of `direct` and of Newton's method over bodies or velocities are compared.
         """
         p, first = self.problem, DECISIONS.first_sweeps * self.sweep
         if self.law == "linear" or p.cones.has_round:
             return True
         if self.can_pivot and self.direct < first:
             return True
-        if self.compiled_call_failed:  # From the same start, Newton's method would stall again.
+        if self.compiled_call_failed:  # Started at the same point, Newton's method would stall again.
             return False
         if p.matrix is not None:
             return False
         return self.min_newton_cost < first and self.newton < first
 
     def __iter__(self) -> Iterator[Stage]:
-        """Yield the stages in order; each is only needed if the stages before it did not solve the problem."""
+        """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
         p, ratio = self.problem, DECISIONS.budget_ratio
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
@@ -253,7 +259,8 @@ class DecisionTree:
             yield self.sweeps(self.newton - first, why, self.newton)
         if p.generalized is not None and not np.all(p.compliance):
             yield from islice(self.iterate_factorising_stages(0.25 * ratio), 1)
-            state = self.states.get("newton")  # The smallest violation is found over velocities.
+            # The certificate's smallest violation is computed over velocities.
+            state = self.states.get("newton")
             cost = self.newton if state is None else state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.iterate_factorising_stages(ratio)
@@ -268,7 +275,7 @@ class DecisionTree:
         for k in range(MAX_ALTERNATIONS):
             before = self.best
             for stage in self.iterate_one_round(2.0**k):
-                if self.remaining_cost < 1.0:  # [ns]
+                if self.remaining_cost < 1.0:  # Less than 1 ns remains.
                     return
                 fraction = min(1.0, self.remaining_cost / stage.cost)
                 self.remaining_cost -= fraction * stage.cost
@@ -283,7 +290,7 @@ class DecisionTree:
         return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
 
     def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
-        """Yield stages of the factorising solvers; each costs up to this multiple of the cheapest solver's cost."""
+        """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
         budget = times * self.newton
         for name, cost in self.solver_costs.items():
             if cost <= budget:
@@ -291,20 +298,23 @@ class DecisionTree:
                 yield self.factorisation(name, times * cost, why)
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
-        """Return a stage of this cost [ns] of a factorising solver."""
+        """Return the stage of a factorising solver with the budget `cost` [ns]."""
         steps = self.states[name].steps if name in self.states else DECISIONS.pivot_factorisations
         return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
 
     def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
-        """Return a stage of sweeps of this cost [ns]; it stops if it predicts more than `max_remaining` [ns]."""
+        """Return a stage of sweeps with the budget `cost` [ns].
+
+        Sweeping stops if the sweeps that are still needed are predicted to cost more than `max_remaining` [ns].
+        """
         return Stage("anderson", cost / self.sweep, cost, why, max_remaining / self.sweep)
 
     def iterations(self, name: str, cost: float, why: str) -> Stage:
-        """Return a stage of this cost [ns] of a solver whose iterations cost as much as two sweeps."""
+        """Return a stage with the budget `cost` [ns] of a solver with iterations that cost as much as two sweeps."""
         return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
     def iterate_one_round(self, times: float) -> Iterator[Stage]:
-        """Yield one round, in which each solver costs this multiple of the factorising solvers' first budget."""
+        """Yield one round, in which each solver may cost `times` the first budget of the factorising solvers."""
         times *= DECISIONS.budget_ratio
         cost = times * self.unit
         why = f"in turn, {times:g} times the cheapest factorising solver's cost"
@@ -312,7 +322,7 @@ class DecisionTree:
         p = self.problem
         setup = 0.0
         if p.generalized is not None:
-            # If no stage formed A of J and M, form and factor it now. The cost does not depend on cached data.
+            # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
         if setup <= cost:
@@ -376,7 +386,7 @@ class Auto(Solver):
         time_limit: float | None,
         recorder: Recorder | None = None,
     ) -> Claim:
-        """Run as `run`, and write the history with the recorder."""
+        """Run as `run`, and let `recorder`, if it is given, write the history."""
         problem, deadline = state.problem, Deadline(time_limit)
         if problem.has_singular_program:
             return run_singular_program_backends(problem, impulse, max_iter, tol, deadline)
@@ -412,7 +422,7 @@ class Auto(Solver):
                     log.record_stage(name, claim, log.best)
                 solve(log, tree)
         except KeyboardInterrupt:
-            log.interrupted = True  # The best impulse is returned even after an interruption.
+            log.interrupted = True  # Return the best impulse so far also after Ctrl-C.
         except BREAKDOWN as error:
             log.failure = format_error(error)
         impulse[:] = log.result if log.best > tol else log.impulse
@@ -430,7 +440,7 @@ def run_singular_program_backends(
 ) -> Claim:
     """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
 
-    If none reaches tol, the result is the one with the smallest error of the program.
+    If no backend reaches tol, the result with the smallest error of the program is returned.
     """
     log, start = SolveLog(problem, tol, max_iter, deadline), impulse.copy()
     log.judge_and_store_best(impulse)
@@ -460,7 +470,8 @@ def run_singular_program_backends(
         impulse[:] = log.impulse
     else:
         impulse[:] = best
-        if claim.status is Status.ROUNDOFF_LIMIT:  # This is only true for the impulse of the log.
+        # This status belongs to the best impulse, not to this backend's.
+        if claim.status is Status.ROUNDOFF_LIMIT:
             claim = replace(claim, status=Status.STALLED)
     return claim
 
@@ -479,7 +490,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         Sweeps("anderson", log).sweep_until_deadline()
         return
     lines = iter(tree)
-    while not log.done():  # This is checked before the tree computes the costs of the next stage.
+    # Check this first, because the tree computes costs before it yields the next stage.
+    while not log.done():
         stage = next(lines, None)
         if stage is None:
             break
@@ -526,7 +538,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
 
 
 def can_factorise_later(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
-    """Return whether, after work of this cost [ns], a factorising solver can end in time, or all have ended."""
+    """Return whether work of this cost [ns] leaves time for a factorising solver, or whether all of them have ended."""
     if "states" not in vars(tree):
         return tree.has_time("newton", tree.min_newton_cost, cost)
     unfinished = [name for name in tree.states if name not in steps or not steps[name].over]
@@ -536,7 +548,7 @@ def can_factorise_later(tree: DecisionTree, steps: dict[str, Step], cost: float)
 
 
 def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
-    """Create the step of this name; Newton's method gets the state of the tree."""
+    """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
     kinds = {"anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton}
     step = kinds.get(name, Iterations)(name, log)
     if isinstance(step, Newton):

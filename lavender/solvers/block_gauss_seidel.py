@@ -1,4 +1,4 @@
-"""Block Gauss-Seidel: contacts and joints are solved exactly one after the other, with all others fixed.
+"""Block Gauss-Seidel: contacts and joints are solved exactly one after the other, with all other blocks fixed.
 
     find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
 

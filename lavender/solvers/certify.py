@@ -2,19 +2,19 @@
 
     A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign on free rows),  b.y > 0
 
-On a contact, y has only a normal component, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. The
-sum of |z_t| replaces its norm in the linear program: every certificate found is valid, but with two tangents a few are
-missed.
+On a contact, y has only a normal component, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. In
+the linear program, the sum of |z_t| over the tangents replaces the norm. Every certificate that it finds is valid, but
+with two tangents it misses a few.
 
-With Coulomb friction, the convex relaxation is tried last. A direction y of the relaxation that has tangential
-components proves nothing for Coulomb's law, but it shows which blocks conflict: a compliance on the rows of y removes
-it (`find_conflict`).
+With Coulomb friction, the convex relaxation is tried last. A certificate y of the relaxation that has tangential
+components proves nothing for Coulomb's law, but it shows which blocks conflict: with compliance on the rows of y, the
+relaxation has a solution (`find_conflict`).
 
 With J and M, the certificate is computed from the smallest violation of J v = target, which does not depend on M
 (`certify_by_least_violation`).
 
-One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
-another island does not matter.
+One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because a linear program
+accepts no rows with upper bounds, and other islands may have them.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import residuals_by_island
 
-# Linear programs are used if all islands together have up to this many rows.
+# Linear programs are used for problems of up to this many rows in all islands together.
 CERTIFICATE_ROWS = 3000
 LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
 # Largest number of factorisations to prove that the convex relaxation has no solution.
 MAX_RELAXATION_STEPS = 150
 MAX_SOFTENED_STEPS = 300  # Largest number of factorisations to solve a problem with additional compliance.
-TRIED_COMPLIANCES = 1e-4, 1e-2  # Additional compliances that are tried, as multiples of d.
-# Compliances of the rigid rows, as multiples of d, which are tried one after the other. The solutions approach the
-# motion with the smallest violation.
+TRIED_COMPLIANCES = 1e-4, 1e-2  # [-] Additional compliances that `find_conflict` tries, as multiples of d.
+# [-] Compliances eps of rigid rows, as multiples of d, which are tried one after the other to find a motion with the
+# smallest violation of the constraints.
 NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
 VIOLATION_TOLERANCE = 1e-6  # Relative residual to which the problems with these compliances are solved.
 # Rows of a direction are set to zero if they are below this fraction of its largest entry in the metric of D.
@@ -68,11 +68,11 @@ class Conflict:
     blocks : tuple of int
         Conflicting blocks.
     soft_rows : tuple of int
-        Rows for which an additional compliance gives a solvable problem; empty if no tried compliance does.
+        Rows for which an additional compliance makes the problem solvable; empty if no tried compliance does.
     compliance : float, 1/kg
-        Largest of these compliances.
+        Largest compliance that was added to a row of `soft_rows`.
     soft : str
-        Names of the blocks of these rows.
+        Names of the blocks of `soft_rows`.
     """
 
     proof: Proof
@@ -104,7 +104,7 @@ def find_conflict(problem: Problem, tol: float, deadline: Deadline | None = None
     tries = [
         (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
     ]
-    if contacts:  # Other contacts may conflict, too, but this proof does not contain them.
+    if contacts:  # Soften all contacts, as contacts that this proof does not contain may conflict, too.
         tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
     for rows, names in tries:
         for fraction in TRIED_COMPLIANCES:
@@ -112,7 +112,7 @@ def find_conflict(problem: Problem, tol: float, deadline: Deadline | None = None
             compliance[rows] = fraction * problem.d[rows]
             try:
                 softer = add_compliance(problem, compliance)
-            except InputError:  # A number exceeds the largest one that a problem may have.
+            except InputError:  # A number of the softened problem exceeds the accepted range.
                 continue
             if _run_newton(softer, MAX_SOFTENED_STEPS, tol, deadline)[0] <= tol:
                 largest = float(compliance.max())
@@ -156,9 +156,9 @@ def certify_by_least_violation(log: SolveLog) -> None:
 
         min 1/2 (v' - v).C (v' - v) + 1/2 |violation|^2 / (eps d)
 
-    grow as y / eps + constant if a violation remains, and then J^T y = 0 and b.y > 0. The difference of two of them
-    gives y to many digits, and the judge refines it. Rows with compliance may be violated: their eps is 1 and their y
-    is 0. Under Coulomb's law, friction is left out.
+    grow as y / eps + constant if a violation remains, with J^T y = 0 and b.y > 0. The difference of lambda for two
+    values of eps gives y to many digits, and the judge refines it. Rows with compliance may be violated: their eps is
+    1 and their y is 0. Under Coulomb's law, friction is left out.
     """
     problem, generalized = log.problem, log.problem.generalized
     assert generalized is not None and problem.compliance is not None
@@ -167,7 +167,7 @@ def certify_by_least_violation(log: SolveLog) -> None:
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = generalized.jac.multiply(generalized.jac).tocsr()
     mass = squares.T @ (1.0 / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
-    mass[mass < MIN_MAGNITUDE] = 1.0  # No row moves these velocities, or only by rounding noise.
+    mass[mass < MIN_MAGNITUDE] = 1.0  # These velocities occur in no row, up to rounding noise.
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(generalized.m)
     has_compliance = problem.compliance > 0.0
@@ -175,13 +175,13 @@ def certify_by_least_violation(log: SolveLog) -> None:
         rigid = Problem.from_jacobian(
             generalized.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
         )
-    except InputError:  # For example, C = 1 is negligible if J is 1e47.
+    except InputError:  # Numbers are out of range; for example, C = 1 is too small if J is 1e47.
         return
     for fraction in NEARLY_RIGID_COMPLIANCES:
         eps = np.where(has_compliance, 1.0, fraction) * d
         soft = replace(
             rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
-        )  # Negligible rows are empty.
+        )  # Set rows of J with negligible entries to zero.
         kernel = general.prepare_islands(soft)
         if kernel is None or log.ends_after_deadline(RATES["linear program"]):
             return
@@ -192,7 +192,7 @@ def certify_by_least_violation(log: SolveLog) -> None:
             is Status.INTERRUPTED
         ):
             raise KeyboardInterrupt
-        # The second one helps if rows had larger impulses with the previous eps.
+        # Try the difference of both impulses, and the last impulse, which is better if other rows' impulses decreased.
         for y in (lam - before, lam):
             y = drop_negligible_rows(np.where(has_compliance, 0.0, y), d)
             outside = (np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))
@@ -222,7 +222,7 @@ def certify_infeasibility(log: SolveLog) -> None:
 
 
 def certify_by_linear_programs(log: SolveLog) -> None:
-    """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
+    """Search for a certificate by linear programs, one for each unsolved island without upper bounds."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_after_deadline(
         RATES["linear program"] + estimate_import_cost("scipy.optimize")
@@ -284,9 +284,10 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     """
     if not _has_simple_bounds(problem):
         return None
-    from scipy.optimize import linprog  # The import takes 0.1 s and is only needed here.
+    from scipy.optimize import linprog  # Imported here: it takes 0.1 s, and only this function needs it.
 
-    # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
+    # Maximise b.y with A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents and 0 <= y <= 1, in the metric of
+    # d.
     cones = problem.cones
     contact, tangent = cones.contact_rows, cones.friction_rows
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper) & ~contact
@@ -306,7 +307,7 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     level = sp.hstack([at[free], rim[free]]).tocsr()
     low = np.concatenate([np.where(free, -1.0, 0.0), np.zeros(rim.shape[1])])
     high = np.concatenate([np.where(tangent, 0.0, 1.0), np.full(rim.shape[1], np.inf)])
-    if problem.compliance is not None:  # y.A y = 0 requires y = 0 on rows with compliance.
+    if problem.compliance is not None:  # A certificate is 0 on rows with compliance, since y.A y = 0.
         low[: problem.m][problem.compliance > 0.0] = high[: problem.m][problem.compliance > 0.0] = 0.0
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": SIMPLEX_STEPS_PER_ROW * problem.m}

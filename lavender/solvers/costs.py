@@ -1,23 +1,23 @@
-"""Estimate costs [ns]: counted operations times the rates of `rates.json`, from the data and without a clock.
+"""Estimate costs [ns]: operations, counted from the data, times the rates of `rates.json`. No clock is read.
 
-`Solver.cost(problem)` returns a `Cost`; `auto`, deadlines and `explain` read it. Two kinds of operations are counted.
+`Solver.cost(problem)` returns a `Cost`; `auto`, deadlines and `explain` read it. There are two kinds of costs.
 
-Iterations, which `auto` compares; the rates are fitted means:
+Costs of iterations, which `auto` compares. Their rates are fitted means:
 
     Newton   start + n (row m + entry e + work w)                                                             (1)
     sweep    sweep_row m + entry e, with another rate of e over J and M, and under the cone law over J        (2)
     direct   n (row m + work w)                                                                               (3)
 
-m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds of
-one factorisation and its solves, from the solver's own analysis (`NewtonState.count`) or from the band of A. n is the
-number of factorisations: 1 for linear problems, `DECISIONS.pivot_factorisations` for bounded rows of a matrix or of
-bodies, otherwise `DECISIONS.factorisations`. Newton's method over generalised velocities has its own estimate, without
-a start and with two rates of rows (`lavender_ext/small/limits.pxd`).
+m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds
+of one factorisation and its solves, from the solver's own analysis (`NewtonState.count`) or from the band of A. n is
+the number of factorisations: 1 for linear problems, `DECISIONS.pivot_factorisations` for bounded rows of a matrix or
+of bodies, otherwise `DECISIONS.factorisations`. Newton's method over generalised velocities has its own estimate,
+without a start and with two rates of rows (`lavender_ext/small/limits.pxd`).
 
-Set-ups and the judge, which are only estimated under a time limit, because they cannot be interrupted; their rates are
-1.5 times the fitted means. `python -m benchmarks rates` measures these rates and writes the file. Rates from "band
-work" on were measured once: they choose a factorisation or decide under a time limit alone. The same problem has
-the same cost on every machine that has the same file.
+Costs of set-ups and of the judge, which cannot be interrupted. They are estimated only under a time limit; their rates
+are 1.5 times the fitted means. `python -m benchmarks rates` measures the rates and writes the file. The rates from
+"band work" on in the file were measured once: they only select a factorisation, or are used only under a time limit. A
+problem has the same cost on all machines with the same file.
 """
 
 from __future__ import annotations
@@ -67,19 +67,20 @@ __all__ = [
     "is_formed",
 ]
 
-# os.path is used because pathlib would take 4 % of the time of `import lavender`.
+# Use os.path, because importing pathlib would take 4 % of the time of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
 
 SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factorisations need.
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
 ANALYSIS_BANDWIDTH = 1500.0
-PRODUCTS_PER_BODY_ROW = 32  # Multiply-adds of a pass of the judge for each row between two bodies.
+PRODUCTS_PER_BODY_ROW = 32  # Number of multiply-adds of one pass of the judge per row between two bodies.
 PANELS_GROWTH_ROWS = (
     8000.0  # A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
 )
-# A time limit above these costs [ns], constant and per entry of a full A, is about a hundred times the set-up and the
-# judge together: nothing else is estimated before the solve, because estimates take longer than a small problem.
+# [ns, ns per entry of a full A] If a time limit exceeds LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY m^2, it is about a hundred
+# times the cost of set-up and judge. No costs are then estimated before the solve, because an estimate takes longer
+# than a small problem.
 LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
 
 
@@ -91,7 +92,7 @@ class Cost:
     Parameters
     ----------
     setup : float, ns
-        `prepare`, which cannot be interrupted: a time limit decides whether it starts.
+        Cost of `prepare`. Since it cannot be interrupted, it starts only if this cost fits into a time limit.
     iteration : float, ns
         One iteration; NaN if it is not known.
     total : float, ns
@@ -126,7 +127,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Count:
-    """Counts of one step of Newton's method over rows or bodies.
+    """Operation counts of one step of Newton's method over rows or bodies.
 
     Parameters
     ----------
@@ -139,7 +140,7 @@ class Count:
     rows : float
         Number of rows.
     set_up : float, ns
-        Cost of forming A of J and M.
+        Cost to form A from J and M.
     """
 
     form: str
@@ -196,7 +197,7 @@ def count_dense_work(m: int) -> float:
 
 
 def estimate_sparse_work(entries: float, m: int) -> float:
-    """Estimate the multiply-adds of a sparse factor from its size, without an analysis. Fill grows with the size."""
+    """Estimate the multiply-adds of a sparse factorisation from the size of A, without an analysis of its fill-in."""
     return 100.0 * entries * (1.0 + m / 1000.0)
 
 
@@ -204,7 +205,7 @@ def estimate_sparse_work(entries: float, m: int) -> float:
 
 
 def get_loose_limit(problem: Problem) -> float:
-    """Return about a hundred times the cost of set-up and judge together [ns], from the number of rows alone."""
+    """Return the time limit [ns] above which no costs are estimated: about a hundred times set-up and judge."""
     return LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY * float(len(problem.b)) ** 2
 
 
@@ -214,7 +215,10 @@ def is_formed(problem: Problem) -> bool:
 
 
 def estimate_formation_cost(problem: Problem, known: bool | None = None) -> float:
-    """Estimate the cost to form A of J and M or of bodies [ns]; 0 if A is known. `known` replaces this check."""
+    """Estimate the cost to form A from J and M or from bodies [ns]; 0 if A is known.
+
+    `known` states whether A is known; None checks the problem's cache.
+    """
     if is_formed(problem) if known is None else known:
         return 0.0
     if problem.rows is None:
@@ -227,7 +231,7 @@ def estimate_formation_cost(problem: Problem, known: bool | None = None) -> floa
 def estimate_disk_cost(problem: Problem) -> float:
     """Estimate the cost to build `problem.disk` [ns]; 0 if it is known, or if the problem has no ellipses.
 
-    The estimate itself computes only the couplings of bodies, whose cost the caller has checked before.
+    The estimate counts the couplings of bodies; the caller has checked that there is time for this.
     """
     if not problem.cones.has_ellipse or "_disk" in problem.__dict__:
         return 0.0
@@ -240,7 +244,7 @@ def estimate_disk_cost(problem: Problem) -> float:
 
 
 def estimate_refusal_cost(problem: Problem) -> float:
-    """Estimate the cost of `SolverSpec.refusal` [ns]: adapters of other packages read a complete matrix."""
+    """Estimate the cost of `SolverSpec.refusal` [ns]; adapters of other packages read the complete A in it."""
     if problem.matrix is None or "_scan" in problem.__dict__:
         return 0.0
     return float(estimate_judge_setup_cost(problem) + RATES["judge entry"] * float(problem.matrix.size))
@@ -258,7 +262,7 @@ def estimate_symmetry_cost(problem: Problem) -> float:
 
 
 def estimate_matrix_setup_cost(problem: Problem) -> float:
-    """Estimate the cost to form A, check its symmetry, and lay it out for a solver [ns]."""
+    """Estimate the cost to form A, check its symmetry, and copy it into a solver's layout [ns]."""
     entries = problem.max_entries
     imports = estimate_import_cost(*SCIPY_MODULES) if problem.m > DECISIONS.small_rows else 0.0
     if entries == float(problem.m) ** 2:
@@ -288,18 +292,21 @@ def estimate_row_sums_cost(problem: Problem) -> float:
 
 
 def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
-    """Estimate the cost of a first factor of m rows [ns], dense, or sparse if `entries` is given and less work."""
+    """Estimate the cost of a first factorisation of m rows [ns]: dense, or sparse if that costs less.
+
+    `entries` is the number of entries of the matrix.
+    """
     dense = RATES["dense factor"] * count_dense_work(m)
     return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
 
 
 def estimate_band_factor_cost(m: int, band: int) -> float:
-    """Return the cost of one compiled factor of m rows of a half bandwidth [ns]."""
+    """Return the cost of one compiled factorisation [ns] of m rows with the half bandwidth `band`."""
     return float(RATES["band work"] * m * float(band + 1) ** 2)
 
 
 def estimate_dense_factor_cost(m: int) -> float:
-    """Return the cost of one full Cholesky factor of m rows [ns], without the call.
+    """Return the cost of one dense Cholesky factorisation of m rows [ns], without the overhead of the call.
 
     LAPACK on one thread takes 0.7 to 1 times as long.
     """
@@ -307,7 +314,7 @@ def estimate_dense_factor_cost(m: int) -> float:
 
 
 def estimate_panel_factor_cost(nnz: int, m: int) -> float:
-    """Return the cost of one factor by panels with its analysis [ns], of m rows and nnz symmetric entries."""
+    """Return the cost of one supernodal factorisation with its analysis [ns], for m rows and nnz entries."""
     return float(RATES["panels call"] + RATES["panels entry"] * nnz * (1.0 + m / PANELS_GROWTH_ROWS))
 
 
@@ -331,7 +338,7 @@ def estimate_order_cost(problem: Problem, order: object) -> float:
 
 
 def estimate_judge_setup_cost(problem: Problem) -> float:
-    """Estimate the cost to set up the judge's first pass [ns]: A by rows, J L^-1, or the arrays of bodies."""
+    """Estimate the cost to compute the arrays that the judge reads [ns]: A by rows, J L^-1, or those of bodies."""
     return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
 
 
@@ -353,7 +360,7 @@ def _is_set_up(problem: Problem) -> bool:
 
 
 def _estimate_pass(problem: Problem) -> tuple[float, float]:
-    """Return the maximum multiply-adds of a pass and the cost to set it up [ns]."""
+    """Return an upper bound of the multiply-adds of a pass of the judge, and the cost to compute its arrays [ns]."""
     general = problem.generalized
     if general is not None:
         # A row of J L^-1 has at most as many entries as the row of J, times the mean length of the rows of L.

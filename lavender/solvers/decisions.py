@@ -1,4 +1,4 @@
-"""Numbers that decide in `auto`: its decision table, the first compiled call, and the estimated costs.
+"""Numbers on which the decisions of `auto`, the first compiled call and the estimated costs depend.
 
 `python -m benchmarks decisions` counts the work on fixed problems with each number halved and doubled. Costs in
 nanoseconds are measured separately (`rates.json`).
@@ -12,7 +12,7 @@ __all__ = ["DECISIONS", "NUMBERS", "Number", "describe_numbers"]
 
 
 class Number(NamedTuple):
-    """A number that decides in `auto`.
+    """A number on which a decision of `auto` depends.
 
     Parameters
     ----------

@@ -1,23 +1,23 @@
 """Factor and solve; with bounds, block principal pivoting on the same factorisation.
 
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
-    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess the set of free rows (all rows of a
+    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess the set of free rows (all rows if A has
+    a
              narrow band, otherwise the rows that are free after a few sweeps), solve for them, exchange the rows with
              the wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
-    singular the same on A + s D, s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A fixed point
-             solves A itself (proximal point method). Once the set of free rows no longer changes, each pass is one step
-             of refinement: it multiplies the error along an eigenvector of eigenvalue sigma by s / (s + sigma). If the
-             problem has no solution, the passes diverge along some y >= 0 with A y = 0 and b.y > 0, which is the
-             certificate.
+    singular the boxed method on A + s D with s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A
+             fixed point solves the problem with A (proximal point method). Once the set of free rows no longer
+             changes, each pass is one step of refinement: it multiplies the error along an eigenvector of eigenvalue
+             sigma by s / (s + sigma). If the problem has no solution, the passes diverge along some y >= 0 with A y =
+             0 and b.y > 0, which is the certificate.
 
 All of this runs in `lavender_ext/pivot/direct.pyx`.
 
-For a positive definite A, the method is finite and exact to rounding, for any `tol`. A singular positive semidefinite A
-is reported in the message; if refinement does not reach rounding, the status is STALLED, with the best iterate. Linear
-systems that are asymmetric or indefinite are factored by LU with pivoting; if that is singular, an SVD gives the rank.
-Bounded rows with an asymmetric A are exchanged with LU: this is finite unless the exchanges cycle, which no decreasing
-energy excludes. Box friction is converted to such rows (`polyhedral.py`); if the exchanges cycle, complementary pivots
-follow.
+For a positive definite A, the method is finite and exact to rounding, for any `tol`. A singular positive semidefinite
+A is reported in the message; if refinement does not reach rounding, the status is STALLED, with the best iterate.
+Linear systems that are asymmetric or indefinite are factored by LU with pivoting; if that is singular, an SVD gives
+the rank. For bounded rows with an asymmetric A, exchanges use LU. They may cycle, because no energy decreases. Box
+friction is converted to such rows (`polyhedral.py`); if the exchanges cycle, Lemke's method follows.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ from lavender_ext.pivot.principal import INDEFINITE, SMALL_PIVOT, SOLVED, STUCK
 REFINEMENT_RESIDUAL = (
     1e-13  # Refinement ends at this relative residual, or at the round-off floor if that is larger.
 )
-ROUNDS_PER_CHECK = 32  # Rounds of exchanges between two checks of the clock and the residual.
+ROUNDS_PER_CHECK = 32  # Number of rounds of exchanges between two checks of the clock and the residual.
 
 
 def _estimate_linear_cost(problem: Problem) -> float:
-    """Estimate the cost to set up a linear problem and to compute the factor of all its rows [ns]."""
+    """Estimate the cost to set up a linear problem and to factor A [ns]."""
     factor = estimate_first_factor_cost(problem.m, problem.max_entries)
     return estimate_matrix_setup_cost(problem) + factor
 
@@ -69,11 +69,11 @@ class DirectState:
     ----------
     problem : Problem
     pivot : PivotState, optional
-        Rows of a boxed or symmetric problem.
+        State of the exchanges, for a boxed or symmetric problem.
     general : RankRevealingFactor or PanelsLU, optional
         Factor of an asymmetric or indefinite linear system.
     failed_factorisations : int
-        Factorisations before `general` that failed.
+        Number of factorisations that failed before `general`.
     is_running : bool
         Whether `run` was called.
     note : str
@@ -92,7 +92,8 @@ class DirectState:
 class Direct(Solver):
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
-    patience: ClassVar[bool] = True  # Whether the solver continues if pivoting with one shift is stuck.
+    # Whether the solver continues with another shift if pivoting makes no progress.
+    patience: ClassVar[bool] = True
     exact: ClassVar[bool] = True  # Whether the solver solves to rounding, whatever the tolerance.
 
     def fallback(self) -> Solver:
@@ -176,7 +177,7 @@ def _factor_asymmetric(problem: Problem) -> DirectState:
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def _factor_by_rank_revealing_lu(problem: Problem, why: str) -> DirectState:
-    """Factor A by LU that reveals the rank; `why` begins the message."""
+    """Factor A by a rank-revealing LU factorisation; `why` begins the message."""
     factor = RankRevealingFactor(problem)
     if not factor.usable:
         why += "; LU is singular and A too large for a decomposition that reveals its rank"
@@ -204,10 +205,10 @@ class _Run:
         self.max_iter, self.tol = max_iter, tol
         self.deadline = deadline
         self.best_pass: measure.Judged | None = None
-        self.late = False  # No round was started, because it would have ended after the deadline.
+        self.late = False  # Whether a round was not started because it would have ended after the deadline.
         self.iterations = 0
         self.work: dict[str, int] = {}
-        self.reported: dict[str, int] = {}  # Work of the rows that earlier runs have reported.
+        self.reported: dict[str, int] = {}  # Work that earlier runs of this state have reported.
         self.notes = [state.note] if state.note else []
 
     # -- judging ---------------------------------------------------------------------------------
@@ -238,7 +239,7 @@ class _Run:
         """Copy the best iterate to the impulse."""
         pivot = self.state.pivot
         if pivot is not None and pivot.rows.relative < self.best:
-            # This iterate is left if an error or Ctrl-C ended the run between two rounds.
+            # If an error or Ctrl-C ended the run between two rounds, the kernel's best iterate was not stored yet.
             self.store_if_best(pivot.rows.best)
         if self.best_pass is not None:
             self.impulse[:] = self.best_pass.impulse
@@ -257,7 +258,7 @@ class _Run:
 
     @property
     def pivot_work(self) -> dict[str, int]:
-        """Work of the rows in this run."""
+        """Work of exchanges in this run."""
         work = {} if self.state.pivot is None else self.state.pivot.rows.work
         return {
             kind: n - self.reported.get(kind, 0) for kind, n in work.items() if n > self.reported.get(kind, 0)
@@ -306,7 +307,7 @@ class _Run:
             if not rounded and not self.out_of_time:
                 return self.solve_with_rank_revealing_lu(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.is_good() and singular:
-            # The residual of least squares in the metric of D is orthogonal to the range of A.
+            # Try the residual of least squares in the metric of D, which is orthogonal to the range of A.
             measure.compute_slack(problem.csr_data, x, w)
             proof = self.make_infeasibility_claim(-w / problem.csr_data.d) or self.make_infeasibility_claim(
                 factor.compute_left_null_part(problem.b)
@@ -316,9 +317,9 @@ class _Run:
         return self.make_claim_for_best_iterate()
 
     def solve_with_rank_revealing_lu(self, why: str) -> Claim:
-        """Solve a linear system again by an LU factorisation that reveals the rank."""
+        """Solve a linear system again by a rank-revealing LU factorisation; `why` begins the message."""
         before = self.work | self.pivot_work
-        before.pop("rank", None)  # The rank is not a count; the new decomposition gives it.
+        before.pop("rank", None)  # The rank cannot be added to another; the new factorisation computes it.
         self.state = _factor_by_rank_revealing_lu(self.problem, why)
         self.notes = [self.state.note]
         assert isinstance(self.state.general, RankRevealingFactor)
@@ -356,7 +357,7 @@ class _Run:
                 return self.make_out_of_budget_claim()
 
     def must_give_up(self, code: int, is_shifted: bool) -> bool:
-        """Return whether the solver stops because it is not patient and pivoting makes no progress."""
+        """Return whether the solver stops because pivoting makes no progress and `patience` is false."""
         return not self.patient and (code == STUCK or (code == SMALL_PIVOT and is_shifted))
 
     def make_claim_of_final_code(self, pivot: PivotState, code: int) -> Claim:
@@ -419,7 +420,7 @@ class _Run:
         length = np.sqrt(self.problem.d)
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
         if np.any(np.sign(y) * pull > CERTIFICATE_TOLERANCE * (length @ np.abs(y)) * length):
-            return None  # A large impulse along y supplies b.y, so y proves nothing.
+            return None  # w.y = 0 is reached by a large impulse along y, so y proves nothing.
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")

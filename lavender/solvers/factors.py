@@ -3,11 +3,11 @@
     band     LDL^T by diagonals in compiled code (small matrices, and matrices of small bandwidth)
     dense    Cholesky of a full matrix
     sparse   Cholesky by supernodes of a permuted matrix, in compiled code (`lavender_ext/factor/linear.pxd`)
-    general  LU if A is not symmetric positive definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few
-             rows), or first by panels with row exchanges inside each panel if A is sparse with a symmetric pattern
+    general  LU with pivoting, if A is not symmetric positive definite: LAPACK's getrf, or SuperLU; compiled for few
+             rows. If A is sparse with a symmetric pattern, supernodal LU with exchanges inside panels is tried first
 
-A pivot of at most 1e-13 d_i counts as zero: this is some hundred roundings of A_ii, and less than the pivots of a mass
-ratio of 1e8.
+A pivot of at most 1e-13 d_i counts as zero: this is some hundred roundings of A_ii, and less than the pivots of
+problems with a mass ratio of 1e8.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from lavender_ext.factor.sparse import extract_free_part, has_symmetric_pattern
 PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
 # Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
 MAX_COMPILED_FACTOR_ROWS = 64
-MAX_COMPILED_BAND = 40  # Up to this half bandwidth, the compiled band factor is the fastest.
+MAX_COMPILED_BAND = 40  # Up to this half bandwidth, the compiled band factorisation is the fastest.
 MIN_DENSE_FRACTION = 0.1  # Above this fraction of nonzeros, dense Cholesky is faster than sparse Cholesky.
-MAX_PANELS_FRACTION = 0.25  # Panels are considered for a linear system up to this fraction of nonzeros.
-MAX_DENSE_ROWS = 6000  # Largest dense matrix: 288 MB.
-# Use vectors of four numbers if the processor has them; the bits are the same.
+MAX_PANELS_FRACTION = 0.25  # Supernodal LU is considered for a linear system up to this fraction of nonzeros.
+# Matrices with more rows are not stored as dense arrays; at this size one takes 288 MB.
+MAX_DENSE_ROWS = 6000
+# Whether to use vectors of four numbers if the processor has them. The results have the same bits.
 USE_WIDE_LANES = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")
 MAX_DENSE_RANK_ROWS = (
     # Up to this many rows, the rank of a singular asymmetric matrix is computed with a dense decomposition.
@@ -47,7 +48,10 @@ MAX_DENSE_RANK_ROWS = (
 
 
 def choose_factorisation(problem: Problem) -> tuple[str, int, IntArray | None]:
-    """Return factorisation, half bandwidth and elimination order (None: as given) of a symmetric A by its structure."""
+    """Choose the factorisation of a symmetric A by its structure.
+
+    Return its name, the half bandwidth, and the elimination order, which is None for the given order.
+    """
     choice: tuple[str, int, IntArray | None] | None = problem.derived.cache.get(__name__)
     if choice is None:
         choice = problem.derived.cache[__name__] = _compute_factorisation_choice(problem)
@@ -62,7 +66,7 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
         return "band", band, None
     nnz = len(problem._compressed[1])
     if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
-        # If only one factor is needed, the cheapest factorisation is chosen.
+        # A linear problem needs one factorisation: choose the cheapest.
         narrow = estimate_band_factor_cost(m, band)
         full = RATES["dense call"] + estimate_dense_factor_cost(m)
         if estimate_panel_factor_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
@@ -72,7 +76,7 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
         return "band", band, None
     if nnz >= MIN_DENSE_FRACTION * m * m and m <= MAX_DENSE_ROWS:
         return "dense", m - 1, None
-    # A row of a narrow band has at most 2 band + 1 nonzeros.
+    # In a narrow band, every row has at most 2 band + 1 nonzeros.
     if np.diff(problem._compressed[0]).max() <= 2 * MAX_COMPILED_BAND + 1:
         order = find_small_bandwidth_order(problem)
         band = compute_half_bandwidth_in_order(problem, order)
@@ -102,9 +106,9 @@ class Factor(Protocol):
     """Interface of a factorisation of A_FF + shift D_FF for changing free sets F."""
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor the rows with place >= 0, in order; return the number of pivots that do not exceed PIVOT_TOLERANCE d.
+        """Factor A + shift D of the rows with place >= 0, in their order.
 
-        There must be at least one such row.
+        There must be at least one such row. Return the number of pivots that do not exceed PIVOT_TOLERANCE d.
         """
         ...
 
@@ -222,12 +226,12 @@ class LUFactor:
 
 
 class PanelsLU:
-    """LU factor of D^-1/2 A D^-1/2 by panels. Refinement replaces the missing pivoting across panels.
+    """Supernodal LU factor of D^-1/2 A D^-1/2. Refinement corrects errors that pivoting across panels would avoid.
 
     Attributes
     ----------
     usable : bool
-        Whether no pivot is lost to rounding.
+        Whether all pivots are above rounding errors.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -247,12 +251,12 @@ class PanelsLU:
 
 
 class RankRevealingFactor:
-    """LU factor of D^-1/2 A D^-1/2, with a singular value decomposition if that is singular.
+    """LU factor of D^-1/2 A D^-1/2, or its singular value decomposition if the matrix is singular.
 
     Attributes
     ----------
     rank : int
-        m, or the rank from the decomposition; -1 if A is singular and too large for it.
+        m if A is regular, else the rank; -1 if A is singular and too large for a singular value decomposition.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -285,7 +289,7 @@ class RankRevealingFactor:
             self.rank = -1
 
     def _decompose_singular_matrix(self, a: FloatArray) -> None:
-        """Decompose a singular A: rank, and least squares of minimum norm in the metric of D."""
+        """Compute the singular value decomposition of a singular A, for its rank and least-squares solutions."""
         self.dense = a
         u, s, vt = np.linalg.svd(a)
         self.rank = (

@@ -2,9 +2,9 @@
 
     lambda <- Pi(lambda - omega w / d),   omega = min(1, 1.6 / max_i sum_j |A_ij| / sqrt(d_i d_j)) by default
 
-The row sum, the same in every unit, bounds the largest eigenvalue L of D^-1 A, and symmetric positive semidefinite A
-needs omega < 2 / L. Without damping (omega = 1), k coincident contacts multiply the error by k - 1 and never
-converge for k >= 2.
+The maximum of the row sums, which does not depend on units, bounds the largest eigenvalue L of D^-1 A. For a symmetric
+positive semidefinite A, convergence requires omega < 2 / L. Without damping (omega = 1), k coincident contacts
+multiply the error by k - 1 in each iteration and do not converge for k >= 2.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Jacobi(SweepSolver):
     Parameters
     ----------
     omega : float or None
-        Damping; None: the safe value above.
+        Damping factor [-]; None selects the default in the formula above, with which the iteration converges.
     """
 
     omega: float | None = None

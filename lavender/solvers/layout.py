@@ -1,7 +1,7 @@
 """Copy a problem with its rows in sweep order, so that a sweep reads memory from front to back.
 
-Blocks are in the order of the sweep, and bodies are numbered by `ordering.number_bodies_by_adjacency`. A block reads
-the same values, so the impulses have the same bits; only sums over all rows have another order.
+Blocks are in the order of the sweep, and bodies are numbered by `ordering.number_bodies_by_adjacency`. The update of a
+block reads the same values, so impulses do not change by a bit; only sums over all rows are added in another order.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from lavender.problem.ordering import Order, number_bodies_by_adjacency
 from lavender_ext.core.blocks import make_blocks_over_arrays
 from lavender_ext.core.problem import Data
 
-# The copy is faster from this many contacts on, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
-# times as fast at 10,000 contacts, twice as fast at 100,000).
+# From this many contacts on, sweeps over the copy are faster, because the arrays exceed the second-level cache
+# (measured: 1.0 to 1.1 times as fast at 10,000 contacts, twice as fast at 100,000).
 MIN_CONTACTS_FOR_COPY = 8_000
 
 
@@ -30,11 +30,11 @@ class Layout:
     ----------
     data : lavender_ext.core.problem.Data
     rows : (m,) intp
-        Row of the problem at each position.
+        Row of the problem at each position of the sweep order.
     position : (m,) intp
-        Position of each row.
+        Position of each row of the problem in the sweep order.
     rank : (n,) int32
-        Position of each body.
+        Number of each body in the copy.
     """
 
     data: Any
@@ -52,7 +52,7 @@ class Layout:
 
 
 def is_reordered_copy_faster(problem: Problem, order: Order) -> bool:
-    """Return whether the copy is faster: a large problem with a fixed order other than its own, joints first."""
+    """Return whether sweeps over a copy are faster: for a large problem in a fixed order that is not its own order."""
     rows = problem.rows
     if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < MIN_CONTACTS_FOR_COPY:
         return False
@@ -99,8 +99,9 @@ def copy_problem_in_block_order(problem: Problem, blocks: IntArray, before: Layo
 def _copy_to_separate_pages(*arrays: np.ndarray) -> list[np.ndarray]:
     """Copy arrays to different offsets from a page boundary.
 
-    A sweep reads the arrays in parallel. Large arrays begin on a page boundary; equal offsets would share a few sets of
-    the first-level cache (measured: separate offsets are 3 to 12 % faster at 100,000 contacts).
+    A sweep reads all arrays at the same time. Large arrays begin on a page boundary, so entries with equal indices
+    would compete for a few sets of the first-level cache (measured: different offsets are 3 to 12 % faster at 100,000
+    contacts).
     """
     out = []
     for i, array in enumerate(arrays):

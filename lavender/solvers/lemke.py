@@ -1,13 +1,13 @@
 """Lemke's method: complementary pivoting along one path, for any small dense A.
 
-    w = q + M s + c z,   w, s >= 0,  w_i s_i = 0,   z from its first value down to 0
+    w = q + M s + c z,   w, s >= 0,  w_i s_i = 0,   z from the smallest value with w >= 0 at s = 0 down to 0
 
-The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (which includes positive semidefinite
-M) a ray proves that there is no solution; its direction is the certificate, which is checked before INFEASIBLE is
-returned. The method runs in `lavender_ext/pivot/lemke.pyx`, which also transforms bounded rows into nonnegative ones.
-After each path, the exchanges of `direct` begin at its end and solve for the free rows on A itself. If they do not end
-at a solution, another path with another covering vector c follows. Ties are broken lexicographically, which excludes
-cycles in exact arithmetic.
+M and q are A and -b of bounded rows that are transformed to nonnegative unknowns s; c > 0 is the covering vector. The
+path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (which includes positive semidefinite M) a
+ray proves that there is no solution; its direction is the certificate, which is checked before INFEASIBLE is returned.
+The method runs in `lavender_ext/pivot/lemke.pyx`. After each path, the exchanges of `direct` start at the end of the
+path and solve for the free rows with A. If they do not end at a solution, another path with another covering vector c
+follows. Ties are broken lexicographically, which excludes cycles in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lavender_ext.pivot.lemke import DONE, LATE, RAY
 RAY_MESSAGE = (
     "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
 )
-MAX_LEMKE_ROWS = 2000  # Largest number of rows; the dictionary then has 32 MB.
+MAX_LEMKE_ROWS = 2000  # Problems with more rows are refused; the dictionary of this many rows takes 32 MB.
 
 
 def _count_dictionary_rows(problem: Problem) -> tuple[int, int]:
@@ -75,7 +75,7 @@ class Lemke(Solver):
             return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})
         deadline = Deadline(time_limit)
         n, free = _count_dictionary_rows(state.problem)
-        # The dictionary is built, and every free row eliminated.
+        # Building the dictionary and eliminating the free rows cannot be interrupted.
         if deadline.has_passed(
             1e-9 * (RATES["dictionary entry"] + RATES["dictionary elimination"] * free) * n**2
         ):
@@ -136,7 +136,7 @@ class Lemke(Solver):
 def _find_certificate_by_linear_program(
     problem: Problem, tol: float, deadline: Deadline
 ) -> FloatArray | None:
-    """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
+    """Search a certificate (m,) by a linear program, for a problem on which Lemke's method failed; None without one."""
     if problem.m > CERTIFICATE_ROWS or deadline.has_passed(
         1e-9 * (RATES["linear program"] + estimate_import_cost("scipy.optimize"))
     ):

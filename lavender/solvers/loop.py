@@ -42,12 +42,12 @@ from lavender_ext.judge.stopping_test import StoppingTest
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
 # A chunk may use this fraction of the remaining time, estimated from the speed of the previous chunk.
 CHUNK_TIME_FRACTION = 0.7
-# Largest number of iterations of the first chunk: at 40 us each it takes 10 ms; compiled sweeps of few rows are faster.
+# Largest number of iterations of the first chunk: at 40 us per iteration, as of solvers in Python, it takes 10 ms.
 FIRST_CHUNK_ITERATIONS = 256
 Callback = Callable[[int, FloatArray, Residual], Any]
 # The fields are iterations, time [s], relative residual, energy error and velocity error.
 Record = tuple[int, float, float, float, float]
-# An impulse outside its bounds by up to this relative distance counts as inside: projections round as much.
+# An impulse outside its bounds by up to this relative distance counts as inside; projections cause smaller errors.
 BOUND_ROUNDING = 1e-12
 EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 
@@ -68,22 +68,23 @@ class Loop:
     deadline : Deadline
     callback : callable, optional
     records : list, optional
-        Records of the history, which are appended.
+        List to which the records of the history are appended.
     record_solvers : list of str
-        Solver of each record, if `auto` makes them.
+        Solver of each record, if the records are made by `auto`.
     time : float, s
         Time of the solver, without the judge.
     recording_time : float, s
         Time of the judge for the records.
     done : int
-        Iterations.
+        Number of iterations so far.
     work : dict
+        Work so far, as in `Claim`.
     broken : bool
         Whether the solver raised an arithmetic error.
     next_record : int
-        Iterations at the next record.
+        Number of iterations at which the next record is made.
     pace : float, s
-        Estimated upper bound of the time of an iteration; inf: the first chunk measures it.
+        Estimated upper bound of the time of an iteration; inf if it is unknown, and the first chunk measures it.
     judged : lavender_ext.judge.measure.Judged, optional
         The judge's last pass over a result.
     """
@@ -120,7 +121,7 @@ class Loop:
                 return claim
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        # The impulse array may contain an intermediate result.
+        # After an error, the array may contain an intermediate result: choose the best of it and the start.
         self.impulse[:] = combine_best_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
 
@@ -142,7 +143,8 @@ class Loop:
 
     def run_chunks(self, max_iter: int) -> Claim:
         """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
-        # The first estimate is a nanosecond per unit of work, limited for solvers in Python. Later ones are measured.
+        # Assume 1 ns per unit of work for the first chunk, with a limit for solvers in Python; later chunks are
+        # measured.
         chunk = min(FIRST_CHUNK_ITERATIONS, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
         claim = EMPTY_CLAIM
@@ -174,7 +176,7 @@ class Loop:
                 if stopped:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
-                # An iteration is not started if less than half of it fits.
+                # Do not start an iteration if less than half of its time remains.
                 if self.deadline.has_passed(0.5 * elapsed / claim.iterations):
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
@@ -193,9 +195,9 @@ class Loop:
         return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
 
     def replace_by_best_impulse(self, start: FloatArray, or_zero: bool = True) -> None:
-        """Replace the result, unless it meets tol, by the best of result, start and zero impulse in each island.
+        """Replace a result that does not meet tol by the best of result, start and zero impulse in each island.
 
-        The zero impulse is only considered with `or_zero`.
+        The zero impulse is considered only if `or_zero` is true.
         """
         problem = self.problem
         result = reuse_or_judge_impulse(problem, self.impulse, self.judged)
@@ -211,7 +213,7 @@ class Loop:
         state: State = self.state
         watch = getattr(state, "watch", None)
         if isinstance(watch, StoppingTest):
-            # The state may have its rows in another order than the problem.
+            # Use the state's own method if it has one, because its rows may have another order than the problem's.
             getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)
             return
         best = getattr(state, "best", None)
@@ -234,7 +236,7 @@ class Loop:
 
     def _add_to_total_work(self, claim: Claim) -> Claim:
         if claim.iterations == self.done and claim.work == self.work:
-            return claim  # There was only one chunk.
+            return claim  # The claim of a single chunk needs no addition.
         return replace(claim, iterations=self.done, work=self.work)
 
     def get_history(self) -> History | None:
@@ -244,7 +246,7 @@ class Loop:
         solvers = self.record_solvers
         if (
             solvers and self.records[-1][0] == self.done
-        ):  # The result of `auto` is the best impulse of all stages.
+        ):  # `auto` returns the best impulse of all stages, which may differ from the last record.
             self.records.pop()
         if not self.records or self.records[-1][0] != self.done:
             self._record_residual()
@@ -260,14 +262,15 @@ class Loop:
 def select_best_impulse(
     problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True
 ) -> Any:
-    """Return the judge's pass over the best of `result`, the start (m,) and the zero impulse in each island.
+    """Return the judged best of `result`, the start (m,) and the zero impulse in each island.
 
-    A result within the round-off floor of tol is returned unchanged. An impulse outside its bounds is projected first.
+    A result that meets tol, or is at its round-off floor, is returned unchanged. An impulse outside its bounds is
+    projected first.
     """
     if result.above_floor <= tol:
         return result
     first, own = problem._start if start is None else start, result.impulse
-    with np.errstate(all="ignore"):  # Impulses that overflow are judged below.
+    with np.errstate(all="ignore"):  # Projections of large impulses may overflow without a warning.
         inside = project_impulse(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside

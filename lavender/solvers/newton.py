@@ -2,28 +2,32 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first. Up to 64 sweeps (counted in `work`), or one banded factorisation of joints
-   without other rows, then try to solve it to tol (`warm_start.py`).
+0. A warm start over bodies is judged first. If it does not meet tol, up to 64 sweeps (counted in `work`) continue from
+   it, or one banded factorisation if all rows belong to joints (`warm_start.py`).
 1. Bounded rows: active-set exchanges (Newton's method on the natural map) from the warm start and from the solution of
    H z = g.
 2. Bounded rows and cones: a cold-started Mehrotra interior point. When the active rows are identified, the solution on
    them is computed to the round-off limit of float64.
-3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then proximal
+3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then
+proximal
    damped Newton.
-4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the law,
+4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the
+law,
    in which the convex problem changes with every step. If these stall, a path of smoothed problems (Chen, Mangasarian
    1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds at which
    contacts change from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
-forming A, unless a full A is estimated to cost less than a tenth of that (few rows of a soft body). If that fails, 1 to
-4 follow over the rows of A, unless form="velocity". If the velocities belong to bodies and every block couples at most
-two of them (free bodies of an engine), 1 to 4 use these bodies; under Coulomb's law, and if many contacts are rigid,
-they do so from the start (`SmallCall.cost_limit`).
+forming A. Methods 1 to 4 over the rows of A are used instead if they are estimated to cost less than a tenth (few rows
+of a soft body), and afterwards if the method over velocities fails, unless form="velocity". If the velocities belong
+to free rigid bodies and every block couples at most two of these, methods 1 to 4 run over the bodies and not over A;
+under Coulomb's law, and if many contacts are rigid, they then replace the method over velocities
+(`SmallCall.cost_limit`).
 
-1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their states.
-In between, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds their linear systems. Form
-"velocity" factors I + K^T V K over the bodies and does not square J; "impulse" factors over the rows.
+Methods 1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their
+states. Between factorisations, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds the linear
+systems. The form "velocity" factors I + K^T V K over the bodies and does not square J; "impulse" factors over the
+rows.
 """
 
 from __future__ import annotations
@@ -88,11 +92,11 @@ class NewtonState:
     ----------
     problem : Problem
     system : System or None
-        None if no row can move, or in generalised coordinates.
+        None if no body in a row can move, or for the driver in generalised coordinates.
     general : lavender_ext.driver.driver.Driver, optional
         Driver in generalised coordinates.
     begun : bool
-        Whether `advance` was called.
+        Whether `advance` has been called, so that the next call continues.
     """
 
     problem: Problem
@@ -102,7 +106,7 @@ class NewtonState:
 
     @property
     def count(self) -> Count:
-        """Counts of one step over rows or bodies, from the analysis of the matrix."""
+        """Operation counts of one step over rows or bodies, from the analysis of the matrix."""
         problem, system = self.problem, self.system
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
@@ -139,7 +143,7 @@ class Newton(Solver):
     ----------
     form : {"auto", "velocity", "impulse"}
         Unknowns of the factorisation: velocities (needs J and M) or the rows of A. "auto": velocities if the problem
-        has them, unless the rows of A are estimated to cost less than a tenth.
+        has J and M or bodies, unless the rows of A are estimated to cost less than a tenth.
     """
 
     form: str = "auto"
@@ -186,7 +190,7 @@ class Newton(Solver):
         Raises
         ------
         InputError
-            form="velocity" for a problem given as a matrix.
+            `form` is "velocity", and the problem is a matrix.
         CapabilityError
             The matrix over the velocities is too large for form="velocity" or for round cones.
         """
@@ -209,7 +213,7 @@ class Newton(Solver):
                 problem, (max_cost - fixed) / (estimate_velocity_newton_cost(problem, 1.0) - fixed)
             )
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
-            bodies = find_bodies(problem)  # In this case, interior points over bodies are faster.
+            bodies = find_bodies(problem)  # Interior points over bodies are faster here than the driver.
         if bodies is None and kernel is not None:
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
@@ -259,7 +263,7 @@ class Newton(Solver):
     ) -> Claim:
         """Run about n steps, at most `remaining`, continuing the last call. The first call starts at `impulse` (m,).
 
-        Over generalised velocities, the row form does not follow.
+        In generalised coordinates, only the method over velocities runs, without a continuation over rows.
         """
         is_continued, state.begun = state.begun, True
         if state.general is None:
@@ -285,8 +289,8 @@ class Newton(Solver):
     ) -> Claim:
         """Solve over generalised velocities; if that fails, continue over bodies or over the rows of A.
 
-        The row form runs only if iterations remain and A has at most `MAX_FORMED_ROWS` rows. `impulse` (m,) [N s] holds
-        the better of the two results on return.
+        The row form runs only if iterations remain and A has at most `MAX_FORMED_ROWS` rows. `impulse` (m,) [N s]
+        holds the better of the two results on return.
         """
         problem, deadline = state.problem, Deadline(time_limit)
         claim = general.run_newton_steps(problem, state.general, impulse, max_iter, tol, time_limit)
@@ -378,20 +382,20 @@ def _run_stages(
     is_continued: bool = False,
     max_total: int | None = None,
 ) -> tuple[Status, FloatArray | None]:
-    """Run `max_iter` factorisations on `impulse` (m,) in place, and check the clock and Ctrl-C in between.
+    """Run up to `max_iter` factorisations on `impulse` (m,) in place; check clock and Ctrl-C between factorisations.
 
     Parameters
     ----------
     is_continued : bool
-        Continue where an earlier call stopped.
+        Whether to continue where an earlier call stopped.
     max_total : int, optional
-        If given, a later call may continue where this one stops, with at most this many factorisations in total.
+        If given, later calls may continue where this one stops, with at most this many factorisations in all calls.
 
     Returns
     -------
     Status
     (m,) array or None
-        A certificate, or a direction that bounds the impulses.
+        A certificate, or a direction that gives a lower bound of every solution's impulse.
     """
     deadline = Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
@@ -408,7 +412,7 @@ def _run_stages(
             steps = INTERRUPT_CHECK_INTERVAL / max(system.expected_factor_seconds, 1e-6)
             time_left, watch = deadline.get_remaining_seconds(), Stopwatch()
             if time_left is not None:
-                # The time of the first factorisation is only estimated, so the first call runs a single one.
+                # Run a single factorisation first, because its time is only estimated.
                 steps = (
                     min(steps, STAGE_TIME_FRACTION * time_left / max(system.expected_factor_seconds, 1e-9))
                     if solve.done
@@ -419,7 +423,7 @@ def _run_stages(
                     solve.request_stop()
             try:
                 end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
-            except TooLate:  # The best iterate is returned if the next factorisation would end too late.
+            except TooLate:  # The next factorisation would end too late: return the best iterate.
                 late, end = True, OUTCOMES["spent"]
                 solve.request_stop()
             if solve.done > before:
@@ -432,7 +436,7 @@ def _run_stages(
             elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
                 break
     except KeyboardInterrupt:
-        interrupted = True  # The best iterate is returned even after an interruption.
+        interrupted = True  # Return the best iterate also after Ctrl-C.
         solve.request_stop()
         solve.step(1, impulse)
     if interrupted:

@@ -3,14 +3,16 @@
     x_k = y_{k-1} + beta_{k-1} p_{k-2},    y_k = S(x_k),    g_k = x_k - y_k
     beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},    p_k = beta_k p_{k-1} - g_k,    D = diag d
 
-A sweep S replaces the gradient step, and beta is the formula of Fletcher and Reeves, without a line search; the method
-restarts if beta > 1. An iteration is one sweep and three passes over vectors. On piles it needs a third of the sweeps
-of `pgs` to reach 1e-9. With order="symmetric" an iteration is a sweep and the same sweep backwards, similar to a
-preconditioned conjugate gradient step: slower where `pgs` is fast, much faster on tall stacks and large mass ratios.
+A sweep S replaces the gradient step, and beta is the formula of Fletcher and Reeves, without a line search. If beta >
+1, the method restarts with p = 0. An iteration is one sweep and three passes over vectors. On piles it needs a third
+of the sweeps of `pgs` to reach 1e-9. With order="symmetric", an iteration is a sweep followed by a sweep in reverse
+order, similar to a preconditioned conjugate gradient step: slower if `pgs` converges fast, much faster on tall stacks
+and at large mass ratios.
 
-If contacts slide, g is not a gradient: sweeps then move slowly along one direction with nearly constant g until a
-contact sticks, lifts or slips, and beta > 1 carries no information. With restart="against", p is dropped only if it
-also points against the sweep, p.D g > 0; otherwise it is kept with beta = 1, which speeds up this slow motion.
+If contacts slide, g is not a gradient. Sweeps then move slowly along one direction with nearly constant g until a
+contact sticks, lifts or slips, and beta > 1 does not show that p is useless. With restart="against", the method
+restarts only if p also points against the sweep, p.D g > 0; otherwise it continues with beta = 1, which accelerates
+the slow motion.
 """
 
 from __future__ import annotations

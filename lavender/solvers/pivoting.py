@@ -1,4 +1,4 @@
-"""State of pivoting methods: the rows of a problem for `lavender_ext/pivot/direct.pyx`, and their factorisation."""
+"""State of pivoting methods: which rows of a problem are free (`lavender_ext/pivot/direct.pyx`), and their factor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from lavender_ext.pivot.direct import Pivoting
 
 # Smallest and largest number of symmetric Gauss-Seidel sweeps that guess the free rows.
 MIN_GUESS_SWEEPS, MAX_GUESS_SWEEPS = 2, 24
-# The sweeps that guess the free rows may cost this fraction of a factor. A multiply-add of a sweep takes a nanosecond.
+# The sweeps that guess the free rows may cost this fraction of a factorisation, at 1 ns per multiply-add of a sweep.
 GUESS_COST_FRACTION = 0.5
 
 
@@ -47,7 +47,7 @@ class TimedFactor:
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor like `Factor.factor`, also without any free row; return -1 if the factorisation was not started."""
+        """Factor as `Factor.factor` does; n_free may be 0. Return -1 if the factorisation would end too late."""
         if n_free == 0:
             return 0
         if self.deadline.has_passed(self.seconds):
@@ -71,7 +71,7 @@ class PivotState:
         self.problem = problem
         self.symmetric = problem.is_symmetric
         if problem.m > MAX_COMPILED_FACTOR_ROWS:
-            import_numerical_modules()  # Factors and certificates need it.
+            import_numerical_modules()  # Factorisations and certificates use these modules.
         factor: Factor | None = None
         if self.symmetric:
             same = like is not None and like.symmetric and _have_same_pattern(like.problem, problem)
@@ -90,8 +90,10 @@ class PivotState:
             None if factor is None else TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
         )
         get_zero_impulse_reference(problem)
-        # Time [s] of one round with a compiled factor: an estimate with all rows free, then the time of the last round.
-        sweep_cost = RATES["symmetric sweep entry"] * problem.csr_data.work  # With its slack [ns].
+        # [s] Time of one round with a compiled factor: first an estimate for free rows, then the last round's time.
+        sweep_cost = (
+            RATES["symmetric sweep entry"] * problem.csr_data.work
+        )  # [ns] Includes the computation of w.
         self.seconds = 1e-9 * (estimate_band_factor_cost(problem.m, band) + sweep_cost)
         self.rows = Pivoting(
             problem.csr_data, band, order, PIVOT_TOLERANCE, problem.metric, self.outside, problem.law == "linear",
@@ -109,7 +111,7 @@ class PivotState:
 
     @property
     def sweeps(self) -> int:
-        """Number of symmetric sweeps that guess the free rows: few for a compiled factor, else by its cost."""
+        """Number of symmetric sweeps that guess the free rows: the minimum for a compiled factor, else by its cost."""
         if self.outside is None:
             return MIN_GUESS_SWEEPS
         m, data = self.problem.m, self.problem.csr_data
@@ -131,13 +133,13 @@ class PivotState:
         Returns
         -------
         (int, bool)
-            Code of `Pivoting.advance`, and whether no round fits.
+            Code of `Pivoting.advance`, and whether the time does not suffice for a further round.
         """
         left, before, watch = deadline.get_remaining_seconds(), self.rows.n_rounds, Stopwatch()
-        if left is None or self.outside is not None:  # `TimedFactor` checks the clock itself.
+        if left is None or self.outside is not None:  # No limit, or `TimedFactor` checks the clock.
             return self.rows.advance(max_rounds), max_rounds == 0
         n = int(left / self.seconds)
-        # Do half of the rounds that fit; the caller continues.
+        # Do half of the rounds that fit into the time; the caller calls again.
         n = min(max_rounds, max(1, n // 2) if n else 0)
         code = self.rows.advance(n)
         if self.rows.n_rounds > before:
@@ -152,7 +154,7 @@ class PivotState:
     def rank(self) -> int:
         """Rank of a positive semidefinite A with all rows free, pivots of 1e-13 d counting as zero.
 
-        A zero pivot of a semidefinite matrix has a zero column, so leaving it out is exact.
+        In the elimination of a semidefinite matrix, a zero pivot has a zero column, so leaving it out changes nothing.
         """
         return int(self.rows.rank)
 

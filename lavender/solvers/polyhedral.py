@@ -9,8 +9,8 @@ For a contact with the normal impulse n and bounds |t_i| <= c_i n, lambda = E z:
     cone      (n, t) = sum over signs z_k (1, +-c_1, +-c_2),  z >= 0: its edges, two for each axis with c_i > 0,
               E^T w complementary to z                                                         (2)
 
-(1) is the matrix E^T A E with the couplings of s. It is copositive if A is positive semidefinite: Lemke's path then
-ends at a solution of every problem without joints. (2) is symmetric if A is.
+The matrix of (1) is E^T A E, extended by the couplings of s. It is copositive if A is positive semidefinite: Lemke's
+path then ends at a solution of every problem without joints. The matrix of (2) is E^T A E, symmetric if A is.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lavender.problem.cones import project_impulse
 from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
 
-ROWS_RATIO = 3.0  # Assumed number of rows of (1) or (2) per row of the problem.
+ROWS_RATIO = 3.0  # Cost estimates assume this number of rows of (1) or (2) per row of the problem.
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def convert_to_bounded_rows(problem: Problem) -> BoundedRowForm:
     try:
         rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
     except InputError as error:
-        # The problem itself is valid. Only sums of its entries are out of range.
+        # The problem is valid; only sums of its entries in the conversion are out of range.
         raise OverflowError("A or b, times coefficients of friction, is out of range") from error
     return BoundedRowForm(problem, rows, e)
 

@@ -1,9 +1,9 @@
 """Record the history of a solve by `auto`: the residual after each recorded iteration of each stage.
 
-A stage of sweeps or of another resumable solver is recorded at 1, 2, ... 16 iterations and then at an eighth more each
-time, counted from the begin of the stage. Newton's method and `direct` are recorded at the end of their stage. The
-compiled call for small problems is made again with smaller limits of its counted cost: a call with a limit returns its
-iterate at that cost. Recording does not change the result.
+A stage of sweeps or of another resumable solver is recorded after 1, 2, ..., 16 iterations of the stage, and then each
+time after an eighth more. Newton's method and `direct` are recorded at the end of their stage. The compiled call for
+small problems is repeated with smaller limits of its estimated cost, since it returns the iterate at the limit.
+Recording does not change the result.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
-SAMPLED_COST_RATIO = 1.25  # Ratio of consecutive limits of the counted cost.
+SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Recorder:
     solve : Loop
         The loop of the solve, which holds the records, their solvers and the time of recording.
     watch : Stopwatch
-        Time since the begin of the solve.
+        Time since the beginning of the solve.
     """
 
     solve: Loop

@@ -28,7 +28,8 @@ from lavender.solvers.decisions import DECISIONS
 __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
-# The overhead of Python dominates a solve up to this many rows, so the compiled call `SolverSpec.small` is tried first.
+# Up to this many rows, the compiled call `SolverSpec.small` is tried first, because Python's overhead dominates a
+# solve.
 SMALL_ROWS = int(DECISIONS.small_rows)
 # Modules whose SPECS are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
@@ -56,11 +57,11 @@ class SolverOptions(TypedDict, total=False):
 
 
 class SmallCall(Protocol):
-    """Compiled call that solves a small problem with the bits of `run`, or leaves it to `run`."""
+    """Compiled call that solves a small problem with the same bits as `run`, or returns None to leave it to `run`."""
 
     @property
     def limits(self) -> Any:
-        """Limits of its cost in generalised coordinates; None if it does not accept this form."""
+        """Limits of the call's cost in generalised coordinates; None if the call does not accept this form."""
 
     @property
     def rules(self) -> Any:
@@ -69,9 +70,9 @@ class SmallCall(Protocol):
     def solve_and_judge(
         self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = ...
     ) -> tuple[Any, Any]:
-        """Return (judged result or None, work counts), from `impulse` (m,) [N s] or from the zero impulse.
+        """Solve from `impulse` (m,) [N s] or from the zero impulse; return (judged result, work counts).
 
-        None is returned if the call did not converge; `max_cost` [ns] limits its estimated cost.
+        The result is None if the call did not converge. `max_cost` [ns] limits the estimated cost of the call.
         """
 
     def make_claim(
@@ -87,14 +88,15 @@ class State(Protocol):
     def best(self) -> tuple[float, FloatArray | None]:
         """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) at first.
 
-        A solver with a residual that may rise provides it: it becomes the result if the last iterate is worse.
+        Solvers with a residual that may rise provide this attribute. Its impulse becomes the result if the last
+        iterate is worse.
         """
 
     @property
     def sweeps_per_decade(self) -> float:
-        """Iterations in which the relative residual fell tenfold, from the last checks; NaN if it did not fall.
+        """Number of iterations in which the relative residual fell tenfold, from the last checks; NaN if it did not.
 
-        A solver with iterations of equal cost provides it.
+        Solvers with iterations of equal cost provide this attribute.
         """
 
 
@@ -117,24 +119,25 @@ class Solver:
     ) -> Claim:
         """Run `max_iter` more iterations on `impulse` (m,) in place; fewer only if the solver's own test is met.
 
-        If the solver is `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None.
+        If the solver is `resumable`, runs of n1 and then n2 iterations give the same bits as a run of n1 + n2, and
+        `time_limit` is None.
         """
         raise NotImplementedError
 
-    needs_scipy = False  # Whether `prepare` uses parts of SciPy that may not have been imported yet.
+    needs_scipy = False  # Whether `prepare` uses modules of SciPy that are imported at their first use.
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
         """Estimate the costs [ns] from the size of the problem, and from the state that `prepare` returned if given.
 
-        A time limit decides by them whether `prepare` starts, and `auto` which solver does.
+        Under a time limit, `prepare` starts only if its cost fits. `auto` compares the costs of solvers.
         """
         return Cost()
 
     def start_workers(self, state: Any, time_limit: float) -> None:
-        """Start worker processes for a solve with a limit [s]. The time to start them does not count."""
+        """Start worker processes for a solve with a limit [s], before its clock starts."""
 
     def set_deadline(self, state: Any, deadline: Deadline) -> None:
-        """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
+        """Set the deadline of the next `run` of a resumable solver: no long step starts that would end later."""
 
     def advance(
         self,
@@ -149,7 +152,7 @@ class Solver:
         return self.run(state, impulse, n, tol, time_limit)
 
     def fallback(self) -> Solver | None:
-        """Return the solver that continues if this one stalls on friction as bounded rows (`polyhedral.py`)."""
+        """Return the solver to use after this one stalls on friction written as bounded rows (`polyhedral.py`)."""
         return None
 
 
@@ -174,33 +177,33 @@ class SolverSpec:
         Forms of A that the solver reads as given, of "rows", "matrix", "generalized"; with "matrix", A is formed from
         any other form.
     exact : bool
-        It ends after finitely many steps or at rounding accuracy, independent of `tol`.
+        Whether the solver ends after finitely many steps or at rounding accuracy, independent of `tol`.
     resumable : bool
-        It can continue after `max_iter` iterations with the same bits as one longer run.
+        Whether the solver can continue after `max_iter` iterations with the same bits as one longer run.
     impulse : bool
-        It uses a warm start.
+        Whether the solver uses a warm start.
     order : bool
-        It accepts the options `order` and `ground`.
+        Whether the solver accepts the options `order` and `ground`.
     seed : bool
-        It accepts the option `seed`.
+        Whether the solver accepts the option `seed`.
     callback : bool
-        It accepts a `callback`; requires `resumable`.
+        Whether the solver accepts a `callback`; requires `resumable`.
     history : bool
-        It records `history`; requires `resumable` or `delegates`.
+        Whether the solver records `history`; requires `resumable` or `delegates`.
     delegates : bool
-        It calls other solvers (only "auto" does).
+        Whether the solver calls other solvers (only "auto" does).
     round_cones : bool
-        It accepts contacts of more than two tangents in one cone.
+        Whether the solver accepts contacts of more than two tangents in one cone.
     box_friction_laws : set of str
-        Laws, of "coulomb" and "cone", under which it accepts boxes: contacts that bound each tangent separately. A law
-        that is not in `laws` is accepted only without disks (own solvers solve boxes as bounded rows:
-        solvers/polyhedral.py).
+        Laws, of "coulomb" and "cone", under which the solver accepts boxes: contacts that bound each tangent
+        separately. If such a law is not in `laws`, only problems without disks are accepted (built-in solvers solve
+        boxes as bounded rows: solvers/polyhedral.py).
     supports_rolling : bool
-        It accepts contacts with rolling friction, or with torsional friction and several tangents.
+        Whether the solver accepts contacts with rolling friction, or with torsional friction and several tangents.
     singular_programs : bool
-        It accepts quadratic programs with a singular P (`Problem.from_qp`).
+        Whether the solver accepts quadratic programs with a singular P (`Problem.from_qp`).
     external : bool
-        The code of another project solves; its claims are not ours.
+        Whether the code of another project solves the problem, so that lavender does not guarantee its claims.
     max_iter : int
         Default iteration budget.
     options : mapping of str to str
@@ -208,11 +211,11 @@ class SolverSpec:
     requires : tuple of str
         Modules that must be importable.
     install : str
-        Arguments of `pip install` if they are not.
+        Arguments of `pip install` that install these modules.
     bounded_hint : str
-        For a solver of free rows: what the error message recommends for bounded rows.
+        For a solver of free rows: recommendation of the error message about bounded rows.
     bounded_variant : str
-        Name of the same method with bounds; `standing_in` uses it.
+        For a solver of free rows: name of the solver with the same method for bounded rows; see `standing_in`.
     refusal : callable, optional
         Returns a reason not to accept a problem, or None; called after all other checks.
     small : SmallCall, optional
@@ -221,9 +224,9 @@ class SolverSpec:
     Attributes
     ----------
     from_entry_point : bool
-        Found by its entry point, so that another process finds it, too.
+        Whether the solver was found by its entry point, so that other processes find it, too.
     builtin : bool
-        Part of this package. Other solvers get copies of the data, and their results are checked
+        Whether the solver is part of this package. Other solvers get copies of the data, and their results are checked
         (`external/foreign.py`).
 
     Raises
@@ -293,7 +296,7 @@ class SolverSpec:
             )
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
-            if kind.type == "bool" and not isinstance(value, bool):  # Annotations are strings here.
+            if kind.type == "bool" and not isinstance(value, bool):  # `type` is the annotation as a string.
                 check_bool(f"{name} of solver {self.name!r}", value)
         object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
@@ -330,8 +333,8 @@ class SolverSpec:
         ----------
         problem : Problem
         kind_alone : bool
-            Compare only the kind of the problem with the spec: nothing is computed from its data, and `refusal` is not
-            called.
+            Whether to compare only the kind of the problem with the spec, without computing anything from its data and
+            without calling `refusal`.
         """
         if not self.singular_programs and getattr(problem, "has_singular_program", False):
             return (
@@ -343,7 +346,7 @@ class SolverSpec:
         check_problem(problem)
         law, operator = problem.law, problem.operator
         if operator == "rows" and problem.cones.has_ellipse:
-            operator = "matrix"  # Solvers get `problem.disk`, which is a matrix problem.
+            operator = "matrix"  # Solvers get `problem.disk`, which has the form of a matrix here.
         if (
             law in self.laws
             and law not in ("linear", "lcp", *self.box_friction_laws)
@@ -386,7 +389,7 @@ class SolverSpec:
             return f"cannot say whether it takes the problem: {format_error(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
-        """Return the variant of this method with bounds if this one refuses the problem only for its bounds."""
+        """Return the `bounded_variant` if this solver refuses the problem only because of its bounds, else None."""
         check_problem(problem)
         other = specs().get(self.bounded_variant)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
@@ -412,7 +415,7 @@ class SolverSpec:
 
 
 def _list_program_solvers() -> str:
-    """Return the names of installed solvers that take a singular P: "clarabel, osqp or piqp"."""
+    """Return the names of installed solvers that accept a singular P, as in "clarabel, osqp or piqp"."""
     names = sorted(
         name for name, s in specs().items() if s.singular_programs and not s.delegates and not s.missing()
     )
@@ -447,7 +450,7 @@ def register_specs_of_module(table: str) -> None:
     for spec in import_module_under_lock(table).SPECS:
         registered.pop(
             spec.name, None
-        )  # A solver that `get` registered by name moves to its place in the table.
+        )  # Restore the order of the table, from which `get` may have registered a solver before.
         _add_own(spec)
 
 
@@ -457,7 +460,7 @@ def _add_own(spec: SolverSpec) -> None:
 
 
 def load_all() -> None:
-    """Fill `registered` once; other threads wait meanwhile."""
+    """Fill `registered` with all solvers, once; other threads wait until it is filled."""
     with import_lock():
         register_all_solvers()
 
@@ -465,7 +468,8 @@ def load_all() -> None:
 @cache
 def register_all_solvers() -> None:
     """Fill `registered` with the built-in solvers and the plug-ins."""
-    from importlib.metadata import entry_points  # This import takes a tenth of the time of `import lavender`.
+    # Imported here: it takes a tenth of the time of `import lavender`.
+    from importlib.metadata import entry_points
 
     for table in TABLES:
         register_specs_of_module(table)
@@ -475,7 +479,7 @@ def register_all_solvers() -> None:
             spec = spec if isinstance(spec, SolverSpec) else spec()
             _add_spec(spec, replace=False)
             object.__setattr__(spec, "from_entry_point", True)
-        # A plug-in may raise any error, which must not prevent the use of lavender.
+        # A plug-in may raise any error; a warning suffices, so that other solvers can be used.
         except Exception as error:
             warnings.warn(
                 f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4
@@ -516,7 +520,7 @@ def get(name: str) -> SolverSpec:
     Raises
     ------
     UnknownName
-        No such solver; the nearest names are listed.
+        The solver does not exist; the message lists the nearest names.
     SolverUnavailable
         Its package is not installed; the message says what to install.
     """

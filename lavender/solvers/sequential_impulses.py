@@ -3,9 +3,9 @@
     w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/core/block.pxd`,
     v <- v + M^-1 J_i^T (change of lambda_i)
 
-with v = M^-1 J^T lambda, the change of velocity. In the same order, each sweep equals one of `pgs` up to rounding,
-but the cost of a contact does not depend on the number of its neighbours. In a fixed order, contacts and joints are
-swept in pairs, with the same bits (`lavender_ext/sweep/packed.pyx`).
+with v = M^-1 J^T lambda, the change of velocity. A sweep equals a sweep of `pgs` in the same order up to rounding, but
+the cost of a contact does not depend on the number of its neighbours. In a fixed order, contacts and joints are swept
+in pairs, without changing the result by a bit (`lavender_ext/sweep/packed.pyx`).
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from lavender_ext.sweep import serial
 class ImpulseState(SweepState):
     """State of sweeps over bodies: v = M^-1 J^T lambda is formed once and updated by the sweeps.
 
-    A large problem with an order of its own is copied in that order; the sweeps then use `sweep_impulse`.
+    A large problem that is swept in another order than its own is copied in that order (`solvers/layout.py`); the
+    sweeps then use `sweep_impulse`.
     """
 
-    sweep_impulse: FloatArray | None = None  # (m,) N s, in sweep order, as the last run left it.
+    sweep_impulse: FloatArray | None = None  # Impulse (m,) [N s] at the end of the last run, in sweep order.
     layout: Layout | None
 
     def __init__(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> None:
@@ -59,7 +60,7 @@ class ImpulseState(SweepState):
         return relative, impulse
 
     def keep_best(self, impulse: FloatArray, tol: float) -> None:
-        """Replace `impulse` (m,), unless it meets tol, by the best of it and all checked iterates in each island."""
+        """Replace `impulse` (m,) by the best of it and all checked iterates in each island, unless it meets tol."""
         if self.layout is None:
             self.watch.keep_best(impulse, tol)
             return

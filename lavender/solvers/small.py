@@ -1,9 +1,9 @@
 """Solve small problems in one compiled call, and build the claim from its counts.
 
-The call is used for few rows of bodies or of A and for small islands with friction (`lavender_ext/small/call.pyx`), and
-for generalised coordinates if Newton's method is estimated to cost no more than other solvers
-(`lavender_ext/batch/many.pyx`): Python would take longer than such a solve. If the call does not find a solution, it
-returns None, and the solver runs from the beginning as on any other problem.
+The call is used for few rows of bodies or of A and for small islands with friction (`lavender_ext/small/call.pyx`),
+and for generalised coordinates if Newton's method is estimated to cost no more than other solvers
+(`lavender_ext/batch/many.pyx`). The overhead of Python would exceed the time of such a solve. If the call does not
+find a solution, it returns None, and the solver runs from the beginning as on any other problem.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from lavender.solvers.registry import SMALL_ROWS, get
 from lavender_ext.batch.many import Limits, solve_new_generalized_problem
 from lavender_ext.small.call import Islands, Rules, Small
 
-# Key of `Derived.cache`: a `Small` or `Islands`; False if the problem has no compiled call.
+# Key in `Derived.cache` of the problem's compiled call, a `Small` or `Islands`; its value is False if there is none.
 COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
 
 #: Messages if no solver ran, by the status of the start.
@@ -44,11 +44,11 @@ NO_WORK_MESSAGES = {
     Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
 }
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
-# Newton's method starts from an iterate if its relative residual does not exceed this.
+# Newton's method starts from the iterate of the sweeps if its relative residual does not exceed this, else from zero.
 WARM_START_MAX_RESIDUAL = 1e-3
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-# If an island has at least this many rows per velocity, the matrix N is full, and smaller than
-# the data from which it is formed.
+# If an island has at least this many rows per velocity, Newton's matrix N over velocities is treated as full: it is
+# then smaller than the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
 VELOCITIES_OF_TWO_BODIES = 12.0
 # Largest number of Newton steps of all islands of velocities, within the default limits of each solver.
@@ -63,11 +63,11 @@ def make_limits(
     Parameters
     ----------
     sweeps : float
-        The call may cost as much as this many sweeps,
+        Limit of the cost, as a number of sweeps.
     max_cost : float, ns
-        and at most this,
+        Limit of the cost.
     steps : float
-        and do at most this many steps.
+        Limit of the number of Newton steps.
     """
     sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
@@ -91,8 +91,8 @@ def make_limits(
 def get_call_time_fraction(problem: Problem, seconds: float) -> float:
     """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
 
-    With at most SMALL_ROWS rows, it may use all of the time. Otherwise the call may fail, so it may use a fraction of
-    the time, in which its set-up must fit; after that the kernel stops at the estimated cost that it is given.
+    With at most SMALL_ROWS rows, the call may use all of the time. Larger problems may fail in the call, so it may use
+    only a fraction of the time, into which its set-up must fit. The kernel stops at the estimated cost of this time.
     """
     if seconds == inf or len(problem.b) <= SMALL_ROWS:
         return 1.0
@@ -133,7 +133,7 @@ def _make_call(problem: Problem) -> Small | None:
         return None
     if bounded or count == 1:
         return Small(data, problem.csr_data if bounded else data)
-    # Islands are those of the bodies if the bodies have fewer unknowns than rows, otherwise those of A.
+    # Newton's method factors over the bodies if these have fewer unknowns than there are rows, otherwise over A.
     bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
     return Islands(data, data if bodies else problem.csr_data, label, count)
 
@@ -173,8 +173,8 @@ class SmallCall:
     pivots : bool
         Whether the call accepts bounded rows.
     hands_over : bool
-        Whether the call also accepts friction. It then returns a start that is a solution, and replaces a bad start by
-        zero.
+        Whether the call also accepts friction. It then returns a start that is already a solution, and replaces a
+        start that is worse than the zero impulse.
     rules : Rules
         Options of the compiled call.
     """
@@ -192,7 +192,7 @@ class SmallCall:
         object.__setattr__(self, "rules", rules)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy or pickle as the call of that name, because `rules` and `limits` cannot be pickled."""
+        """Pickle the name only, because `rules` and `limits` cannot be pickled; a copy is the call of that name."""
         return _named_call, (self.name,)
 
     def cost_limit(self, problem: Problem, kernel: Any) -> float:
@@ -210,12 +210,12 @@ class SmallCall:
         impulse : (m,) N s, optional
         tol : float, -
         max_cost : float, ns
-            Estimated cost at which the call ends with the iterate so far.
+            Estimated cost at which the call stops with the iterate so far.
 
         Returns
         -------
         tuple
-            (judged result, work counts). None is returned if the call did not converge; the counts are () if no call
+            (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
             was made.
         """
         if not tol > 0.0 or not len(problem.b):
@@ -239,7 +239,7 @@ class SmallCall:
         self, problem: Problem, counts: tuple[int, ...] | None
     ) -> list[tuple[str, Claim]]:
         """Return (solver name, claim) for each solver that ran in a failed call, from its counts."""
-        if counts is None or not any(counts):  # If the counts are None, the start is the result.
+        if counts is None or not any(counts):  # No solver ran, as for a start that is the result.
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.make_claim(Status.STALLED, counts), iterations=0))]

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["SolveLog"]
 
-# Sweeps start from the given impulse up to this relative residual, even if the zero impulse has a smaller one, because
-# the given impulse shows which rows are free.
+# Sweeps start from the given impulse if its relative residual is at most this, even if the zero impulse has a smaller
+# residual, because the given impulse shows which rows are free.
 MAX_START_RESIDUAL = 1e3
 
 
@@ -43,15 +43,16 @@ class SolveLog:
             np.inf,
             problem._start,
         )  # Smallest relative residual, and the impulse (m,) [N s] with this residual.
-        # (m,) [N s]: the best impulse of each island, until one impulse meets tol.
+        # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
-        self.bad_start: FloatArray | None = None  # (m,) [N s]: a start that is worse than the zero impulse.
-        self.judged: Any = None  # The judge's pass over `impulse`, if one was made.
+        # Given start (m,) [N s], if it is worse than the zero impulse.
+        self.bad_start: FloatArray | None = None
+        self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
-        self.certificate: FloatArray | None = None  # (m,) Proof that no solution exists, if one was found.
-        # (m,) Direction that bounds the impulses but is not a certificate.
+        self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
+        # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
         self.direction: FloatArray | None = None
         self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
@@ -63,12 +64,13 @@ class SolveLog:
             self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
             self.judge_and_store_best(
                 self.problem._start, is_start=True
-            )  # The zero impulse has the residual 1.
+            )  # The relative residual of the zero impulse is 1.
 
     def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
-        """Judge an impulse (m,) [N s], unless `judged` belongs to it, and store it in islands in which it is the best.
+        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
 
-        No island of `result` has a larger relative residual than an impulse that was offered with `is_start`.
+        `judged` is the judge's result if it is known. If `is_start` is true, the impulse also sets an upper bound of
+        the relative residual of each island of `result`.
         """
         relative = find_relative_at_zero(self.problem, impulse)
         if relative is None:
@@ -99,7 +101,7 @@ class SolveLog:
 
     @property
     def remaining_iterations(self) -> int:
-        """Remaining iterations of the budget."""
+        """Number of iterations that the budget still allows."""
         return self.budget - self.iterations
 
     @property

@@ -1,6 +1,6 @@
 """Successive over-relaxation on free rows: lambda_i <- lambda_i - omega w_i / d_i with the current w.
 
-Converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Reich).
+It converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Reich).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Run the solvers of `auto` in steps: a number of iterations, later more, continuing where they stopped."""
+"""Run the solvers of `auto` in steps: each runs some iterations, and may later continue where it stopped."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "admm": ("admm", {}),
 }
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
-MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions use at least this relative residual as tol.
-# Upper bound of the ratio of an iteration's time [s] to its estimated cost [ns].
+# Predictions of remaining sweeps replace a smaller tol by this relative residual.
+MIN_PREDICTED_RESIDUAL = 1e-16
+# [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
 ITERATION_TIME_PER_COST = 4e-9
 # Sweeps use a formed A only if at least this multiple of the cost to form it remains.
 FORMATION_COST_RATIO = 4.0
@@ -46,8 +47,9 @@ def make_solver(name: str, problem: Problem) -> Any:
     """Create the solver of a step."""
     solver, options = METHODS[name]
     if name == "direct" and problem.law == "linear":
-        return SufficientDirect()  # This solver does not refine a solution that meets tol.
-    # Sweeps solve blocks exactly under the cone law, and if the rows of a contact may have different units.
+        return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
+    # Solve blocks exactly under the cone law, and for a matrix, in which the rows of a contact may have different
+    # units.
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
     if exact and "sweep" in get(solver).options:
         options = options | {"sweep": "blocks"}
@@ -63,14 +65,14 @@ def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
 class Step:
     """A solver that runs on the problem of a log.
 
-    `over` is set if the step cannot continue, `late` if it has no time. It stops if it predicts that more than `least`
-    iterations remain.
+    `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
+    more than `least` iterations are still needed.
     """
 
     over = late = False
     least = np.inf
     state: Any = None
-    impulse: FloatArray  # (m,) [N s]
+    impulse: FloatArray  # Present iterate (m,) [N s].
 
     def __init__(self, name: str, log: SolveLog) -> None:
         self.name, self.log = name, log
@@ -113,8 +115,8 @@ class Step:
 class Newton(Step):
     """Newton's method with the state that the tree has analysed.
 
-    It starts from the best impulse. If it stalls from an impulse that is not zero, it starts once more from zero,
-    unless the compiled call did.
+    It starts from the best impulse. If it stalls after a start that is not the zero impulse, it starts once more from
+    zero, unless the compiled call has started from zero.
     """
 
     started_from_zero = is_second_start = has_stalled = False
@@ -186,7 +188,7 @@ class Sweeps(Iterations):
     """
 
     time_fraction = DECISIONS.time_share
-    predicted = 0.0  # Number of remaining sweeps that the last ones predict.
+    predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
 
     def advance(self, n: int) -> Claim:
         """Run at most n sweeps, offer the result to the log, and predict how many remain."""
@@ -211,7 +213,7 @@ class Sweeps(Iterations):
         """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
         first = int(DECISIONS.first_sweeps)
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
-        if self.time_fraction == 1.0:  # Checks would cost as much as these first sweeps.
+        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
             loop.tol = 0.0
             claim = loop.run_chunks(min(n, first))
             if claim.status is not Status.MAX_ITERATIONS:

@@ -1,7 +1,7 @@
 """Base classes of sweep solvers: sweep order, sweep count, residual checks.
 
-The checks are in `lavender_ext/judge/stopping_test.pxd`. They use the judge's arithmetic. Each check is half way to the
-expected end, so the number of sweeps between checks depends only on the numbers of the problem.
+The checks are in `lavender_ext/judge/stopping_test.pxd` and use the judge's arithmetic. The next check is made after
+half of the sweeps that are predicted to be needed, so it depends only on the numbers of the problem.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STATUS = {
     STALLED: Status.STALLED,
     AT_FLOOR: Status.ROUNDOFF_LIMIT,
 }
-SWEEP_PATIENCE = 64  # A run stalls only after this many sweeps without a better check.
+SWEEP_PATIENCE = 64  # A run stops as STALLED after this many sweeps without a smaller residual at a check.
 
 
 def create_stopping_test(problem: Problem, data: Any, patience: int) -> StoppingTest:
@@ -37,16 +37,17 @@ def create_stopping_test(problem: Problem, data: Any, patience: int) -> Stopping
 
 
 class SweepState:
-    """State of a run; the stopping test `watch` counts sweeps and stores the best checked iterate."""
+    """State of a run of sweeps. Its stopping test `watch` counts sweeps and stores the best checked iterate."""
 
     def __init__(
         self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = SWEEP_PATIENCE
     ) -> None:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
-        self.order = self.plan = order  # `plan` contains the order of the problem's own blocks.
+        # `plan` is the order in terms of the problem's blocks; `order` may be replaced.
+        self.order = self.plan = order
         get_zero_impulse_reference(problem)
-        data.share_reference(problem.metric)  # Residuals in every form are relative to the judge's reference.
+        data.share_reference(problem.metric)  # Make residuals over `data` relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)
         # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
         self.sweeps = serial.Sweeps(data, *make_order_plan(order)) if sweeps is None else sweeps
@@ -77,11 +78,11 @@ def is_sweep_over_jacobian_cheaper(problem: Problem) -> bool:
     if problem.generalized is None:
         return False
     data = problem.metric
-    return bool(data.work - 4 * problem.m < data.entries_of_matrix)  # `work` counts Y twice.
+    return bool(data.work - 4 * problem.m < data.entries_of_matrix)  # `work` counts each entry of Y twice.
 
 
 def choose_sweep_data(problem: Problem) -> Any:
-    """Return the data that sweeps use: rows or a matrix as given. For J and M: these, or A if it is cheaper."""
+    """Return the data that sweeps use: bodies or a matrix as given; for J and M, the cheaper of J and M and A."""
     return problem.metric if is_sweep_over_jacobian_cheaper(problem) else problem.data
 
 

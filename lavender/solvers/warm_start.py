@@ -1,7 +1,7 @@
 """First phase of `newton` from a warm start: judge it, then a few sweeps, or a direct solve of free joints.
 
-It solves steps of a simulation at rest, or of a chain. The equations are in `lavender_ext/newton/warm_start.pxd`. If
-the result is not within tol, `newton` continues from the original start.
+It suffices for most steps of a simulation at rest and for chains of joints. The equations are in
+`lavender_ext/newton/warm_start.pxd`. If the result is not within tol, `newton` continues from the original start.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lavender_ext.newton.warm_start import (
 
 UNDECIDED_RESULT = UNDECIDED, 0, 0
 
-#: Messages for the codes of the kernel; None if it decided nothing.
+#: Message for each code of the kernel; None if the phase did not solve the problem.
 MESSAGES = {
     UNDECIDED: None,
     JUDGED: "as it came",

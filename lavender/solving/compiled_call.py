@@ -21,7 +21,7 @@ from lavender_ext.judge.measure import all_finite
 if TYPE_CHECKING:
     pass
 
-COST_PER_SECOND = 0.9e9  # A compiled call may have this estimated cost [ns] per second of its time limit.
+COST_PER_SECOND = 0.9e9  # [ns/s] Estimated cost that a compiled call may have per second of its time limit.
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
 
@@ -34,8 +34,8 @@ def solve_small(
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
     """Solve and judge a small problem by one compiled call.
 
-    With at most SMALL_ROWS rows, the result at an estimated cost of the limit [s] is the best of the iterate so far and
-    the start. The fields of claim, counts and residual are computed when they are first accessed.
+    With at most SMALL_ROWS rows, a call that reaches the time limit [s], by its estimated cost, returns the better of
+    its iterate and the start. The fields of claim, counts and residual are computed when they are first accessed.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def solve_small(
     if not 0.0 < tol < math.inf or problem.has_singular_program:
         return None, None
     if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
-        # Solving the islands may take long, so they are solved after the checks of the clock.
+        # Islands may take long, so `Prepared` solves them between checks of the clock.
         return None, None
     fraction = 1.0
     if limit < math.inf:
@@ -73,9 +73,10 @@ def solve_small(
     status = CONVERGED
     if judged.relative > tol:
         if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
-            return None, counts  # Either time remains, or rounding hides b next to such large impulses.
+            # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
+            return None, counts
         status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol)
-    # The caller may change their own array later.
+    # Copy the start, because the caller may change the array later.
     start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)
     solution = Solution.with_late_fields(
@@ -97,7 +98,7 @@ def compute_postponed_fields(
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
     """Return the fields of the solution of a compiled call that `Solution.with_late_fields` postpones."""
-    if spec.small is None:  # The solution belongs to a world of `solve_many`.
+    if spec.small is None:  # Only worlds of `solve_many` have no compiled call of their own.
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 
 def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
-    """Raise an error if the argument is not a problem or the solver refuses it; return `is_too_late`.
+    """Raise an error if the argument is not a problem or the solver refuses it; return the result of `is_too_late`.
 
-    If it is too late, only the kind of the problem is checked, because the other checks would exceed the limit.
+    If that is true, only the kind of the problem is checked, because other checks would exceed the time limit.
     """
     check_problem(problem)
     late = is_too_late(problem, spec, deadline)
@@ -40,10 +40,10 @@ def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVE
 
 
 def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
-    """Return whether forms of a problem that are needed before a solver runs would be built after the deadline.
+    """Return whether building the forms of a problem that a solver needs would end after the deadline.
 
-    These are `problem.disk`, and A if a solver of another package refuses problems by its entries. Such a call returns
-    its start.
+    These forms are `problem.disk`, and A if a solver of another package examines its entries. If the result is true,
+    the call returns its start.
     """
     if not is_tight(problem, deadline):
         return False
@@ -52,7 +52,7 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
         and problem.cones.has_ellipse
         and deadline.has_passed(1e-9 * estimate_judge_setup_cost(problem))
     ):
-        # Even the couplings of bodies, which give the number of entries of A, would take too long.
+        # Even counting the couplings of bodies, which gives the number of entries of A, would take too long.
         return True
     refusal = estimate_refusal_cost(problem) if spec.external else 0.0
     needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
@@ -64,7 +64,7 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     ):
         watch = Stopwatch()
         import_numerical_modules()
-        # SciPy is imported outside the limit: otherwise no call with this limit would ever have it.
+        # Import SciPy without counting the time; otherwise no call with this limit could ever import it.
         deadline.reserve_seconds(-watch.elapsed_seconds)
         needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
     return needed > 0.0 and deadline.has_passed(needed)
@@ -84,7 +84,7 @@ def check_time_limit(time_limit: Any) -> float:
     Raises
     ------
     InputError
-        It is not a positive number.
+        `time_limit` is not a positive number.
     """
     if type(time_limit) is float and time_limit > 0.0:
         return time_limit
@@ -108,7 +108,7 @@ def make_deadline(spec: SolverSpec, limit: float, begun: float | None = None) ->
 
 
 def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
-    """Return `tol` and `max_iter` as numbers; `max_iter` is the spec's if it is None.
+    """Return `tol` and `max_iter` as numbers; a `max_iter` of None becomes the default of the spec.
 
     Raises
     ------

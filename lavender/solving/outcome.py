@@ -49,9 +49,9 @@ from lavender_ext.judge.measure import Judged, all_finite
 # Fields of an unjudged solution, besides its residual, that are computed when one is first read.
 LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
-# A lower bound of every solution's impulse is reported if it is at least this multiple of sum |b_i| / d_i, the impulse
-# that the rows would need one by one. Below, the bound is true of well-posed problems, too, and says nothing about the
-# data. Rows that contradict each other up to a relative difference delta need about 1 / delta times that sum.
+# A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
+# impulse that the rows would need one by one. Smaller bounds also hold for well-posed problems. Rows that contradict
+# each other up to a relative difference delta need about 1 / delta times that sum.
 CONTRADICTING_IMPULSE_RATIO = 100.0
 
 
@@ -70,11 +70,11 @@ def finish(
 ) -> Solution:
     """Build the solution: the judge's residual, the status that it supports, and the check of the claim.
 
-    `refutation` says which solution the caller found if the solver claims that there is none.
+    `refutation` describes a solution that the caller found although the solver claims that none exists; else empty.
     """
     claim = name_lost_row(problem, impulse, claim)
     if claim.status is INFEASIBLE and tol > 0.0:
-        # An engine that applies the impulse of an infeasible step must not pull at a contact.
+        # Project the impulse on its bounds, so that an engine that applies it does not pull at a contact.
         impulse = combine_best_islands(
             problem, (problem._start,), (project_impulse(problem.cones, impulse),), tol
         )
@@ -94,7 +94,7 @@ def finish(
     elif tol < relative and (
         (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
         or (status is ROUNDOFF_LIMIT and judged._float64_relative < math.inf)
-    ):  # The claim was true for the first pass of the judge, but is not for the pass with refinement.
+    ):  # The unrefined residual met tol, but the refined residual does not: correct the claim.
         status = STALLED
         message = _joined(
             message,
@@ -184,7 +184,10 @@ def create_unjudged(
     message: str,
     setup_time: float = 0.0,
 ) -> Solution:
-    """Return the start as a solution if even the judge would exceed the limit; its fields are judged when accessed."""
+    """Return the start as a solution without judging it, because even the judge would exceed the time limit.
+
+    Its residual and the fields that depend on it are computed when they are accessed.
+    """
     start = problem._start if problem.guess is None else problem.guess
     start = start.copy() if impulse is None else problem.impulse_array(impulse)
     late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
@@ -194,7 +197,7 @@ def create_unjudged(
 def judge_late_fields(
     problem: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
 ) -> dict[str, Any]:
-    """Return the fields that `create_unjudged` postpones; impulse (m,) [N s], read-only."""
+    """Return the fields that `create_unjudged` postpones, for the impulse (m,) [N s], which is read-only."""
     disk = problem.disk
     solution = finish(disk, spec, options, problem.on_disk(impulse), claim, tol, 0.0, 0.0, None)
     if problem is not disk:
@@ -204,7 +207,7 @@ def judge_late_fields(
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
-    """Describe why an iteration without its own message found no solution. Bad diagonal entries are reported first."""
+    """Describe why a solver that returned no message found no solution; bad diagonal entries of A come first."""
     reason = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
     message = f"{reason}, {format_work_count(iterations, 'iterations')}"
     if problem.matrix is None:
@@ -221,7 +224,7 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
 
 
 def describe_islands(judged: Residual, tol: float) -> str:
-    """Return how many islands meet tol, with the worst one's first and last block; empty for one island."""
+    """Return how many islands meet tol, and the first and last block of the worst island; empty for one island."""
     label, relative = judged.islands[:2]
     if len(relative) < 2:
         return ""
@@ -247,15 +250,15 @@ def _contradicting_impulse(problem: Problem) -> float:
 
 
 def _joined(message: str, addition: str) -> str:
-    """Append `addition` to the message, unless it contains it already, as the message of a record may."""
+    """Append `addition` to the message, unless the message contains it already."""
     return message if addition in message else f"{message}; {addition}".removeprefix("; ")
 
 
 def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
-    """Return whether the residual with the formed A meets tol or its floor: the given data differ by rounding."""
+    """Return whether the residual of the formed A meets tol or its floor, so that only rounding separates both."""
     try:
         formed = problem.csr_data
-    except InputError:  # A is too large to be formed, so no solver has formed it.
+    except InputError:  # A is too large to be formed.
         return False
     get_zero_impulse_reference(problem)
     formed.share_reference(problem.metric)
@@ -263,7 +266,10 @@ def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
 
 
 def _predict_iterations(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
-    """Return a message for an exhausted budget if reaching tol needs more iterations than were done, else empty."""
+    """Return a message about an exhausted budget that predicts the iterations needed to reach tol.
+
+    It is empty if no more iterations than were done are predicted.
+    """
     remaining = (
         per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
     )
@@ -289,7 +295,7 @@ def decide_empty_rows(
     cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
     if not len(empty):
         return None
-    # Friction rows have no fixed bounds: the normal impulse bounds them.
+    # Leave out friction rows, which have no fixed bounds.
     nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if (
         problem.law == "cone"
@@ -310,6 +316,6 @@ def decide_empty_rows(
     y, b = np.zeros(problem.m), problem.b[worst]
     y[worst] = math.copysign(1.0, b)
     if prove_infeasibility(problem, y, tol).reason:
-        return None  # b is negligible.
+        return None  # b of these rows is negligible, so that the answer can meet tol.
     message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s"
     return message, y, impossible

@@ -40,7 +40,7 @@ class Plan:
     stages : tuple of Stage
         First stages; each runs only if the stages before it did not solve the problem.
     in_turn : tuple of str
-        Solvers that alternate afterwards, with doubled work in each round.
+        Solvers that alternate after these stages, with doubled work in each round.
     """
 
     rows: int
@@ -62,7 +62,7 @@ class Plan:
         lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
-        if self.in_turn:  # Only backends solve programs with a singular P.
+        if self.in_turn:  # It is empty for programs with a singular P, which only backends solve.
             lines.append(
                 f"newton is counted to take {format_seconds(1e-9 * self.newton)}, "
                 f"a sweep {format_seconds(1e-9 * self.sweep)}"

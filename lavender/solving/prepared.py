@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
     from lavender.solvers.registry import SolverOptions
 
-# `auto` judges its last iterate and selects the best iterate of each island in as many passes of the judge.
+# [passes of the judge] Cost of judging `auto`'s last iterate and of selecting the best iterate of each island.
 SELECTION_PASSES = 3
 SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
 JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
@@ -90,10 +90,9 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     Returns
     -------
     Prepared
-        `prepared.solve(impulse=..., tol=...)` solves this problem. `prepared.solve(problem2, ...)` solves another one,
-        which replaces it: the next `prepared.solve()` solves `problem2`. If that has the same structure (blocks,
-        sparsity pattern of A or J), the preparation is reused. Both may be called any number of times. `setup_time`
-        [s] is the time of the preparation.
+        `prepared.solve(impulse=..., tol=...)` solves this problem. `prepared.solve(problem2, ...)` solves another
+        problem and keeps it: the next `prepared.solve()` solves `problem2`. The preparation is reused if `problem2`
+        has the same structure (blocks, sparsity pattern of A or J). `setup_time` [s] is the time of the preparation.
 
     Examples
     --------
@@ -129,7 +128,8 @@ class Prepared:
         begin: bool = True,
         deadline: Deadline = NEVER,
     ) -> None:
-        watch = Stopwatch()  # The checks may form A and convert ellipses to disks, which counts as set-up.
+        # The time of checks counts as set-up: they may form A and convert ellipses to disks.
+        watch = Stopwatch()
         late = check_accepted(problem, spec, deadline)
         for name in options:
             if name not in spec.accepts:
@@ -149,14 +149,14 @@ class Prepared:
         self.options = options
         self._original, self.problem = problem, problem if late else problem.disk
         self._lock = Lock()
-        # `auto` prepares nothing before its compiled call for small problems.
+        # `auto` has nothing to prepare before its compiled call for small problems.
         if begin and (options or not spec.delegates):
             self._prepare_solver(NEVER)
         self.setup_time = watch.elapsed_seconds
 
     solver: Any = None  # Created when it is first needed.
-    setup_time = 0.0  # [s]
-    _is_fresh = True  # No solve has used the state yet.
+    setup_time = 0.0  # [s] Time of the preparation.
+    _is_fresh = True  # Whether no solve has used the state yet.
     _failure = ""  # Reason why no state exists, or empty.
     _is_late = False  # Whether no state exists because building it would have exceeded the time limit.
 
@@ -168,7 +168,7 @@ class Prepared:
         try:
             self._set_up(self.problem, True, deadline)
         except BaseException:
-            self.solver = None  # After a failure, the next call tries again.
+            self.solver = None  # Makes the next call try again.
             raise
         self._is_fresh = True
         self.setup_time += watch.elapsed_seconds
@@ -199,7 +199,7 @@ class Prepared:
         InUse
             Another call of this object's `solve` has not returned yet.
         UnknownName
-            No such argument.
+            An argument does not exist.
         """
         for name in unknown:
             successor = suggest_argument_name(name, SOLVE_ARGUMENTS)
@@ -247,7 +247,7 @@ class Prepared:
             disk = original.disk
             start = None if impulse is None else original.on_disk(disk.impulse_array(impulse))
             if is_tight(original, deadline):
-                # The judge measures the result, and the start if it is not zero.
+                # The judge makes one pass for the result, and one for a start that is not zero.
                 passes = 2 if start is not None or disk.guess is not None else 1
                 judge_time = 1e-9 * passes * estimate_result_cost(disk)
                 setup_time = 1e-9 * estimate_judge_setup_cost(disk)
@@ -270,7 +270,7 @@ class Prepared:
             return self._run(loop, max_iter)
         finally:
             if self._is_late:
-                self.solver, self._is_late = None, False  # The next call tries again.
+                self.solver, self._is_late = None, False  # Makes the next call try again.
             self._lock.release()
 
     def _loop(
@@ -311,7 +311,7 @@ class Prepared:
         elif self._failure:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._failure)
         elif self._is_late or (loop.deadline.has_passed() and not spec.external):
-            # If the start is the zero impulse, there is no better one to select, and judging is postponed.
+            # If the start is the zero impulse, no better impulse can be selected, and judging is postponed.
             at_zero = find_relative_at_zero(problem, loop.impulse)
             if (
                 at_zero is not None
@@ -333,7 +333,7 @@ class Prepared:
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
-                # `auto` and the checks of sweeps already store the best of each island, including the start.
+                # `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
                 keeps_best = spec.delegates and not problem.has_singular_program
                 if not keeps_best and (
                     claim.status is TIME_LIMIT
@@ -383,7 +383,7 @@ class Prepared:
         b[rows] = start[rows] = 0.0
         try:
             others = Prepared(self.problem.updated(b=b), self.spec, self.options)
-        except InputError:  # All other numbers of b are below the smallest that a problem may have.
+        except InputError:  # The remaining entries of b are below the accepted range.
             return claim
         solution = others.solve(
             impulse=start,
@@ -407,12 +407,12 @@ class Prepared:
             original, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
             self.setup_time = watch.elapsed_seconds
-            # These are assigned last, so that a problem does not replace the old one if its set-up raises an error.
+            # Assign the problem last, so that it does not replace the old problem if its set-up raises an error.
             self._original, self.problem = original, problem
         self._is_fresh = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy or pickle as a new preparation, because a state can only be used by one solve at a time."""
+        """Copy or pickle the arguments only; the copy prepares the solver again, as two solves cannot share a state."""
         return partial(prepare, **self.options), (self._original, self.spec.name)
 
     def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
@@ -420,13 +420,13 @@ class Prepared:
         if problem.metric.reference_energy < 0.0:
             get_zero_impulse_reference(
                 problem
-            )  # The judge computes its reference before a solver gets the problem.
+            )  # Compute the judge's reference before a solver gets the problem.
         is_new, self._failure = is_new or bool(self._failure), ""
         if deadline.is_set:
             self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
             if self._is_late and self.solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES):
-                # SciPy is imported outside the limit, like the start of processes: otherwise no call with this limit
-                # would ever have it.
+                # Import SciPy without counting the time, like the start of processes; otherwise no call with this
+                # limit could ever import it.
                 watch = Stopwatch()
                 import_numerical_modules()
                 deadline.reserve_seconds(-watch.elapsed_seconds)
@@ -440,7 +440,7 @@ class Prepared:
             else:
                 self.state = self.solver.update(self.state, problem)
         except InputError:
-            raise  # The problem is not valid for the solver.
+            raise  # The solver does not accept the problem.
         except BREAKDOWN as error:
             self.state, self._failure = None, format_error(error)
 
@@ -469,14 +469,14 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
         return ForeignSolver(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:
         return solver
-    # This module is imported here, because it imports the table of solvers.
+    # Import this module here, because it imports the table of solvers.
     from lavender.solvers.polyhedral import BoundedRowSolver
 
     return BoundedRowSolver(solver)
 
 
 def same_structure(p: Problem, q: Problem) -> bool:
-    """Return whether two problems have the same blocks, operator, and bodies or pattern of J and M or of A."""
+    """Return whether two problems have the same blocks, form of A, and bodies or sparsity pattern."""
     if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:

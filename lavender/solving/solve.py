@@ -47,8 +47,8 @@ def solve(
     impulse : (m,) N s, optional
         Warm start. Default: `problem.guess`, otherwise zero clipped to the bounds.
     tol : float, default 1e-6
-        Relative residual to reach: 0 is a solution, 1 is zero impulses (see `judge.residuals`). `tol=0` runs exactly
-        `max_iter` iterations; `auto` and solvers that factor end earlier where nothing is left to gain.
+        Relative residual to reach: 0 for an exact solution, 1 for zero impulses (see `judge.residuals`). `tol=0` runs
+        exactly `max_iter` iterations; `auto` and solvers that factor end earlier if nothing can be gained.
     velocity_tol : float, optional, m/s (rad/s on angular rows)
         Velocity error to reach on every row, whatever the relative residual; `tol` is not used. Solvers run to the
         relative residual that guarantees it (`lavender.solving.velocity`), and `success` refers to it.
@@ -62,7 +62,8 @@ def solve(
         other packages run in a separate process, which is reused by later solves and killed at the limit (at twice the
         limit if the package has a time limit of its own); `isolate=False` runs them in this process.
     history : bool
-        Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all stages.
+        Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all
+        stages.
     callback : callable (iterations, impulse, residual), optional
         Called whenever history would be recorded; the solve stops if it returns a true value.
     **options
@@ -77,7 +78,7 @@ def solve(
     Raises
     ------
     UnknownName
-        No such solver or option.
+        The solver or option does not exist.
     SolverUnavailable
         The solver's package is not installed.
     CapabilityError
@@ -86,7 +87,7 @@ def solve(
         `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid.
     """
     begun = 0.0 if time_limit is None else perf_counter()
-    check_problem(problem)  # This comes first, because a frequent error is to pass A and b.
+    check_problem(problem)  # Check this first, because a frequent error is to pass A and b.
     if surplus:
         raise InputError(
             f"solve has {2 + len(surplus)} positional arguments; a problem and the name of a solver are needed, "
@@ -124,6 +125,6 @@ def solve_prepared(
     callback: Callback | None = None,
     failed_call: tuple[int, ...] | None = None,
 ) -> Solution:
-    """Prepare a solver and solve once; `failed_call` is as in `solve_small`."""
+    """Prepare a solver and solve once; `failed_call` holds the counts of a compiled call that failed, or None."""
     prepared = Prepared(problem, spec, options, False, deadline)
     return prepared._solve(None, impulse, tol, max_iter, deadline, history, callback, failed_call)

@@ -5,8 +5,8 @@ V0 of the zero impulse. With V0 the largest reference of an island,
 
     relative <= velocity_tol / V0   =>   V <= velocity_tol on every row                                        (1)
 
-Solvers run to the tolerance (1). An answer that they return with a larger relative residual is accepted nevertheless if
-the judge measures V <= velocity_tol: the bound on E was then stricter than needed.
+Solvers run to the tolerance (1). An answer with a larger relative residual is also accepted if the judge measures
+V <= velocity_tol, because (1) limits E, too, which was not requested.
 """
 
 from __future__ import annotations

@@ -3,11 +3,11 @@
     [ I     -K^T              ] [ dy ]   [  0 ]
     [ P K   I - P + P theta   ] [ dz ] = [ -F ]        y = K^T z, P in the derivative of Pi               (1)
 
-Eliminating dy gives H = K K^T, eliminating dz gives K^T K. Both square the singular values of K, and values below
-sqrt(2^-53) of the largest are lost (for closed loops of hinges and nearly parallel axes, 1e-6 to 1e-8 is usual, with
-impulses of 1e4 and more along them). (1) contains K itself. A shift on the rows that P keeps makes redundant rows
-solvable; refinement removes its effect (Bjorck 1996, section 2.4.4). The systems (H + W) dz = r of an interior point
-are treated in the same way, with W^-1 = R^T Q and dz = R^T x,
+Eliminating dy gives H = K K^T, eliminating dz gives K^T K. Both square the singular values of K, so that values below
+sqrt(2^-53) of the largest are lost. Closed loops of hinges and nearly parallel axes have singular values of 1e-6 to
+1e-8, and impulses of 1e4 and more along them. (1) contains K itself. A shift on the rows with P = 1 makes systems with
+redundant rows regular; refinement removes the effect of the shift (Bjorck 1996, section 2.4.4). The systems
+(H + W) dz = r of an interior point are treated in the same way, with W^-1 = R^T Q and dz = R^T x,
 
     [ I     -K^T R^T ] [ dy ]   [  0  ]
     [ Q K    I       ] [ x  ] = [ Q r ]                                                                   (2)
@@ -28,7 +28,7 @@ from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
 
 class AugmentedSystem:
-    """Factorisation of (1) and (2), which the kernel's `Solve` calls. K is built at the first call."""
+    """Factorises (1) and (2) for the kernel `Solve`. K is built at the first call."""
 
     def __init__(self, kernel: Solve, layout: Layout, bodies: Any) -> None:
         self.kernel, self.layout, self.bodies = kernel, layout, bodies
@@ -44,13 +44,13 @@ class AugmentedSystem:
         Raises
         ------
         TooLate
-            It would end after the deadline.
+            The factorisation would end after the deadline.
         """
         if self.k is None:
             if self.deadline.has_passed(1e-9 * RATES["scipy calls"]):
                 raise TooLate
             self.k = self._build_jacobian()
-            # The system contains K twice, and the block matrices.
+            # The system contains K twice, and block-diagonal matrices.
             entries = 2.0 * self.k.nnz + len(self.block_entries[0])
             self.seconds = 1e-9 * (
                 RATES["scipy calls"]

@@ -19,10 +19,10 @@ from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
 FORM = "generalized velocities"
-# Between two checks of the clock and Ctrl-C, an island does at most this many steps, and at most as many as are
-# estimated for CHECK_INTERVAL [s]. The estimate uses FLOP_TIME per multiply-add, or SPARSE_TIME_RATIO times as much for
-# sparse factors. With a time limit, the steps use at most CALL_TIME_FRACTION of the remaining time, at the measured
-# speed or at FLOP_TIME, whichever is slower, because the first steps may be cheap.
+# Between two checks of the clock and Ctrl-C, an island does at most MAX_STEPS_PER_CHECK steps, and at most as many as
+# are estimated to take CHECK_INTERVAL [s]. The estimate is FLOP_TIME per multiply-add, times SPARSE_TIME_RATIO for
+# sparse factors. With a time limit, the steps between two checks may use the fraction CALL_TIME_FRACTION of the
+# remaining time, estimated by the slower of FLOP_TIME and the measured speed, because the first steps may be cheap.
 MAX_STEPS_PER_CHECK = 64
 CHECK_INTERVAL = 4.0
 CALL_TIME_FRACTION = 0.5
@@ -42,7 +42,7 @@ _STATUS = {
     OUTCOMES["broken"]: Status.NUMERICAL_ERROR,
     OUTCOMES["lost"]: Status.DIVERGED,
 }
-UNLIMITED_STEPS = 2**31 - 1  # The kernel has no limit of steps, because `run` counts the steps.
+UNLIMITED_STEPS = 2**31 - 1  # Step limit that is passed to the kernel, because `run` limits the steps.
 _WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
@@ -82,7 +82,7 @@ def run_newton_steps(
     slow = max(SPARSE_TIME_RATIO * step, 1e-9)
     steps = clock = max(
         1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow))
-    )  # The step limit applies to each island separately.
+    )  # The kernel applies the step limit to each island separately.
     if time_limit is not None:
         steps = max(1, int(min(CALL_TIME_FRACTION * time_limit / slow, clock)))
     while counts[0] < max_iter:
@@ -98,7 +98,8 @@ def run_newton_steps(
         if status is Status.CONVERGED:
             judged = judge_impulse(problem, impulse.copy())
         if status is Status.CONVERGED and not judged.relative <= tol:
-            # The kernel sums in another order than the judge, and its squares may underflow.
+            # The judge does not confirm the kernel's test, which adds in another order and whose squares may
+            # underflow.
             status = Status.MAX_ITERATIONS if tolerance_ratio > MIN_TOLERANCE_RATIO else Status.STALLED
             tolerance_ratio *= 0.25
             is_continued = False

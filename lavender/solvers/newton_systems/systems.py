@@ -1,7 +1,7 @@
-"""H of the scaled problem and its Newton systems, in two forms.
+"""The matrix H = D^-1/2 A D^-1/2 of the scaled problem and its Newton systems, in two forms.
 
-`VelocitySystem` does not form H (K K^T + theta with one small dense block for each body); `MatrixSystem` stores it
-(dense, or in compressed rows). The equations and the methods that use them are in `lavender_ext/newton/`.
+`VelocitySystem` keeps H = K K^T + theta as K, without forming H, and factors over the bodies. `MatrixSystem` stores H,
+dense or in compressed rows. The equations and the methods that use them are in `lavender_ext/newton/`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,18 @@ from lavender_ext.newton.coupled import (
 from lavender_ext.newton.solve import Layout, Solve
 
 MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse factor.
-# Fractions of nonzeros of A above which a dense factor is faster. For the cone law: a full block of s^1/2 m rows has
-# the fraction s, and a multiply-add of a dense factor costs a quarter. It is smaller for bounded rows, of which dense
-# factors use only the free ones, and for Coulomb's law, whose asymmetric matrices lose pivots by panels.
+# If the fraction of nonzeros of A is larger, a dense factor is faster. For the cone law: a full block of s^1/2 m rows
+# has the fraction s, and a multiply-add of a dense factor costs a quarter of a sparse one. The fraction is smaller for
+# bounded rows, because dense factors contain only the free rows, and for Coulomb's law, because supernodal factors of
+# its asymmetric matrices may lose pivots.
 CONE_DENSE_FRACTION, OTHER_DENSE_FRACTION = 0.4, 0.25
 
 
 def is_dense_faster(nnz: float, m: int, cones: bool) -> bool:
-    """Return whether a dense factor of m rows and nnz entries is faster than panels. `cones`: under the cone law."""
+    """Return whether a dense factorisation of m rows and nnz entries is faster than a supernodal one.
+
+    `cones` states whether the problem has the cone law.
+    """
     return nnz > (CONE_DENSE_FRACTION if cones else OTHER_DENSE_FRACTION) * m * m
 
 
@@ -53,7 +57,7 @@ class Bodies(NamedTuple):
     Parameters
     ----------
     pair : (n_blocks, 2) int32
-        Bodies of each block; -1 if there is none.
+        Bodies of each block; -1 for a static or missing body.
     n : int
         Number of bodies.
     column : (nv,) int32, optional
@@ -66,7 +70,10 @@ class Bodies(NamedTuple):
 
 
 def find_bodies(problem: Problem) -> Bodies | None:
-    """Return the bodies of a problem, also those of J and M if every block couples at most two of them, else None."""
+    """Return the bodies of a problem, or None if it has no bodies.
+
+    For J and M these are free rigid bodies, of which every block must couple at most two.
+    """
     if problem.rows is not None:
         return Bodies(problem.rows.block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
     if problem.generalized is None or problem.cones.has_round:
@@ -80,7 +87,7 @@ class System:
 
     form = ""
     work = 0.0  # Multiply-adds of one factorisation.
-    pace = 1e-9  # Upper bound of the time [s] per multiply-add, on any machine of the last ten years.
+    pace = 1e-9  # [s] Upper bound of the time per multiply-add, on machines of the last ten years.
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
 
@@ -93,7 +100,7 @@ class System:
         return self.pace * self.work
 
     def set_deadline(self, deadline: Deadline) -> None:
-        """Start no factor by Python that is expected to end after `deadline`."""
+        """Set the deadline; factorisations by Python that are expected to end after it are not started."""
 
     def record_factor_time(self, seconds: float) -> None:
         """Record the time of the last factorisation with the steps around it [s], to estimate the next time."""
