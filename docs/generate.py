@@ -82,25 +82,34 @@ PLAN = bench.Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, wa
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "The first table has the solver that brings the most cases of a structure to each tolerance and, of those that\n"
-    "bring as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how\n"
-    "many cases, if not on all. The second table has the solver that serves the most cases within each time\n"
-    "(a case is served if at most half of the start's residual is left); the number is the residual at the 90th\n"
-    f"percentile. Solvers after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
+    "A *case* is one problem of the built-in suite, and cases of similar structure are grouped. The first table\n"
+    "has a solver for each structure and each relative residual: the solver that solves the largest number of cases\n"
+    "to this residual, and among several such solvers the fastest. The number is the shifted geometric mean of its\n"
+    "times. Brackets show the number of solved cases if not all are solved.\n\n"
+    "The second table has a solver for each time: the solver that serves the largest number of cases within this\n"
+    "time. A solver serves a case if its residual is at most half of the residual of the start. The number is the\n"
+    "residual at the 90th percentile of the cases. *none* means that no solver serves nine cases of ten. Solvers\n"
+    f"after ≈ are equally good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
     f"{RESIDUAL_NOISE_FACTOR:g} in residual)."
 )
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
 This page lists every name that `lavender.solve` accepts, and the options of each solver. [How to choose a
-solver](choose.md) recommends one for a problem; `lv.available(problem)` lists those that accept it. The [built
-documentation](install.md#builds-for-development) has a page for each solver, with its method and its measured times.
+solver](choose.md) recommends a solver for a problem, and `lv.available(problem)` lists the solvers that accept it.
+If you [build the documentation](install.md#builds-for-development), it has a page for each solver with its method
+and its measured times.
 
-*Laws*: the friction models that it accepts ([laws](concepts.md#laws)). *Reads*: the forms of a problem that it reads:
-rows (body velocities), generalized (J and M) or the matrix A, which is formed if it is not given. *Exact*: ends after
-finitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂."""
+The columns of the table are
+
+- *laws*: the friction models that the solver accepts ([laws](concepts.md#laws)),
+- *reads*: the forms of a problem that the solver reads. The form *rows* has body velocities, *generalized* has J and
+  M, and *matrix* has A. If a solver reads only A, A is computed from the other forms,
+- *exact*: the solver ends after finitely many steps with the exact solution, up to rounding,
+- *resumable*: n₁ iterations followed by n₂ iterations give the same bits as n₁ + n₂ iterations."""
 ORDERS = """\
-Options are keywords of `lavender.solve`. These solvers also take `order=` and `ground=`, and `seed=` for random
-orders:"""
+Options are keywords of `lavender.solve`. The option `order=` selects the [sweep order](sweep.md#sweep-orders),
+`seed=` the seed of random orders. If a problem is given as a matrix, `ground=` lists the blocks that touch the
+ground, from which `bottom_up` and `top_down` count their levels. These solvers accept all three options:"""
 LAW_NAMES = {
     "linear": "linear systems",
     "lcp": "bounded rows and contacts without friction",
@@ -555,9 +564,10 @@ def scene_page():
         "# Scenes",
         "<!-- Written by `python docs/generate.py --pages`. -->",
         (
-            "`lavender.Scene(name, **parameters)` builds a scene of the gallery; parameters that all scenes share "
-            "(`dt`, `friction`,\n`solver_iterations`, `warm_start`, …) are those of `lavender.Scene`. Lengths in m, "
-            "masses in kg, angles in rad."
+            "This page lists the built-in scenes of [LavenderSim](engine.md), the engine in this package, with their "
+            "parameters.\n`lavender.Scene(name, **parameters)` builds a scene. Every scene also accepts the "
+            "[parameters of all scenes](engine.md#build-a-scene)\n(`dt`, `friction`, `solver_iterations`, "
+            "`warm_start`, …). Lengths are in m, masses in kg, angles in rad."
         ),
     ]
     for name, build in SCENES.items():

@@ -213,30 +213,38 @@ def format_catalogue(entries: list[Entry], recorded: Sequence[Entry] = ()) -> st
     near = sum(e.radius is not None and e.radius <= NEAR_SOLUTION_SPEED for e in found)
     unique = sum(e.unique for e in found)
     first = (
-        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
-        f"near a known answer, {near} within {NEAR_SOLUTION_SPEED:.0e} m/s of it; for {unique} no other motion exists; "
-        f"{count['infeasible']} have no solution, with a certificate."
+        f"This page lists a fixed set of {len(found)} contact problems with proved properties. An *enclosed* problem "
+        f"has an exact solution that is [proved](proof.md) to lie near a known answer. {count['enclosed']} problems "
+        f"are enclosed, {near} of them within {NEAR_SOLUTION_SPEED:.0e} m/s of the answer. For {unique} problems it is "
+        f"proved that all solutions have one motion. {count['infeasible']} problems have no solution, which a "
+        "[certificate](residual.md#certificates-of-infeasibility) proves. Rows, laws and the matrix A are defined in "
+        "[the contact problem](concepts.md)."
     )
     how = (
-        "`lavender problems` builds them from their names, `lavender problems --check` compares every number with "
-        "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page. "
-        "Robots need the extra `robots`: models of gymnasium (MIT) and dm_control (Apache-2.0). Recorded problems are "
-        "files of other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two "
-        "of ContactBench (BSD-2-Clause); `lavender problems FOLDER --certify FILE` certifies your files."
+        "`lavender problems` builds the problems from their names. `lavender problems --check` also compares "
+        "every number with `lavender/lab/manifest.json`. `lavender problems --page docs/catalogue.md` writes this page "
+        "from the manifest. The robots are models of gymnasium (MIT) and dm_control (Apache-2.0) and need the extra "
+        "`robots`. The recorded problems are files of other projects and are not distributed with lavender: test data "
+        "of FCLIB and Siconos (Apache-2.0), and two files of ContactBench (BSD-2-Clause). `lavender problems FOLDER "
+        "--certify FILE` proves the properties of your own files."
     )
     columns = (
-        "The columns: smallest and largest number of rows; median of the PGS sweeps to a thousandth of the error of "
-        f"the zero impulse ({MAX_SWEEPS:,} if these do not suffice or PGS does not accept the problem); median "
-        "condition number of A; problems with blocks at a boundary; problems by law; and their proved properties. "
-        "Open problems are on the boundary of two states, where no proof by signs exists."
+        "The first table has a line for each set of problems, with these columns:\n\n"
+        "- *rows*: the smallest and the largest number of rows\n"
+        "- *sweeps*: the median number of [sweeps](sweep.md) of PGS until the relative residual is 1e-3. "
+        f"{MAX_SWEEPS:,} is counted if these sweeps do not suffice or PGS does not accept the problem\n"
+        "- *condition*: the median condition number of A\n"
+        "- *at a boundary*: the number of problems with blocks at the boundary of two "
+        "[states](concepts.md#states-of-blocks)\n"
+        f"- {', '.join(f'*{law}*' for law in sorted({e.law for e in found}))}: the number of problems under this law\n"
+        "- *enclosed*, *one motion*, *infeasible*: the number of problems with this proved property\n"
+        "- *open*: the number of problems for which neither a solution nor infeasibility is proved. Usually a block is "
+        "then at the boundary of two states"
     )
-    claims = (
-        "None of the files states a claim of a solver, so no published claim is contradicted here; "
-        "`lavender report @hard --prove` compares the claims of solvers in your run with the proofs."
-    )
+    claims = "`lavender report @hard --prove` compares the claims of solvers with the proofs."
     laws = sorted({e.law for e in found})
     out = [
-        "# Catalogue",
+        "# Catalogue of problems with proved properties",
         first,
         how,
         columns,
@@ -261,19 +269,28 @@ def format_catalogue(entries: list[Entry], recorded: Sequence[Entry] = ()) -> st
         cells += [sum(e.known == known for e in own) for known in ("infeasible", "open")]
         out.append("| " + " | ".join(map(str, cells)) + " |")
     if recorded:
-        out += ["## Recorded files", "| file | sha | rows | law | known |\n|---|---|---|---|---|"]
+        out += [
+            "## Recorded files",
+            "*sha* is a hash of the data. A distance in m/s is the distance of the exact solution from the answer.",
+            "| file | sha | rows | law | proved properties |\n|---|---|---|---|---|",
+        ]
         out += [
             f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {describe_properties(e)} |" for e in recorded
         ]
     solutions = [e for e in found if e.motions > 1]
-    for title, selected, cell in (
-        ("No solution", [e for e in found if e.known == "infeasible"], lambda e: e.reason),
-        ("Several motions", solutions, lambda e: f"at least {e.motions}, up to {e.apart:.1e} m/s apart"),
-        ("Open", [e for e in found if e.known == "open"], lambda e: e.reason),
+    for title, head, selected, cell in (
+        ("No solution", "reason", [e for e in found if e.known == "infeasible"], lambda e: e.reason),
+        (
+            "Several motions",
+            "solutions found",
+            solutions,
+            lambda e: f"at least {e.motions}, which differ by up to {e.apart:.1e} m/s",
+        ),
+        ("Open", "reason", [e for e in found if e.known == "open"], lambda e: e.reason),
     ):
         out += [
             f"## {title}",
-            f"{len(selected)} problems." if not selected else "| problem | rows | |\n|---|---|---|",
+            f"{len(selected)} problems." if not selected else f"| problem | rows | {head} |\n|---|---|---|",
         ]
         out += [f"| `{e.name}` | {e.rows} | {cell(e)} |" for e in selected]
     text = "\n\n".join(out)

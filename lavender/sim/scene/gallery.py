@@ -27,9 +27,9 @@ __all__ = ["SCENES"]
 
 @named_scene()
 def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> None:
-    """Stack `n` equal boxes: 4 n contacts; the slowest mode of Gauss-Seidel is known in closed form.
+    """Stack `n` equal boxes, for which the slowest mode of Gauss-Seidel is known in closed form.
 
-    Six unit boxes: 7 bodies, 24 contacts, 24 rows without friction and 72 with.
+    Six boxes have 24 contacts with 72 rows, or 24 rows without friction. With the plane there are 7 bodies.
     """
     check_int("n", n, 1)
     size = check_float("size", size, above=0.0)
@@ -40,10 +40,11 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
 
 @named_scene()
 def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, gap: float = 0.05) -> None:
-    """Build rows of boxes, each one box shorter: coupling in two directions, redundant contact rows.
+    """Build a pyramid of rows of boxes, each one box shorter than the row below.
 
-    base 10: 55 boxes, 400 contacts; base 20: 210 boxes, 1,600 contacts. `gap` is the distance between neighbours as a
-    fraction of their size.
+    The contacts are coupled in two directions, and their rows are redundant. A base of 10 boxes gives 55 boxes and 400
+    contacts, a base of 20 gives 210 boxes and 1,600 contacts. `gap` is the distance between neighbours as a fraction of
+    their size.
     """
     check_int("base", base, 1)
     size, pitch = check_float("size", size, above=0.0), size * (1.0 + check_float("gap", gap, low=0.0))
@@ -58,7 +59,8 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
 def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
     """Build a card house: thin boxes lean against each other, edge on edge, and are held only by friction.
 
-    2 levels: 3 pairs, 1 card across, 7 cards; 3 levels: 15 cards. `lean` is the angle from the vertical.
+    Two levels have 7 cards: 3 pairs of leaning cards, and 1 card across two pairs. Three levels have 15 cards. `lean`
+    is the angle of a leaning card from the vertical.
     """
     check_int("levels", levels, 1)
     lean = check_float("lean", lean, low=0.05, high=0.7)
@@ -91,9 +93,10 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
 
 @named_scene()
 def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, walls: bool = True) -> None:
-    """Drop `n` bodies into a bin: many irregular, moving contacts; kind "spheres", "boxes" or "mixed".
+    """Drop `n` bodies into a bin, which gives many irregular, moving contacts.
 
-    1,000 spheres: some 2,500 contacts after they have settled. `seed` perturbs the initial positions.
+    `kind` is "spheres", "boxes" or "mixed". 1,000 spheres have about 2,500 contacts after they have settled. `seed`
+    perturbs the initial positions.
     """
     check_int("n", n, 1)
     size = check_float("size", size, above=0.0)
@@ -121,10 +124,10 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
 
 @named_scene()
 def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2) -> None:
-    """Build a chain of `n` links on ball joints, the last with mass `tip_mass`: only joints.
+    """Build a chain of `n` links on ball joints, with a last link of mass `tip_mass`.
 
-    A sweep propagates an impulse by one link. 3 n rows. `angle` is the initial angle of the straight chain from the
-    vertical.
+    The scene has 3 n joint rows and no contacts. One sweep propagates an impulse by one link. `angle` is the initial
+    angle of the straight chain from the vertical.
     """
     check_int("n", n, 1)
     length = check_float("length", length, above=0.0)
@@ -147,9 +150,9 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
 
 @named_scene()
 def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
-    """Build a bridge of `n` planks on hinges between two banks, with a box of mass `load`: joints and contacts.
+    """Build a bridge of `n` planks on hinges between two banks, with a box of mass `load` on it.
 
-    5 (n + 1) joint rows and the contacts of the load.
+    The scene has 5 (n + 1) joint rows and the contacts of the box.
     """
     check_int("n", n, 2)
     planks = []
@@ -167,9 +170,10 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 
 @named_scene()
 def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
-    """Stack boxes of mass 1, the top one `ratio` times as heavy: a sweep reduces the error to R/(1 + R) of it.
+    """Stack `n` boxes, the top box with the mass `ratio` and the others with mass 1.
 
-    n = 2: 8 contacts.
+    With two boxes and one contact per face, each sweep multiplies the error by R/(1 + R), where R is `ratio`. The scene
+    has four contacts per face, so two boxes have 8 contacts.
     """
     check_int("n", n, 2)
     ratio = check_float("ratio", ratio, above=0.0)
@@ -182,7 +186,7 @@ def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
 def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
     """Build a table with redundant legs: the distribution of the load is not unique, but the motion is.
 
-    9 legs: 10 bodies, 72 contacts. The legs form a square grid, row by row.
+    The scene with 9 legs has 10 bodies and 72 contacts. The legs form a square grid, row by row.
     """
     check_int("legs", legs, 3)
     side = int(np.ceil(np.sqrt(legs)))
@@ -197,9 +201,10 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
 
 @named_scene()
 def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
-    """Place a box on a slope of `angle`: it sticks if tan(angle) < friction, else accelerates by g (sin - mu cos).
+    """Place a box on a slope of the angle `angle`.
 
-    2 bodies, 4 contacts.
+    The box sticks if tan(angle) is smaller than the friction coefficient mu. Otherwise it slides with the acceleration
+    g (sin(angle) - mu cos(angle)). The scene has 2 bodies and 4 contacts.
     """
     angle, size = check_float("angle", angle, low=-1.5, high=1.5), check_float("size", size, above=0.0)
     turn = make_quaternion((0.0, 1.0, 0.0), angle)
@@ -210,9 +215,10 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
 
 @named_scene(patch_radius=0.1)
 def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
-    """Spin a ball on a plane: torsional friction slows it by the moment mu r N.
+    """Spin a ball on a plane, where torsional friction slows it.
 
-    2 bodies, 1 contact of 4 rows.
+    The moment of the friction is mu r N, with the friction coefficient mu, the patch radius r and the normal force N.
+    The scene has 2 bodies and 1 contact of 4 rows.
     """
     scene.add_plane()
     scene.add_sphere(
@@ -222,9 +228,10 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
 
 @named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
 def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6, gap: float = 0.01) -> None:
-    """Build Newton's cradle: `lifted` balls on strings are released; impacts follow one another and gain no energy.
+    """Build Newton's cradle of `n` balls on strings, of which `lifted` are released from the angle `angle`.
 
-    The strings have 2 n rows. `gap` separates the balls, so that impacts do not coincide.
+    The impacts follow one another, and the energy must not increase. The strings have 2 n rows. `gap` separates the
+    balls, so that impacts do not coincide.
     """
     check_int("n", n, 2)
     check_int("lifted", lifted, 0, n)
@@ -240,10 +247,10 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
 
 @named_scene()
 def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, tilt: float = 0.4) -> None:
-    """Build a closed loop of three bars and the ground on four oblique hinges: redundant rows.
+    """Build a closed loop of three bars and the ground on four oblique hinges, with redundant rows.
 
-    3 bodies, 20 rows (21 with a motor) on 18 degrees of freedom, of which one remains. `motor` is the speed of the
-    crank [rad/s], `torque` the largest torque of the motor [N m].
+    The 3 bodies have 18 degrees of freedom and 20 joint rows (21 with a motor), but one degree of freedom remains.
+    `motor` is the speed of the crank [rad/s], `torque` the largest torque of the motor [N m].
     """
     r = convert_to_rotation_matrix(make_quaternion((0.3, 0.2, 1.0), tilt))
     flat = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8], [2.4, 0.0, 1.6], [2.2, 0.0, 0.0]])
