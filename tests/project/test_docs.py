@@ -240,8 +240,8 @@ def test_the_paper_is_short_and_its_references_and_figures_exist():
 def test_the_chapter_names_functions_that_exist():
     text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
     for function, file in (
-        ("prepare", "engine/substep.pyx"),
-        ("finish", "engine/substep.pyx"),
+        ("prepare_substep", "engine/substep.pyx"),
+        ("finish_substep", "engine/substep.pyx"),
         ("relax_contact", "core/contact.pxd"),
     ):
         assert f" {function}(" in (ROOT / "lavender_ext" / file).read_text(encoding="utf-8")

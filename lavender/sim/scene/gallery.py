@@ -172,8 +172,8 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
     """Stack `n` boxes, the top box with the mass `ratio` and the others with mass 1.
 
-    With two boxes and one contact per face, each sweep multiplies the error by R/(1 + R), where R is `ratio`. The scene
-    has four contacts per face, so two boxes have 8 contacts.
+    With R = `ratio`, two boxes and one contact per face, each sweep multiplies the error by R/(1 + R). The scene has four
+    contacts per face, so two boxes have 8 contacts.
     """
     check_int("n", n, 2)
     ratio = check_float("ratio", ratio, above=0.0)
@@ -215,7 +215,7 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
 
 @named_scene(patch_radius=0.1)
 def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
-    """Spin a ball on a plane, where torsional friction slows it.
+    """Spin a ball on a plane with torsional friction.
 
     The moment of the friction is mu r N, with the friction coefficient mu, the patch radius r and the normal force N.
     The scene has 2 bodies and 1 contact of 4 rows.
