@@ -172,8 +172,8 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
     """Stack `n` boxes, the top box with the mass `ratio` and the others with mass 1.
 
-    With R = `ratio`, two boxes and one contact per face, each sweep multiplies the error by R/(1 + R). The scene has four
-    contacts per face, so two boxes have 8 contacts.
+    With R = `ratio`, two boxes and one contact per face, each sweep multiplies the error by R/(1 + R). The scene has
+    four contacts per face, so two boxes have 8 contacts.
     """
     check_int("n", n, 2)
     ratio = check_float("ratio", ratio, above=0.0)
