@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from lavender.judge.residuals import VERDICTS_OF_OLD
-from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_PROVEN
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_PROVEN, RENAMED_STATUSES
 
 # Statuses of a run that returned no solution, in addition to the statuses of a solve.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -381,7 +381,6 @@ RENAMED_FIELDS = {
     "plan.pass_limit": "sequence_time_limit",
 }
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
-RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 
 
