@@ -59,6 +59,8 @@ class CrossCheckRow:
     status : str
     relative, roundoff_floor : float or None
         Relative residual and its round-off floor, by the judge.
+    velocity : float or None, m/s
+        Velocity error of the worst row, by the judge.
     distance : float or None, sqrt J
         |Delta|_A to the reference.
     allowed : float or None, sqrt J
@@ -81,6 +83,7 @@ class CrossCheckRow:
     status: str = ""
     relative: float | None = None
     roundoff_floor: float | None = None
+    velocity: float | None = None
     distance: float | None = None
     allowed: float | None = None
     slack: float | None = None
@@ -158,13 +161,14 @@ class CrossCheck:
 
     def __str__(self) -> str:
         head = (
-            "solver", "verdict", "status", "relative", "floor", "distance", "allowed", "objective", "ms", "what ran",
+            "solver", "verdict", "status", "relative", "floor", "error [m/s]", "distance [√J]", "allowed [√J]",
+            "objective [J]", "time [ms]", "what ran",
         )  # fmt: skip
         body = [
             (
                 f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
-                _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.distance),
-                _format_number(r.allowed), _format_number(r.objective),
+                _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.velocity),
+                _format_number(r.distance), _format_number(r.allowed), _format_number(r.objective),
                 "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
             )
             for r in self.rows
@@ -207,7 +211,8 @@ def cross_check(
     solvers : names, optional
         Default: all available solvers that accept the problem.
     reference : str
-        Solver that is tried first as the reference.
+        Solver that is tried first as the reference. Under Coulomb's law it is not used; `reference_note` of the result
+        states the reason.
     tol : float
         Relative residual tolerance of the solvers.
     max_iter : int, optional
@@ -286,10 +291,13 @@ def _solve_reference(
 ) -> tuple[Solution | None, str | None, str]:
     """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
     if problem.law == "coulomb":
+        reason = reasons.get(first, "not registered")
+        if reason is None:
+            reason = "solves it, but several motions may be solutions, so a distance to one of them is not an error"
         return (
             None,
             None,
-            "Coulomb friction is not the optimality condition of a QP; solution.motion_error() measures its motion",
+            f"as Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
         )
     if not (problem.has_singular_program or problem.is_symmetric):
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
@@ -340,6 +348,7 @@ def compare_with_reference(
         "status": solution.status.name,
         "relative": r.relative,
         "roundoff_floor": r.roundoff_floor,
+        "velocity": r.velocity,
         "time": solution.setup_time + solution.solve_time,
         "solution": solution,
     }

@@ -85,6 +85,41 @@ def test_coulomb_and_asymmetric_have_no_reference():
     assert "not positive semidefinite" in table.reference_note
 
 
+def test_a_named_reference_under_coulombs_law_is_refused_with_its_reason_and_errors_are_in_metres_per_second():
+    coulomb = random_contact_problem(2, tangents=2, spin=False)
+    table = cross_check(coulomb, ["newton", "pgs"], "osqp", max_iter=20)
+    assert table.reference is None and "osqp takes laws linear, lcp" in table.reference_note
+    assert "no reference, as Coulomb friction is not the optimality condition of a QP" in str(table)
+    for row in table:
+        assert row.distance is None and row.allowed is None
+        by_row = lv.residual(coulomb, row.solution.impulse).velocity_by_row
+        by_contact = [np.linalg.norm(by_row[rows]) for _, rows in coulomb.cones.friction_components()]
+        normals_and_joints = np.delete(by_row, coulomb.cones.friction_rows)
+        assert row.velocity == pytest.approx(max(*by_contact, *normals_and_joints), rel=1e-12)
+        assert f"{row.velocity:.1e}" in str(table)
+    assert table["newton"].velocity < table["pgs"].velocity
+    table = cross_check(coulomb, ["newton"], "newton")
+    assert table.reference is None and "newton solves it, but several motions" in table.reference_note
+
+
+def test_relaxed_friction_is_compared_with_a_solver_of_cones_although_a_qp_solver_is_named():
+    problem = suite.case("granular(n=2, friction=cone)").problem
+    table = cross_check(problem, ["newton", "anderson"], "osqp", tol=1e-4)
+    assert table.reference == "clarabel_cone"
+    assert "osqp takes laws linear, lcp, not 'cone'" in table.reference_note
+    best = lv.solve(problem, "newton", tol=1e-12)
+    a = problem.delassus()
+    for row in table:
+        solution = row.solution
+        step = solution.impulse - best.impulse
+        assert row.distance == pytest.approx(np.sqrt(step @ a @ step), rel=0.05, abs=2e-9)
+        w = a @ solution.impulse - problem.b
+        exact = a @ best.impulse - problem.b
+        assert row.slack == pytest.approx(np.abs(w - exact).max(), rel=0.05, abs=2e-9)
+        assert row.distance <= row.allowed
+        assert row.velocity == solution.residual.velocity
+
+
 # -- claims ---------------------------------------------------------------------------------------------
 
 
