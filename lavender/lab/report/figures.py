@@ -32,6 +32,7 @@ class Curve:
     thin : whether this is a warm start, drawn thin
     steps : whether the line is a step function
     points : whether points are drawn without a line
+    unmarked : whether the line has no marks at its points
     low, high : edges of a band about the line, as `y`; empty without a band
     """
 
@@ -43,6 +44,7 @@ class Curve:
     thin: bool = False
     steps: bool = False
     points: bool = False
+    unmarked: bool = False
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
 

@@ -206,6 +206,16 @@ def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
     }
 
 
+def number_styles(names: Sequence[str]) -> dict[str, CurveStyle]:
+    """Return a style for each curve of a figure without solvers, in their order; eight names have different colours."""
+    return {
+        name: CurveStyle(
+            COLORS[i % len(COLORS)], DASHES[i // len(COLORS) % len(DASHES)], MARKERS[i % len(MARKERS)]
+        )
+        for i, name in enumerate(names)
+    }
+
+
 def plot_figure(
     figure: Figure, styles: Mapping[str, CurveStyle], size: tuple[float, float] = (7.6, 4.6)
 ) -> Any:
@@ -273,9 +283,11 @@ def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) ->
         line.set(
             color=style.color, linestyle="none" if c.points else style.dash, linewidth=0.8 if c.thin else 1.5
         )
-        if not (c.steps or has_bands or len(points) > MAX_MARKED_POINTS):
-            face = "none" if c.thin else style.color
-            line.set(marker=style.marker, markersize=4, markerfacecolor=face)
+        if not (c.steps or c.unmarked or has_bands or len(points) > MAX_MARKED_POINTS):
+            face = "none" if c.thin or c.points else style.color
+            line.set(
+                marker=style.marker, markersize=8 if c.points and len(c.x) == 1 else 4, markerfacecolor=face
+            )
         if band is not None:
             band.set(color=style.color, alpha=0.15, linewidth=0.0)
     axes.set_title(_shorten_label(figure.heading), fontsize=10, parse_math=False)
@@ -288,13 +300,8 @@ def _escape_dollars_in_legend(legend: Any) -> Any:
     return legend
 
 
-def save_figures(figures: Iterable[Figure], folder: Path, solvers: Iterable[str] = ()) -> None:
-    """Write each figure as NAME.svg and NAME.png.
-
-    `solvers` are solvers without a curve that get colours, too, so that colours agree with other figures.
-    """
-    figures = list(figures)
-    styles = assign_styles({*solvers, *(c.solver for figure in figures for c in figure.curves)})
+def save_figures(figures: Iterable[Figure], folder: Path, styles: Mapping[str, CurveStyle]) -> None:
+    """Write each figure as NAME.svg and NAME.png."""
     for figure in figures:
         canvas = plot_figure(figure, styles)
         path = make_folder(folder) / make_file_name(figure.name)
@@ -472,7 +479,7 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
             elif kind == "line":
                 if not c.points:
                     yield f'<path d="{data}"/>'
-                if c.points or not (c.steps or c.low or len(c.x) > MAX_PAGE_DOTS):
+                if c.points or not (c.unmarked or c.steps or c.low or len(c.x) > MAX_PAGE_DOTS):
                     dots = re.sub(r"[ML](\S+ \d+)", r"M\1h0", data)
                     yield f'<path class="d" d="{dots}"/>'
             yield from _rewrite_texts(group, "", _shorten_label(c.label, MAX_NAME_LENGTH))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lavender.io.stored import make_folder, write_text
 from lavender.lab.report.figures import Figure
 from lavender.lab.report.page import create_environment
-from lavender.lab.report.plotting import PAGE_WIDTH, plot_for_page, save_figures
+from lavender.lab.report.plotting import PAGE_WIDTH, number_styles, plot_for_page, save_figures
 from lavender.lab.report.table import Table
 from lavender.lab.report.terminal import print_table
 
@@ -65,11 +65,15 @@ class SummaryPage:
     stopped: bool = False
     warning: str = ""
 
+    @property
+    def _curve_names(self) -> list[str]:
+        """Names of the curves of all figures, in their order."""
+        curves = (c for part in self.sections for f in part.figures for c in f.curves)
+        return list(dict.fromkeys(c.solver for c in curves))
+
     def render_html(self) -> str:
         """Return one file without external parts; every text is escaped."""
-        names = list(
-            dict.fromkeys(c.solver for part in self.sections for f in part.figures for c in f.curves)
-        )
+        names = self._curve_names
         number = {name: i for i, name in enumerate(names)}
         shown = [part for part in self.sections if part.is_shown]
         sections = [
@@ -91,7 +95,8 @@ class SummaryPage:
         folder = make_folder(folder)
         write_text(folder / "index.html", self.render_html())
         write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
-        save_figures((f for part in self.sections for f in part.figures if f.curves), folder / "figures")
+        figures = (f for part in self.sections for f in part.figures if f.curves)
+        save_figures(figures, folder / "figures", number_styles(self._curve_names))
         return folder / "index.html"
 
     def print_short(self, console: Console) -> None:

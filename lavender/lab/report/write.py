@@ -11,7 +11,7 @@ from lavender.lab.report.figures import build_figures
 from lavender.lab.report.findings import Report
 from lavender.lab.report.markdown import summarise_report
 from lavender.lab.report.page import render_page
-from lavender.lab.report.plotting import save_figures
+from lavender.lab.report.plotting import assign_styles, save_figures
 
 
 def write(source: Records | Report, folder: str | Path, *, figures: bool = True) -> Path:
@@ -50,5 +50,6 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     write_text(index, render_page(report, drawn, saved=figures))
     write_text(folder / "summary.md", summarise_report(report))
     if figures:
-        save_figures(drawn, folder / "figures", report.all_records.solvers)
+        solvers = {*report.all_records.solvers, *(c.solver for figure in drawn for c in figure.curves)}
+        save_figures(drawn, folder / "figures", assign_styles(solvers))
     return index

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -204,21 +204,20 @@ class Tuning:
 
     @property
     def figure(self) -> Figure:
-        """Figure of error over time: every setting, the Pareto front, and the model's own setting."""
+        """Figure of error over time: every setting, a line through the Pareto front, and the model's own setting."""
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
             notes = tuple(m.setting.option_line for m in settings)
-            return replace(
-                Curve.from_points(
-                    name, name, [(m.mean_step_time, m.worst_error) for m in settings], notes=notes
-                ),
-                **more,
-            )
+            points = [(m.mean_step_time, m.worst_error) for m in settings]
+            return Curve.from_points(name, name, points, notes=notes, **more)
 
         solvers = dict.fromkeys(m.solver for m in self.measured)
         by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
         parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
-        parts += [curve("front", self.pareto_front), curve("as it is", [self.present_result], points=True)]
+        parts += [
+            curve("fastest for its error", self.pareto_front, unmarked=True),
+            curve("model's own setting", [self.present_result], points=True),
+        ]
         return Figure("time-and-error", Path(self.model).name, "time of a step [s]",
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 
@@ -251,7 +250,7 @@ class Tuning:
                      note=self._lines_note),
                 PageSection("Rows and contacts", sizes, short=2,
                      note="Rows and contacts of the steps with the model's own setting."),
-                PageSection("The front of time and error", [self._build_table_of_settings(shown)], figures, short=5),
+                PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures, short=5),
                 PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
                 PageSection("Every setting", [self._build_table_of_settings(every)],
