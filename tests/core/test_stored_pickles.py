@@ -13,7 +13,9 @@ from lavender.judge.solution import RENAMED_STATUSES, Status
 
 # One line for each commit: its hash, and the pickle (protocol 4, zlib, base85) of the list of all statuses, and of
 # solutions by `auto` (two rows), `newton` (a contact of bodies) and `lemke` (no solution exists).
-STORED = dict(line.split() for line in Path(__file__).with_name("stored_pickles.txt").read_text().splitlines())
+STORED = dict(
+    line.split() for line in Path(__file__).with_name("stored_pickles.txt").read_text().splitlines()
+)
 
 
 @pytest.fixture(params=sorted(STORED))
