@@ -134,7 +134,7 @@ def solve(
         In the backward pass: the differentiated impulses are not unique, or the gradient by a tensor that requires one
         does not exist (for example by J if rows share a load).
     """
-    arguments = [J, M, v_free, mu, target, compliance]
+    arguments: list[Any] = [J, M, v_free, mu, target, compliance]
     for i, (name, x) in enumerate(zip(ARGUMENTS, arguments, strict=True)):
         if x is None and i > 3:
             arguments[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)

@@ -72,8 +72,8 @@ class _LazyModule:
 
 
 if TYPE_CHECKING:
+    import scipy.linalg.lapack as lapack
     from scipy import sparse, spatial
-    from scipy.linalg import lapack
 else:
     sparse, spatial, lapack = map(_LazyModule, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
 

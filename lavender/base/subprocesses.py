@@ -122,7 +122,7 @@ class ProcessBackend:
             lifeline, self._lifeline = os.pipe()
             options = {"start_new_session": True, "pass_fds": (lifeline,)}
         try:
-            self.popen = subprocess.Popen(
+            self.popen = subprocess.Popen(  # pyright: ignore[reportAttributeAccessIssue]
                 [sys.executable, "-c", SERVE_SCRIPT, str(lifeline), str(self._memory)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

@@ -322,7 +322,7 @@ class Batch(Sequence[Problem]):
         block, k = (int(self.at[i, PLACE[name]]) for name in ("block", "blocks"))
         if self._has_shared_cones and mu is None:
             return self.cones
-        cones = self.cones._select_blocks(np.arange(block, block + k))
+        cones = self.cones._select_blocks(np.arange(block, block + k))  # pyright: ignore[reportArgumentType]
         if mu is None:
             return cones
         check_nonnegative_magnitudes("mu", mu, "-")

@@ -757,7 +757,7 @@ def check_on_random_problems(compare: Callable[[int, int], None]) -> None:
         deadline=None,
         database=None,
         derandomize=True,
-        suppress_health_check=list(hypothesis.HealthCheck),
+        suppress_health_check=list(hypothesis.HealthCheck),  # pyright: ignore[reportArgumentType]
     )
 
     def call(seed: int, m: int) -> None:

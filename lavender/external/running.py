@@ -363,8 +363,8 @@ def _redirect_streams_by_thread() -> Iterator[None]:
     """Redirect warnings, sys.stdout and sys.stderr of threads that run a backend."""
     with (
         warnings.catch_warnings(),
-        contextlib.redirect_stdout(_Stream(sys.stdout)),
-        contextlib.redirect_stderr(_Stream(sys.stderr)),
+        contextlib.redirect_stdout(_Stream(sys.stdout)),  # pyright: ignore[reportArgumentType]
+        contextlib.redirect_stderr(_Stream(sys.stderr)),  # pyright: ignore[reportArgumentType]
     ):
         show = warnings.showwarning
 

@@ -129,7 +129,7 @@ class BodyChain:
         axes, out = np.zeros((r.n_contacts, 3, 3)), {"jac": entries[: self.mj]}
         np.add.at(axes, (self.contact, self.axis), by_axis)
         out["normal"] = axes[:, 0] + np.cross(r.tangent, axes[:, 2])
-        out["tangent"] = axes[:, 1] + np.cross(axes[:, 2], r.normal)
+        out["tangent"] = axes[:, 1] + np.cross(axes[:, 2], r.normal)  # pyright: ignore[reportArgumentType]
         for name, x in (("arm_a", -np.cross(a, ang_a)), ("arm_b", np.cross(a, ang_b))):
             out[name] = np.zeros((r.n_contacts, 3))
             np.add.at(out[name], self.contact, np.where(is_angular, 0.0, x))

@@ -42,9 +42,10 @@ from lavender_ext.judge.measure import all_finite
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
 # Arrays that are read for each row, in addition to efc_J, and for each contact: type and shape.
-ROW_FIELDS: dict[str, Any] = dict.fromkeys(
-    ("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())
-) | dict.fromkeys(("efc_type", "efc_id"), (np.int32, ()))
+ROW_FIELDS: dict[str, Any] = {
+    **dict.fromkeys(("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())),
+    **dict.fromkeys(("efc_type", "efc_id"), (np.int32, ())),
+}
 CONTACT_FIELDS: dict[str, Any] = {
     "efc_address": (np.int32, ()), "dim": (np.int32, ()), "geom": (np.int32, (2,)), "friction": (float, (5,)),
 }  # fmt: skip

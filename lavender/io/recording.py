@@ -170,8 +170,10 @@ def record(
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*records, *left_out)))
     above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
     worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
-    verdict = UNCONVERGED if worst and worst["verdict"] == UNCONVERGED else f"is {WRONG}"
-    short = worst and f"{verdict}, {worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
+    short = ""
+    if worst is not None:
+        verdict = UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}"
+        short = f"{verdict}, {worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
     return Recording(
         folder=folder,
         files=tuple(line["file"] for line in records),
@@ -180,7 +182,7 @@ def record(
         above_floor=sum(line["verdict"] != AT_FLOOR for line in records),
         stopped=len(above_threshold),
         threshold=threshold,
-        worst=short or "",
+        worst=short,
     )
 
 

@@ -562,6 +562,6 @@ def _inf_norm(a: FloatArray) -> float:
 
 def _invert(a: FloatArray) -> FloatArray | None:
     try:
-        return np.asarray(np.linalg.inv(a))
+        return np.asarray(np.linalg.inv(a), float)
     except np.linalg.LinAlgError:
         return None

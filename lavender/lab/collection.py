@@ -111,7 +111,7 @@ def certify_problem(problem: Problem, name: str, group: str) -> Entry:
         condition=compute_condition_number(problem),
         degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
-    base = asdict(entry)
+    base: dict[str, Any] = asdict(entry)
     if answer.status is Status.INFEASIBLE and answer.claim_check == CONFIRMED:
         return Entry(**base | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
     try:

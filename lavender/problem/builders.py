@@ -242,8 +242,9 @@ class Builders(Operators):
         order, cones = convert_from_findex(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
             matrix = check_matrix(A, len(b), True)
-            if more.get("guess") is not None:
-                more["guess"] = as_array("guess", more["guess"], (len(b),), unit="N s")[order]
+            guess = more.get("guess")
+            if guess is not None:
+                more["guess"] = as_array("guess", guess, (len(b),), unit="N s")[order]
             return cls(b[order], cones, matrix[order][:, order], **more)
         return cls(b, cones, A, **more)
 

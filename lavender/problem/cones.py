@@ -516,11 +516,11 @@ class Cones:
         for i in np.flatnonzero(self.kind != ROW).tolist():
             first = self.ptr[i] + 1
             if tangents[i]:
-                yield i, np.arange(first, first + tangents[i])
+                yield i, np.arange(first, first + tangents[i])  # pyright: ignore[reportArgumentType, reportCallIssue]
             if apart[i] >= 0:
                 yield i, apart[i : i + 1]
             if rolling[i] >= 0:
-                yield i, np.arange(rolling[i], rolling[i] + 2)
+                yield i, np.arange(rolling[i], rolling[i] + 2)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def select(self, blocks: ArrayLike) -> Cones:
         """Return the selected blocks in the given order.

@@ -319,10 +319,10 @@ class Operators(ProblemData):
     @property
     def _start(self) -> FloatArray:
         """Pi(0) (m,) [N s], a cached array that callers must not change."""
-        derived = self.derived
-        if derived.start is None:
-            derived.start = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
-        return derived.start
+        start = self.derived.start
+        if start is None:
+            start = self.derived.start = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
+        return start
 
 
 def _mark_matrix_read_only(matrix: sp.csr_array) -> sp.csr_array:

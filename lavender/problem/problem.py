@@ -132,7 +132,7 @@ class Problem(Builders):
         if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
             before, impulse = previous[0], previous[0].impulse_array(previous[1])
         elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
-            before, impulse = previous.residual._problem, previous.impulse
+            before, impulse = previous.residual._problem, previous.impulse  # pyright: ignore[reportAttributeAccessIssue]
         else:
             raise InputError(
                 f"previous is a {type(previous).__name__}; a Solution, or (problem, impulse), is needed"

@@ -403,8 +403,8 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
     free = rows.m
     n_g, finite_rows = rows.add_matrix("G", G, "h", h)
     if low is not None and up is not None:
-        rows.add_bounds(low, lb, 1.0)
-        rows.add_bounds(up, ub, -1.0)
+        rows.add_bounds(low, lb, 1.0)  # pyright: ignore[reportArgumentType]
+        rows.add_bounds(up, ub, -1.0)  # pyright: ignore[reportArgumentType]
     jac, target = rows.stacked
     general = _factor_definite(lower, jac, q)
     return QuadraticProgram(
@@ -595,7 +595,7 @@ def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray
         return None
 
 
-def _has_empty_zero_diagonal_rows(lower: Compressed, is_zero: FloatArray) -> bool:
+def _has_empty_zero_diagonal_rows(lower: Compressed, is_zero: npt.NDArray[np.bool_]) -> bool:
     """Return whether rows and columns of P with a zero diagonal entry are empty; if they are not, P is indefinite."""
     ptr, idx, val = lower
     is_entry = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)

@@ -235,7 +235,7 @@ def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> Q
     nearest = Problem(qp.target, cones, generalized=general, copy=False)
     left = None if end == math.inf else max(end - perf_counter(), 1e-6)
     point = solve(nearest, tol=FEASIBLE_TOL, time_limit=left)
-    if point.status is Status.INFEASIBLE and point.claim_check == CONFIRMED:
+    if point.certificate is not None and point.status is Status.INFEASIBLE and point.claim_check == CONFIRMED:
         certificate = np.concatenate([np.zeros(len(unit)), point.certificate])
         return replace(answer, solution=replace(solution, certificate=certificate, message=point.message))
     if not (point.success or point.residual.at_floor):

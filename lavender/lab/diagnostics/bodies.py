@@ -143,7 +143,7 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
         )
 
 
-def _find_coincident(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _find_coincident(r: Rows, size: FloatArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Return two index arrays of contacts, each compared with the other contacts of its pair of bodies.
 
     The first holds contacts that are equal to another up to rounding, the second contacts that are opposite to another

@@ -88,9 +88,9 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     each = np.abs(target[c.ptr[full][:, None] + np.arange(3)])
     used, largest = each.any(axis=0), each.max(axis=1, initial=0.0)
     # Equal targets on tangents are a conveyor's and plausible.
-    if not used[:1].any() and used[1:].sum() == 1 and np.ptp(largest) > 0.01 * largest.max():
+    if not used[:1].any() and used[1:].sum() == 1 and np.ptp(largest) > 0.01 * largest.max():  # pyright: ignore[reportIndexIssue]
         reason = (
-            f"the {'second' if used[1] else 'third'} row of contacts has targets, the first never; the rows "
+            f"the {'second' if used[1] else 'third'} row of contacts has targets, the first never; the rows "  # pyright: ignore[reportIndexIssue]
         )
         yield make_diagnostic(p, "tangents first", reason + "of a contact are normal, tangent, tangent", full)
         return

@@ -81,7 +81,7 @@ class Island:
         out, speeds = list(w), []
         for first, part in self.sliding:
             z = [number(c) * w[index[r]] for r, c in zip(part.rows, part.coefficients, strict=True)]
-            s = sum((q * q for q in z), number(0.0)).sqrt() if len(z) > 1 else abs(z[0])
+            s = sum((q * q for q in z), number(0.0)).sqrt() if len(z) > 1 else abs(z[0])  # pyright: ignore[reportAttributeAccessIssue]
             speeds.append((w, s))
             normal = x[index[first]] if first in index else self.lam[first]
             for r, c in zip(part.rows, part.coefficients, strict=True):

@@ -161,7 +161,7 @@ class Search:
                 for r in range(first, end):
                     low, high, x = cones.lower[r], cones.upper[r], lam[r] - w[r] / d[r]
                     inside = (low < x or low == -math.inf) and (x < high or high == math.inf)
-                    out.append(_Block(i, r, None, inside, float(low if x <= low else high)))
+                    out.append(_Block(i, r, None, bool(inside), float(low if x <= low else high)))
                 continue
             own = components.get(i, [])
             speed = [
@@ -175,7 +175,7 @@ class Search:
                     (lam[r] - w[r] / step) / c
                     for r, c in zip(component.rows, component.coefficients, strict=True)
                 ]
-                component.slides = math.hypot(*y) > lam[first]
+                component.slides = bool(math.hypot(*y) > lam[first])
             out.append(block)
         return out
 

@@ -246,7 +246,7 @@ def _write_tables(report: Report) -> str:
         parts.append(format_latex(table_specs.tabulate_mean_times(by_tolerance), caption, f"means-{law}"))
     backends = table_specs.tabulate_backends(records)
     if backends.rows:
-        separate = ", ".join(sorted({s for row in backends.rows if excludes_setup(s := str(row[0]))}))
+        separate = ", ".join(sorted({s for row in backends.rows if excludes_setup(s := str(row[0]))}))  # pyright: ignore[reportArgumentType, reportCallIssue]
         caption = (
             f"Solvers of other packages, to {middle}, geometric means over the cases that each solves. Call: the time "
             "of the other tables. Own interface: its part in the package's own solve function, on converted data"

@@ -122,7 +122,7 @@ def place_tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
     """
     k = np.arange(n)
     contact_point = np.stack([0.0 * k, 0.0 * k, k], 1)
-    return contact_point + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), contact_point
+    return contact_point + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), contact_point  # pyright: ignore[reportReturnType]
 
 
 def add_horizontal_velocity(bodies: Bodies, speed: float, seed: int = 5) -> None:

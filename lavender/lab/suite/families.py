@@ -297,7 +297,7 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     link = np.stack(
         [0.8 + 0.0 * k, 0.3 * map_scalar(math.cos, k), -0.5 + 0.3 * map_scalar(math.sin, 1.7 * k)], 1
     )
-    problem = _build_chain(link, tip_mass, 0.02)
+    problem = _build_chain(link, tip_mass, 0.02)  # pyright: ignore[reportArgumentType]
     return Draft(
         problem,
         "bilateral and banded with little tension: easy for every solver that uses the band",
@@ -315,7 +315,7 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
     check_positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack([1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
-    problem = _build_chain(link, tip_mass, 1e-4)
+    problem = _build_chain(link, tip_mass, 1e-4)  # pyright: ignore[reportArgumentType]
     return Draft(
         problem,
         "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",

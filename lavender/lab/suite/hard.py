@@ -284,7 +284,7 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
 
     def closed_form() -> Reference:
         load = FALL_SPEED * kg * m / s * (n - np.arange(n))
-        return Reference(np.repeat(0.25 * load, 4), "closed form: the weight above", "slack")
+        return Reference(np.repeat(0.25 * load, 4), "closed form: the weight above", "slack")  # pyright: ignore[reportArgumentType]
 
     return Draft(problem, "reveals tolerances with a hidden unit", closed_form)
 

@@ -29,7 +29,7 @@ ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error ove
 # time.
 MAX_TIME_RATIO = 2.0
 #: Kinds of measurements: the error of a setting, and the times of its steps.
-MEASUREMENTS = ("judging", "timing")
+MEASUREMENTS: tuple[str, ...] = ("judging", "timing")
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class MujocoSetting(Setting):
 
 def _map_keywords_to_values(mj: Any, name: str) -> dict[str, Any]:
     """Return {MJCF keyword: MuJoCo's value} of an enumerated option."""
-    members = getattr(mj, f"mjt{name.capitalize()}").__members__
+    members: dict[str, Any] = getattr(mj, f"mjt{name.capitalize()}").__members__
     keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
     short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
     return {keywords.get(key, key.lower()): value for key, value in short}

@@ -277,7 +277,7 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         ):
             values[JOINT[name] : JOINT[name] + 3] = x
         side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
-        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.compute_norm(side)
+        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.compute_norm(side)  # pyright: ignore[reportArgumentType]
         values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
             j.length,
             j.hertz,

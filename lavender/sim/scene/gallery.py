@@ -261,7 +261,7 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
         d = corner[i + 1] - corner[i]
         long = compute_norm(d)
         x = d / long
-        q = convert_frame_to_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))
+        q = convert_frame_to_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))  # pyright: ignore[reportArgumentType]
         # The bars are offset along the axis, so that they do not overlap.
         position = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         bars.append(

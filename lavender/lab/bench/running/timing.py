@@ -386,7 +386,7 @@ def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
 def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     """Prepare and solve a task under its time limit."""
     fresh = replace(problem, copy=False)  # Nothing is derived yet: forming A is part of the set-up.
-    arguments = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
+    arguments: dict[str, Any] = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     # The runner has placed third-party solvers in a separate process already.
     prepared = prepare(fresh, task.solver, **{**arguments, **task.options})
     get_zero_impulse_reference(fresh)  # The judge's reference energies are computed before the clocks start.
