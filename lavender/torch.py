@@ -134,7 +134,7 @@ def solve(
         In the backward pass: the differentiated impulses are not unique, or the gradient by a tensor that requires one
         does not exist (for example by J if rows share a load).
     """
-    arguments: list[Any] = [J, M, v_free, mu, target, compliance]
+    arguments = [J, M, v_free, mu, target, compliance]
     for i, (name, x) in enumerate(zip(ARGUMENTS, arguments, strict=True)):
         if x is None and i > 3:
             arguments[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
@@ -142,9 +142,9 @@ def solve(
             raise InputError(
                 f"{name} is {type(x).__name__}; a tensor of float64 is needed: torch.as_tensor({name})"
             )
-        elif x.dtype != torch.float64 or x.device.type != "cpu":
+        elif x.dtype != torch.float64 or x.device.type != "cpu":  # pyright: ignore[reportOptionalMemberAccess]
             raise InputError(
-                f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
+                f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"  # pyright: ignore[reportOptionalMemberAccess]
             )
     infer_result_shapes(arguments)  # Raises InputError if the shapes disagree.
     arguments[1] = 0.5 * (arguments[1] + arguments[1].transpose(-1, -2))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,22 +111,21 @@ def certify_problem(problem: Problem, name: str, group: str) -> Entry:
         condition=compute_condition_number(problem),
         degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
-    base: dict[str, Any] = asdict(entry)
     if answer.status is Status.INFEASIBLE and answer.claim_check == CONFIRMED:
-        return Entry(**base | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
+        return replace(entry, known="infeasible", reason=answer.message.rpartition("; ")[2])
     try:
         found = prove(problem, answer)
     except CapabilityError as error:
-        return Entry(**base | {"reason": str(error)})
-    base |= {"reason": found.reason, "unique": found.unique}
+        return replace(entry, reason=str(error))
+    entry = replace(entry, reason=found.reason, unique=found.unique)
     if found.infeasible:
-        return Entry(**base | {"known": "infeasible"})
+        return replace(entry, known="infeasible")
     if found.proven:
-        base |= {"known": "enclosed", "radius": found.velocity_radius}
+        entry = replace(entry, known="enclosed", radius=found.velocity_radius)
     if problem.law == "coulomb" and not found.unique and problem.m <= MAX_SEARCH_ROWS:
         solutions = find_solutions(problem.disk)
-        base |= {"motions": len(solutions), "apart": solutions.spread, "unique": bool(solutions.unique)}
-    return Entry(**base)
+        entry = replace(entry, motions=len(solutions), apart=solutions.spread, unique=bool(solutions.unique))
+    return entry
 
 
 def count_sweeps_to_thousandth(problem: Problem) -> int | None:

@@ -167,8 +167,8 @@ class DecisionTree:
             cost = estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
             if self.deadline.has_passed(1e-9 * cost):
                 return False
-        self.states = states | self.prepare_newton("newton over rows")
-        return len(self.states) > len(states)
+        self.states = states | self.prepare_newton("newton over rows")  # pyright: ignore[reportAttributeAccessIssue]
+        return len(self.states) > len(states)  # pyright: ignore[reportArgumentType]
 
     @property
     def solver_costs(self) -> dict[str, float]:

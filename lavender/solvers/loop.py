@@ -214,7 +214,7 @@ class Loop:
         watch = getattr(state, "watch", None)
         if isinstance(watch, StoppingTest):
             # Use the state's own method if it has one, because its rows may have another order than the problem's.
-            getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)
+            getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)  # pyright: ignore[reportOptionalMemberAccess]
             return
         best = getattr(state, "best", None)
         if best is None or best[1] is None:

@@ -65,7 +65,7 @@ class BoundedRowForm:
                 fractions = [np.divide(x[j + t], s * x[j]) if s * x[j] > 0.0 else 0.0 for t, s in sides]
                 for signs in product((1.0, -1.0), repeat=len(sides)):
                     out.append(
-                        x[j] * np.prod([0.5 * (1.0 + a * b) for a, b in zip(signs, fractions, strict=True)])
+                        x[j] * np.prod([0.5 * (1.0 + a * b) for a, b in zip(signs, fractions, strict=True)])  # pyright: ignore[reportArgumentType, reportCallIssue]
                     )
             else:
                 out.append(x[j])

@@ -69,7 +69,7 @@ class SmallCall(Protocol):
 
     def solve_and_judge(
         self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = ...
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # pyright: ignore[reportReturnType]
         """Solve from `impulse` (m,) [N s] or from the zero impulse; return (judged result, work counts).
 
         The result is None if the call did not converge. `max_cost` [ns] limits the estimated cost of the call.
@@ -77,7 +77,7 @@ class SmallCall(Protocol):
 
     def make_claim(
         self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
-    ) -> Claim:
+    ) -> Claim:  # pyright: ignore[reportReturnType]
         """Build the claim of a call from its counts, its start (m,) and its final relative residual `after`."""
 
 
@@ -85,7 +85,7 @@ class State(Protocol):
     """State of one solve, as `Solver.prepare` returns it. Both attributes are optional, for resumable solvers."""
 
     @property
-    def best(self) -> tuple[float, FloatArray | None]:
+    def best(self) -> tuple[float, FloatArray | None]:  # pyright: ignore[reportReturnType]
         """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) at first.
 
         Solvers with a residual that may rise provide this attribute. Its impulse becomes the result if the last
@@ -93,7 +93,7 @@ class State(Protocol):
         """
 
     @property
-    def sweeps_per_decade(self) -> float:
+    def sweeps_per_decade(self) -> float:  # pyright: ignore[reportReturnType]
         """Number of iterations in which the relative residual fell tenfold, from the last checks; NaN if it did not.
 
         Solvers with iterations of equal cost provide this attribute.

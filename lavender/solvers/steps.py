@@ -167,7 +167,7 @@ class Iterations(Step):
             log.recorder.add_loop(self.name, log.iterations, begun, loop)
         self.store_iterate_in_log()
         if log.best > log.tol:
-            best, impulse = self.state.best
+            best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]
             if impulse is not None and best < log.best:
                 log.judge_and_store_best(impulse)
         return claim

@@ -16,6 +16,15 @@ from lavender.judge.solution import RENAMED_STATUSES, Status
 STORED = dict(
     line.split() for line in Path(__file__).with_name("stored_pickles.txt").read_text().splitlines()
 )
+BODY = lv.Rows(
+    [0.5], [np.eye(3) / 0.008], [[0.3, 0.0, -0.16, 0.0, 0.0, 0.0]], contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)],
+    tangent=[(1.0, 0.0, 0.0)], arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, -0.09)],
+)  # fmt: skip
+PROBLEMS = (
+    lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]),
+    lv.Problem.from_rows(BODY, target=0.6, mu=[0.5], key=[7]),
+    lv.Problem.lcp([[0.0]], [1.0]),
+)
 
 
 @pytest.fixture(params=sorted(STORED))
@@ -37,8 +46,8 @@ def test_solutions_have_all_fields_and_the_residual_of_todays_judge(stored):
     assert lcp.stages[0].solver == "direct"
     assert contact.state(0).name == "sticks"
     assert infeasible.certificate.tolist() == [1.0]
-    for solution in stored[1]:
-        again = lv.residual(solution.residual._problem, solution.impulse)
+    for solution, problem in zip(stored[1], PROBLEMS, strict=True):
+        again = lv.residual(problem, solution.impulse)
         assert np.array_equal(solution.residual.error, again.error)
         assert solution.residual.relative == again.relative
         assert solution.velocity_tol is None

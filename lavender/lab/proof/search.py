@@ -168,7 +168,7 @@ class Search:
                 math.hypot(*(c * w[r] for r, c in zip(p.rows, p.coefficients, strict=True))) for p in own
             ]
             shifted = w[first] - (sum(speed) if self.cone else 0.0)
-            block = _Block(i, first, own, lam[first] - shifted / d[first] > 0.0)
+            block = _Block(i, first, own, bool(lam[first] - shifted / d[first] > 0.0))
             for component in own:
                 step = max(d[r] for r in component.rows)
                 y = [

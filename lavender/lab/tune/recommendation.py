@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -208,8 +208,8 @@ class Tuning:
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
             notes = tuple(m.setting.option_line for m in settings)
-            points = [(m.mean_step_time, m.worst_error) for m in settings]
-            return Curve.from_points(name, name, points, notes=notes, **more)
+            places = [(m.mean_step_time, m.worst_error) for m in settings]
+            return replace(Curve.from_points(name, name, places, notes=notes), **more)
 
         solvers = dict.fromkeys(m.solver for m in self.measured)
         by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
