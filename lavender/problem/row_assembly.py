@@ -83,7 +83,7 @@ class Contact(NamedTuple):
 
 
 class RowAssembly:
-    """Bodies, blocks and keys of a step; equations (1) to (5) are those of `row_builder`.
+    """Bodies, blocks and keys of a step; `row_builder` defines equations (1) to (5).
 
     `RowBuilder` describes the arguments.
     """
