@@ -30,10 +30,10 @@ from lavender.solvers.registry import Cost, Solver
 
 MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
 OPTION_HELP = {
-    "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
+    "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default: by size, mass ratio and backend); not for programs",
-    "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
-    "settings": "mapping of the backend's options; they override the options that tol determines",
+    "unit_diagonal": "in the impulse form, scale A to a unit diagonal; default True",
+    "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
 
 

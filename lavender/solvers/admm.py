@@ -343,9 +343,9 @@ SPEC = SolverSpec(
     supports_rolling=True,
     max_iter=2000,
     options={
-        "memory": "iterations that Anderson mixing combines, 0 (none) to 16; default 10",
-        "relaxation": "alpha between 0 and 2; default 1.6",
+        "memory": "number of iterations that Anderson mixing combines, from 0 (no mixing) to 16; default 10",
+        "relaxation": "over-relaxation parameter alpha, between 0 and 2; default 1.6",
     },
-    summary="proximal splitting, factorisation reused, Anderson-mixed",
+    summary="proximal splitting (ADMM) with one factorisation and Anderson mixing",
     reference="Boyd et al. 2011; Carpentier, Le Lidec, Montaut 2024 (contact); Acary et al. 2011 (De Saxce shift)",
 )

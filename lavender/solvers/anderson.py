@@ -43,7 +43,7 @@ SPEC = SolverSpec(
     options={
         "sweep": SWEEP_OPTION,
         "convex": CONVEX_OPTION,
-        "memory": "sweeps that are combined, 1 to 16; default 5",
+        "memory": "number of sweeps that are combined, from 1 to 16; default 5",
     },
     summary="Anderson acceleration of Gauss-Seidel sweeps",
     reference="Anderson 1965; Walker, Ni 2011; Zhang, O'Donoghue, Boyd 2020 (safeguards)",

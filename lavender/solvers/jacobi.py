@@ -58,7 +58,7 @@ SPEC = SolverSpec(
     operators=frozenset({"matrix"}),
     supports_rolling=True,
     max_iter=1000,
-    options={"omega": "damping, default safe for symmetric positive semidefinite A"},
+    options={"omega": "damping factor; the default is safe for every symmetric positive semidefinite A"},
     summary="damped Jacobi, projected",
     reference="Saad 2003, section 4.1; Tasora, Anitescu 2011 for the projected form",
 )

@@ -471,7 +471,7 @@ SPEC = SolverSpec(
     small=NEWTON,
     resumable=False,
     max_iter=2500,
-    options={"form": "auto, velocity (bodies, joints) or impulse (rows): unknowns of the factorisation"},
+    options={"form": "unknowns: 'velocity' (of bodies), 'impulse' (of rows) or 'auto' (the default)"},
     summary="interior point, active-set polish and proximal semismooth Newton",
     reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991; "
     "De Saxce, Feng 1998",

@@ -54,8 +54,8 @@ SPEC = SolverSpec(
     options={
         "sweep": SWEEP_OPTION,
         "convex": CONVEX_OPTION,
-        "restart": "growth (beta > 1) or against (beta > 1 and the direction points against the sweep: much faster on "
-        "piles under Coulomb's law); default growth",
+        "restart": "'growth' (restart if the factor beta of the search direction exceeds 1; the default) or 'against' "
+        "(restart only if the direction also points against the sweep; much faster on piles under Coulomb's law)",
     },
     summary="nonlinear conjugate gradients over Gauss-Seidel sweeps",
     reference="Silcowitz-Hansen, Niebe, Erleben 2010, A nonsmooth nonlinear conjugate gradient method",

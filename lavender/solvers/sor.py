@@ -49,7 +49,7 @@ SPEC = SolverSpec(
     seed=True,
     max_iter=1000,
     bounded_hint=": 'pgs' is this method with bounds, at omega = 1",
-    options={"omega": "relaxation, 0 < omega < 2, default 1.5"},
+    options={"omega": "relaxation factor, 0 < omega < 2; default 1.5"},
     summary="successive over-relaxation of a linear system",
     reference="Young 1971, Iterative Solution of Large Linear Systems",
 )
