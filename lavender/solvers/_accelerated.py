@@ -31,7 +31,9 @@ ACCELERATED_PATIENCE = 500
 # are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570
 # rows of 17, which exceed the second-level cache.
 MAX_ENTRIES_PER_ROW, MAX_SWEPT_ENTRIES = 40, 600_000
-CONVEX_OPTION = "iterations under the cone law before those under Coulomb's law, for piles that stick; default 0"
+CONVEX_OPTION = (
+    "iterations under the cone law before those under Coulomb's law, for piles that stick; default 0"
+)
 SWEEP_OPTION = (
     "'pgs' or 'blocks' (each contact and joint is solved exactly); default 'pgs', under the cone law 'blocks'"
 )
