@@ -14,7 +14,9 @@ from lavender.base.errors import InputError
 
 
 def find_converter(like: Any) -> Callable[[np.ndarray], Any] | None:
-    """Return the function that converts NumPy arrays to the library, device and floating precision of `like`.
+    """Return the function that converts NumPy arrays to the library of `like`.
+
+    For PyTorch, JAX, CuPy and Warp, also to its device and floating precision; other libraries with DLPack get neither.
 
     Parameters
     ----------

@@ -13,9 +13,9 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
+    continue_after_closed_output,
     convert_gigabytes_to_bytes,
     exit_after_interrupt,
-    ignore_closed_output,
     is_option_set,
     limit_to_one_thread,
     make_console,
@@ -188,7 +188,7 @@ def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: S
 def show_page(page: SummaryPage, folder: Path) -> None:
     """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
-    with ignore_closed_output():
+    with continue_after_closed_output():
         page.print_short(make_console())
         print_escaped(f"\npage: {path}")
     if page.stopped:

@@ -179,7 +179,7 @@ def discard_output() -> None:
 
 
 @contextlib.contextmanager
-def ignore_closed_output() -> Iterator[None]:
+def continue_after_closed_output() -> Iterator[None]:
     """Discard output if its reader has closed the pipe, so that the command still writes its files."""
     try:
         yield

@@ -8,7 +8,12 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import ErrorReporter, ignore_closed_output, limit_to_one_thread, print_escaped
+from lavender.cli.options import (
+    ErrorReporter,
+    continue_after_closed_output,
+    limit_to_one_thread,
+    print_escaped,
+)
 
 
 @click.command()
@@ -34,7 +39,7 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
         require_python_flint()
 
     def print_line(text: str, style: str = "") -> None:
-        with ignore_closed_output():
+        with continue_after_closed_output():
             print_escaped(text, style=style)
 
     unmet, errors = False, ErrorReporter(partial(print_line, style="yellow"))

@@ -13,8 +13,8 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     PATH,
+    continue_after_closed_output,
     exit_after_interrupt,
-    ignore_closed_output,
     parse_parameters,
     print_escaped,
     reject_unused_options,
@@ -119,7 +119,7 @@ def run(
 
     def show(text: str) -> None:
         # On a terminal each line replaces the previous one.
-        with ignore_closed_output() if writes else contextlib.nullcontext():
+        with continue_after_closed_output() if writes else contextlib.nullcontext():
             click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
     scene_parameters = _collect_parameters(parameters, scene_options, velocity_tol)

@@ -21,7 +21,7 @@ from lavender.external.running import (
     Limits,
     capture_backend_output,
     clamp_tolerance,
-    copy_certificate,
+    copy_usable_certificate,
     keep_if_infeasibility_certificate,
     set_backend_options,
 )
@@ -295,8 +295,10 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         zeta=y[:r],
         xi=y[r:],
         work={"iterations": info.iter, "factorisations": 1 + info.rho_updates},
-        direction=copy_certificate(result.dual_inf_cert, qp.n),
-        contradiction=copy_certificate(None if result.prim_inf_cert is None else result.prim_inf_cert[:r], r),
+        direction=copy_usable_certificate(result.dual_inf_cert, qp.n),
+        contradiction=copy_usable_certificate(
+            None if result.prim_inf_cert is None else result.prim_inf_cert[:r], r
+        ),
     )
 
 
@@ -339,10 +341,10 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         zeta=y[:r],
         xi=y[r:],
         work={"iterations": solver.info.iter, "outer": solver.info.iter_out},
-        direction=copy_certificate(np.array(solver.dual_inf_certificate), qp.n)
+        direction=copy_usable_certificate(np.array(solver.dual_inf_certificate), qp.n)
         if "dual inf" in name
         else None,
-        contradiction=copy_certificate(np.array(solver.prim_inf_certificate)[:r], r)
+        contradiction=copy_usable_certificate(np.array(solver.prim_inf_certificate)[:r], r)
         if "primal inf" in name
         else None,
     )

@@ -116,7 +116,7 @@ def set_backend_options(options: Any, settings: Mapping[str, Any], name: str) ->
         setattr(options, key, value)
 
 
-def copy_certificate(y: Any, size: int) -> FloatArray | None:
+def copy_usable_certificate(y: Any, size: int) -> FloatArray | None:
     """Copy a backend's certificate of infeasibility; None if it has another size, is zero or is not finite."""
     if y is None or np.size(y) != size or not np.isfinite(y).all() or not np.any(y):
         return None

@@ -370,7 +370,7 @@ class _Worlds:
         return lower, upper, mu
 
     def _mark_block_begins(self) -> np.ndarray:
-        """Return a mask of the rows that begin a block; all kinematic rows of one joint form one block."""
+        """Return a mask of the rows that begin a block: all kinematic rows of a joint form one block."""
         begins = ~self.is_contact_row | self.begins_contact
         layout = self.layout
         if (layout.joint_rows != self.joints).any():

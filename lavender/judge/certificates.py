@@ -242,7 +242,7 @@ def _check_infeasibility_direction(problem: Problem, y: FloatArray, tol: float) 
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Proof(y, 0.0, "A^T y overflows")
     rounding_factor = min((len(rows) + 2.0) * UNIT_ROUNDOFF, MAX_ROUNDING_SLACK * gain / gain_size)
-    support, slack, rounding = _compute_support_function(problem, low, high, rounding_factor * size)
+    support, slack, rounding = _compute_support_and_slack(problem, low, high, rounding_factor * size)
     # (1)
     net, sum_rounding = gain - float(support.sum()), (len(rows) + 4.0) * UNIT_ROUNDOFF
     if not net > sum_rounding * (gain_size + float(np.abs(support).sum())):
@@ -324,7 +324,7 @@ def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, Float
     return normal, coefficient, np.array([np.hypot.reduce(x[rows]) for _, rows in components])
 
 
-def _compute_support_function(
+def _compute_support_and_slack(
     problem: Problem, low: FloatArray, high: FloatArray, rounding: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute support, slack and rounding of the slack, all (m,), for low <= z <= high.

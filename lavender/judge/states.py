@@ -133,7 +133,10 @@ class States(Sequence[State]):
 
     @property
     def boundary_fraction(self) -> float | None:
-        """Fraction of the blocks with an error bound that are at a boundary; None without bounds, 0 without blocks."""
+        """Fraction, of the blocks with an error bound, whose margin to the next state is within that bound.
+
+        None if no block has a bound; 0 if there are no blocks.
+        """
         known = self.tolerance < np.inf
         if not known.any():
             return None if len(known) else 0.0

@@ -293,7 +293,7 @@ def _write_states_before_steps(recorder: Recorder) -> None:
 
 
 def _judge_claims_of_step(step: EngineStep, result: ClaimComparison) -> tuple[Any, FloatArray]:
-    """Return outcome and velocity error of each world, and add wrong answers to the result's statistics."""
+    """Return outcome and velocity error of each world; add all wrong answers, claimed or not, to the statistics."""
     residuals = residual_many(step.batch, step.impulse, threshold=result.threshold, errors="status")
     velocity, verdicts, claimed = residuals.velocity_error, residuals.verdict, step.claims.converged
     is_right = (velocity <= result.threshold) | (verdicts == AT_FLOOR) | (step.batch.row_counts == 0)

@@ -139,7 +139,7 @@ class SlipExplanation:
         heads = ["contact", *(f"{v.name} [m/s]" for v in self.variants), "dominant cause"]
         rows = []
         for i, name in enumerate(self.contacts):
-            speeds = [_format_speed(v, i) for v in self.variants]
+            speeds = [_format_contact_speed(v, i) for v in self.variants]
             rows.append([name, *speeds, self.causes[i]])
         return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))
 
@@ -247,7 +247,7 @@ def explain_slip(
     )  # fmt: skip
     rigid = hard if law_note else hard.relaxed("coulomb")
     start = add("coulomb", rigid, start, law_note)
-    variants[-1] = replace(variants[-1], speed_range=_find_speed_range(rigid, slip))
+    variants[-1] = replace(variants[-1], speed_range=_find_speed_ranges_over_solutions(rigid, slip))
     names = tuple(measured.block_name(k) for k in blocks)
     return SlipExplanation(names, tuple(variants))
 
@@ -299,7 +299,7 @@ def _replace_soft_friction(problem: Problem) -> tuple[Problem, bool]:
     return replace(problem, b=b, compliance=soft), True
 
 
-def _find_speed_range(problem: Problem, slip: Any) -> FloatArray | None:
+def _find_speed_ranges_over_solutions(problem: Problem, slip: Any) -> FloatArray | None:
     """Return the smallest and largest speed of each contact over the solutions that are found, or None for one."""
     if problem.m > MAX_SEARCHED_ROWS:
         return None
@@ -310,7 +310,7 @@ def _find_speed_range(problem: Problem, slip: Any) -> FloatArray | None:
     return np.array([speeds.min(axis=0), speeds.max(axis=0)])
 
 
-def _format_speed(variant: SlipVariant, i: int) -> str:
+def _format_contact_speed(variant: SlipVariant, i: int) -> str:
     """Format a contact's speed, or its range over several solutions."""
     if variant.note.startswith("not solved") or variant.note == UNDEFINED_LAW:
         return NONE

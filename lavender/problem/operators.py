@@ -53,7 +53,7 @@ class Operators(ProblemData):
         return problem
 
     def _has_large_entries(self) -> bool:
-        """Return whether entries of J and M^-1 are so large that A_ii may exceed MAX_MAGNITUDE."""
+        """Return whether an entry of J, M^-1 or the compliance exceeds MAX_SAFE_ENTRY: A_ii may be too large."""
         if self.compliance is not None and max_abs_of_array(self.compliance) > MAX_SAFE_ENTRY:
             return True
         if self.generalized is not None:
@@ -347,11 +347,11 @@ def has_shifted_cholesky(a: Any) -> bool:
         except np.linalg.LinAlgError:
             return False
         return True
-    system, values = analyse_symmetric_matrix(a)
+    system, values = analyse_matrix_for_factorisation(a)
     return bool(system.factor(values, None, SEMIDEFINITE_SHIFT) == 0)
 
 
-def analyse_symmetric_matrix(a: Any) -> tuple[LinearSystem, FloatArray]:
+def analyse_matrix_for_factorisation(a: Any) -> tuple[LinearSystem, FloatArray]:
     """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
 
     Returns

@@ -508,7 +508,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             step = steps[stage.solver] = create_solver_step(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
-                if not can_factorise_later(
+                if not has_time_to_factorise_after(
                     tree,
                     steps,
                     min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds()),
@@ -537,7 +537,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         certify_infeasibility(log)
 
 
-def can_factorise_later(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
+def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
     """Return whether work of this cost [ns] leaves time for a factorising solver, or whether all of them have ended."""
     if "states" not in vars(tree):
         return tree.has_time("newton", tree.min_newton_cost, cost)

@@ -214,7 +214,10 @@ class _Run:
     # -- judging ---------------------------------------------------------------------------------
 
     def judge_iterate(self, x: FloatArray) -> float:
-        """Return the relative residual of x (m,), which must not change afterwards; the best x becomes the result."""
+        """Return the relative residual of x (m,), which must not change afterwards; keep the best x as the result.
+
+        No history is recorded.
+        """
         result = judge_impulse(self.problem, x)
         self.store_if_best(result)
         relative: float = result.relative

@@ -68,7 +68,7 @@ class Recorder:
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
         self.solve.recording_time += watch.elapsed_seconds
 
-    def add_loop(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
+    def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
         """Append the records of a loop that began at this number of iterations and this time [s]."""
         self.solve.recording_time += loop.recording_time
         self.append_later_records(

@@ -123,7 +123,7 @@ class SolveLog:
         return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
 
     def is_at_floor(self) -> bool:
-        """Return whether the best impulse is at the round-off floor."""
+        """Return whether rounding explains the best residual: no solver can be expected to reach the tolerance."""
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
         self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)

@@ -164,7 +164,7 @@ class Iterations(Step):
         begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.run_loop_iterations(loop, n)
         if log.recorder is not None:
-            log.recorder.add_loop(self.name, log.iterations, begun, loop)
+            log.recorder.append_loop_records(self.name, log.iterations, begun, loop)
         self.store_iterate_in_log()
         if log.best > log.tol:
             best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]

@@ -416,7 +416,10 @@ class Prepared:
         return partial(prepare, **self.options), (self._original, self.spec.name)
 
     def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
-        """Build the state, or update the state of a problem of the same structure, if its estimated time fits."""
+        """Build the state, or update it for a problem of the same structure, if its estimated time fits.
+
+        Otherwise, and after a breakdown, the state is None; after a breakdown, the next call builds it anew.
+        """
         if problem.metric.reference_energy < 0.0:
             get_zero_impulse_reference(
                 problem

@@ -53,7 +53,7 @@ cdef inline bint is_valid_bound(double x) noexcept nogil:
     return is_valid_number(x) or fabs(x) == INFINITY
 
 
-cdef inline int32_t find_bound_fault(const double* lower, const double* upper, int32_t j) noexcept nogil:
+cdef inline int32_t find_fault_of_row_bounds(const double* lower, const double* upper, int32_t j) noexcept nogil:
     """Return the fault of the bounds of row j; NULL: unbounded."""
     cdef double low = lower[j] if lower != NULL else -INFINITY, high = upper[j] if upper != NULL else INFINITY
     if not (low <= high and low < INFINITY and high > -INFINITY):
@@ -96,7 +96,7 @@ cdef inline int32_t find_block_fault(const blocks_t* p, int64_t* index) noexcept
         if fault != NO_FAULT:
             return fault
         for j in range(first, end if kind == ROW else first):
-            fault = find_bound_fault(p.lower, p.upper, j)
+            fault = find_fault_of_row_bounds(p.lower, p.upper, j)
             if fault != NO_FAULT:
                 index[0] = j
                 return fault

@@ -87,4 +87,4 @@ cdef class Method:
     cdef info_t info
     cdef method_t own
     cdef readonly int how       # the last outcome: one of `OUTCOMES`
-    cdef void reset_target(self, double tol, int budget) noexcept
+    cdef void set_target_and_clear_statistics(self, double tol, int budget) noexcept

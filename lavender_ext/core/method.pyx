@@ -13,7 +13,7 @@ cdef class Method:
     The data must know the judge's reference (the residual of the zero impulse) before a method starts.
     """
 
-    cdef void reset_target(self, double tol, int budget) noexcept:
+    cdef void set_target_and_clear_statistics(self, double tol, int budget) noexcept:
         """Reset the options to a relative residual of `tol` and `budget` units of work, and clear the statistics."""
         cdef options_t* o = &self.options
         o.tol, o.budget, o.proven, o.stop = tol, budget, 0, 0

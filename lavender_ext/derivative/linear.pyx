@@ -310,9 +310,12 @@ cdef class Linear:
         return self.at.regular
 
     def adjoint(self, velocity, impulse, slack):
-        """Return (q (m), s (m), f (n), c (m)) of (1), concatenated, from y (n,), c (m,) and x (m,), None meaning 0.
+        """Return (q (m), s (m), f (n), c (m)) of (1), concatenated, from velocity y (n,), impulse c (m,), slack x (m,).
 
-        A factor is required; n is 0 for (2). None is returned if y, c or x is not such an array or not finite; the caller
+        An argument that is None counts as 0.
+
+        A factor is required; n is 0 for (2). None is returned if all three are None, or if one is not such an array or
+        not finite; the caller
         then validates in detail.
         """
         cdef Py_buffer view

@@ -81,7 +81,7 @@ cdef class Driver(Method):
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
-        self.reset_target(tol, budget)
+        self.set_target_and_clear_statistics(tol, budget)
         if self.real is None:
             self.real = allocate_workspace(self.space.n_real * sizeof(double))
             self.space.real = <double*>self.real.at

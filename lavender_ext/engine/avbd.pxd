@@ -42,7 +42,7 @@ cdef inline double warm_start_fraction() noexcept nogil:
     return 0.99
 
 
-cdef inline double contact_constraint_error(const engine_t* e, int32_t c) noexcept nogil:
+cdef inline double compute_stabilised_gap(const engine_t* e, int32_t c) noexcept nogil:
     """Return C' [m] of a contact's normal, (1)."""
     return e.gap[c] if e.gap[c] > 0.0 else (1.0 - e.setting[S_HERTZ]) * e.gap[c]
 
@@ -58,7 +58,7 @@ cdef inline int32_t compute_contact_impulse(const engine_t* e, int32_t c, const 
     cdef const double* n = e.normal + 3 * c
     cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], friction_bound, tangential_impulse
     # normal impulse, clamped at 0
-    error[0] = contact_constraint_error(e, c) + contact_displacement_along(e, c, z, n, turn)
+    error[0] = compute_stabilised_gap(e, c) + contact_displacement_along(e, c, z, n, turn)
     p[0] = e.impulse[row] - kappa * error[0]
     if p[0] < 0.0:
         p[0] = 0.0
@@ -132,7 +132,7 @@ cdef inline int32_t add_newly_active_contact(const engine_t* e, int32_t c, int32
     cdef double j[6]
     cdef double turn[6]
     p = e.impulse[e.ptr[e.size[N_JOINT] + c]] - kappa * (
-        contact_constraint_error(e, c) + contact_displacement_along(e, c, z, e.normal + 3 * c, turn))
+        compute_stabilised_gap(e, c) + contact_displacement_along(e, c, z, e.normal + 3 * c, turn))
     form_contact_jacobian_of_body(e.normal + 3 * c, turn + 3 * side, 1.0 if side else -1.0, j)
     if p > 0.0 or p - kappa * (dot3(j, step) + dot3(j + 3, step + 3)) <= 0.0:
         return 0

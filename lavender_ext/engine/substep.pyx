@@ -145,7 +145,9 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
 
 cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
                     double* scratch) noexcept nogil:
-    """Run the sweeps, joints, then contacts; curve (sweeps + 1, 2) or NULL receives the error after each."""
+    """Run sweeps over joints, then contacts.
+
+    curve (sweeps + 1, 2) or NULL receives max |e_n| and E after sweep s in row s + 1; the caller writes row 0."""
     cdef int32_t s, mode
     cdef uint64_t rng
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)

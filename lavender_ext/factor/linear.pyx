@@ -334,7 +334,7 @@ cdef int32_t run_signal_handlers(void* at) noexcept with gil:
 
 
 cdef class PythonCalls:
-    """Calls of a factorisation to Python, also to the handlers of signals. The first exception ends the work, and is then raised."""
+    """Calls of a factorisation to Python, also to signal handlers. The first exception ends the work, and is then raised."""
 
     def __cinit__(self):
         self.interrupt = interrupt_t(<void*>self, run_signal_handlers, 0.0, 0)

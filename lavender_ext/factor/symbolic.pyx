@@ -13,7 +13,9 @@ from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimin
 
 cdef public int32_t lav_find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
                                         int32_t* first) noexcept nogil:
-    """Group consecutive rows with the same columns to vertices: write the vertex of each row and the first row of each.
+    """Group consecutive rows with the same columns to vertices: write the vertex of each row.
+
+    `first` (n + 1) receives the first row of each vertex, then n.
 
     Return the number of vertices.
     """

@@ -92,7 +92,7 @@ cdef inline void judge_csr_block(const blocks_t* p, const csr_t* a, int32_t i, c
         add_block_floor(p, i, lam, w, e, size, f)
 
 
-cdef inline void judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
+cdef inline void judge_impulse_over_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
     """Judge lam over A in compressed rows."""
     cdef int32_t island, k, end, n
@@ -308,7 +308,7 @@ cdef inline void add_contact_floor(const blocks_t* p, const rows_t* r, int32_t c
     add_block_floor(p, i, lam, w, e, size, f)
 
 
-cdef inline void judge_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
     """Judge lam over bodies; v (12 n) is scratch, (6 n) without a floor."""
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
@@ -349,7 +349,7 @@ cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t*
     score_with_floor(p, NULL, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
 
 
-cdef inline void judge_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+cdef inline void judge_impulse_over_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                double* x, bint floor, score_t* out) noexcept nogil:
     """Judge lam over J and M; x (n + m) is scratch, (n) without a floor."""
     compute_generalized_slack(p, g, lam, x, w)

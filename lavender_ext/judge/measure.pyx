@@ -15,7 +15,8 @@ from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
                                       count_islands, copy_score_without_islands, store_better_islands, store_better_start)
-from lavender_ext.judge.forms cimport judge_csr, compute_csr_slack, score_generalized_slack, judge_generalized, judge_bodies
+from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
+                                       judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (
     residual_above_floor, set_zero_impulse, relative_floor_of_score, relative_residual_of_score, count_judge_scratch,
 )
@@ -31,11 +32,11 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
                      score_t* out) noexcept nogil:
     """Compute slack w (m), error e (m) and their norms; scratch (`count_judge_scratch`; half of it over bodies without a floor)."""
     if v.g != NULL:
-        judge_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
+        judge_impulse_over_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
-        judge_bodies(&v.p, v.r, lam, w, e, scratch, floor, out)
+        judge_impulse_over_bodies(&v.p, v.r, lam, w, e, scratch, floor, out)
     else:
-        judge_csr(&v.p, v.a, lam, w, e, floor, out)
+        judge_impulse_over_csr(&v.p, v.a, lam, w, e, floor, out)
 
 
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,

@@ -173,7 +173,7 @@ cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, 
                 row[c % 6 + (0 if c // 6 == body[2 * i] else 6)] = y[q] / sqrt(p.d[j])
 
 
-cdef inline void bind_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
+cdef inline void bind_panel_and_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
                              bint lu, bint wide, int32_t* index, double* y, double* real) noexcept nogil:
     """Bind the panel (rows, 12), with these columns of each body, and the factor after `analyse_blocks`.
 
@@ -204,4 +204,4 @@ cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, co
         column[i] = i
     form_panel(p, r, x, panel)
     x += 10 * <int64_t>r.n_bodies
-    bind_factor(s, a, panel, column, 6, needs_lu(s, p), wide, index, x, x + 6 * <int64_t>r.n_bodies)
+    bind_panel_and_factor(s, a, panel, column, 6, needs_lu(s, p), wide, index, x, x + 6 * <int64_t>r.n_bodies)

@@ -431,7 +431,7 @@ cdef inline void save_path_point(newton_t* n) noexcept nogil:
 
 
 cdef inline bint return_to_saved_path_point(newton_t* n) noexcept nogil:
-    """Return to the newest saved point with half the step and a smaller tolerance; return False if no point is saved."""
+    """Return to the newest saved point and remove it; halve its step and divide the tolerance by 10. False if none is saved."""
     cdef path_t* x = &n.path
     cdef double* z = x.saved_z[0]
     cdef double* tangent = x.saved_t[0]

@@ -20,7 +20,7 @@ from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide
 from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, PythonCalls, analyse_blocks, analyse_dense,
                                          block_factor_index_size, block_factor_size, block_pattern_index_size)
-from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_factor, bind_pattern_workspace,
+from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_panel_and_factor, bind_pattern_workspace,
                                          body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
                                          index_workspace_size, order_bodies, order_elements,
                                          order_index_size, pattern_t)
@@ -388,7 +388,7 @@ cdef class Solve(Method):
         a.group = <int32_t*>get_data_pointer(own) + block_factor_index_size(a.n, layout.s)
         values = np.empty(factored + block_factor_size(f, lu) + 1)
         self.held += [panel, layout, own, values]
-        bind_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
+        bind_panel_and_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
                     <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
                     <double*>get_data_pointer(values) + factored)
         f.factor.interrupt = &self.python.interrupt
@@ -397,7 +397,7 @@ cdef class Solve(Method):
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (rows,), to a relative residual of tol, with `budget` factorisations."""
-        self.reset_target(tol, budget)
+        self.set_target_and_clear_statistics(tol, budget)
         with nogil:
             begin(self.n, &self.options, &impulse[0])
 

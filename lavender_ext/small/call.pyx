@@ -246,7 +246,10 @@ cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int
 
 cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
                          double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
-    """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code."""
+    """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code.
+
+    both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`); the call ends at an
+    estimated cost of `max_cost` [ns]."""
     cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
     memset(counts, 0, N_COUNTS * sizeof(int32_t))
     if not grow_workspace_to(&workspaces.work, 0, scratch):

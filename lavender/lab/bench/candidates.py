@@ -27,7 +27,7 @@ MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at 
 TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
-def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallSpec]:
+def choose_calls_to_time(records: Records, times: Sequence[float] = ()) -> list[CallSpec]:
     """List the calls to time alternately.
 
     These are calls to the middle tolerance for single problems and for a batch, and calls with a time limit for each
@@ -110,4 +110,4 @@ def time_candidates(
     remaining = drop_cases_solved_at_zero(records)
     if not len(remaining) or plan.velocity_tolerances:
         return records
-    return time_alternately(cases, list_candidates(remaining, plan.times), records, plan, store, **more)
+    return time_alternately(cases, choose_calls_to_time(remaining, plan.times), records, plan, store, **more)

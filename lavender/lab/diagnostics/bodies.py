@@ -93,7 +93,7 @@ def are_normals_first(p: Problem) -> bool:
 
 
 def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
-    """Yield diagnostics about normals, arms and centres that contradict each other."""
+    """Yield diagnostics about tangents before normals, normals from b to a, duplicates, and contradicting arms."""
     r = reconstruct_bodies(p)
     if r is None or not r.n_contacts:
         return

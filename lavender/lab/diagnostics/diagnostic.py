@@ -44,7 +44,7 @@ class Diagnostic:
 
 
 def make_diagnostic(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Diagnostic:
-    """Build a diagnostic with the names of the blocks concerned; empty `blocks` means the whole problem."""
+    """Build a diagnostic with the names of the first 100 of these blocks; no block means the whole problem."""
     at = tuple(int(i) for i in np.unique(np.asarray(blocks, int)))
     names = tuple(problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in at[:100])
     return Diagnostic(kind, reason, at, names, data)

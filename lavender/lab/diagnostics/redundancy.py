@@ -26,7 +26,7 @@ from lavender.base.lazy_import import lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.problem.operators import analyse_symmetric_matrix, has_shifted_cholesky
+from lavender.problem.operators import analyse_matrix_for_factorisation, has_shifted_cholesky
 from lavender.problem.ordering import group_rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
@@ -348,7 +348,7 @@ def _find_dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> In
     Products with random z show in which rows S is not zero; their block of S is factored with pivoting.
     """
     n = a.shape[0]
-    system, values = analyse_symmetric_matrix(a)
+    system, values = analyse_matrix_for_factorisation(a)
 
     def product(z: FloatArray) -> FloatArray:
         y = a @ z

@@ -102,7 +102,7 @@ class MotionError:
         return self._name_body(self.body)
 
     @property
-    def _row_unit(self) -> str:
+    def _worst_row_unit(self) -> str:
         """Unit of `rows`: " m/s" or " rad/s" by the kind of the row, or " m/s or rad/s" if bodies are not known."""
         if self._problem is None or self._problem.rows is None or self.row < 0:
             return " m/s or rad/s"
@@ -130,7 +130,7 @@ class MotionError:
             ("energy", self.energy if self.kinetic is None else None, " sqrt(J)", ""),
             ("speed", self.speed, " m/s or rad/s" if is_generalized else " m/s", self.body_name),
             ("spin", self.spin, " rad/s", self._name_body(self.spin_body)),
-            ("rows", self.rows, self._row_unit, self.row_name),
+            ("rows", self.rows, self._worst_row_unit, self.row_name),
             ("bound", self.bound, " sqrt(J)", ""),
             ("bound_speed", self.bound_speed if self.bound is not None else None, " m/s", ""),
         )

@@ -102,7 +102,7 @@ class Operator:
 
 
 def make_operator(problem: Problem) -> Operator:
-    """Build the operator of a problem; O(nnz), and M^-1 by trees in generalised coordinates."""
+    """Build the operator of a problem by its form: A, J and M^-1 of bodies, or J and M in generalised coordinates."""
     if problem.rows is not None:
         return _Bodies(problem)
     return Operator(problem) if problem.generalized is None else _Velocities(problem)

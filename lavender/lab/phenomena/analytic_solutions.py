@@ -24,7 +24,7 @@ def compute_period_of_pendulum(inertia: float, torque: float, angle: float) -> f
     return 4.0 * math.sqrt(inertia / torque) * float(ellipk(math.sin(0.5 * angle) ** 2))
 
 
-def compute_period_of_flip(inertia: FloatArray, omega: FloatArray) -> float:
+def compute_period_of_free_rotation(inertia: FloatArray, omega: FloatArray) -> float:
     """Compute the period [s] after which the angular velocity of a free body repeats, in the body's axes.
 
     Euler's equations with energy E and momentum L have Jacobi's elliptic functions as solutions (Landau, Lifshitz,
@@ -64,7 +64,7 @@ def compute_tipping_time(width: float, height: float, slope: float, angle: float
     return float(0.5 * math.sqrt(angle) * (weights * 2.0 * u / speed).sum())
 
 
-def compute_arch_thrust_bounds(stones: int, lean: float, thick: float) -> tuple[float, float]:
+def compute_pointed_arch_thrust_bounds(stones: int, lean: float, thick: float) -> tuple[float, float]:
     """Compute the smallest and the largest thrust H at the apex of a pointed arch that stands, in weights of a stone.
 
     Each leg consists of `stones` blocks of length 1 and thickness t = `thick` on a skewback, at a = `lean` [rad] from
@@ -84,10 +84,10 @@ def compute_arch_thrust_bounds(stones: int, lean: float, thick: float) -> tuple[
 
 
 def compute_min_arch_thickness(stones: int, lean: float) -> float:
-    """Compute the thickness [stone lengths] below which no thrust holds the arch (`compute_arch_thrust_bounds`)."""
+    """Compute the thickness [stone lengths] below which no thrust holds the pointed arch."""
     low, high = 0.0, float(stones)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        smallest_thrust, largest_thrust = compute_arch_thrust_bounds(stones, lean, middle)
+        smallest_thrust, largest_thrust = compute_pointed_arch_thrust_bounds(stones, lean, middle)
         low, high = (low, middle) if smallest_thrust <= largest_thrust else (middle, high)
     return high

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.lab.phenomena.analytic_solutions import compute_period_of_flip, compute_period_of_pendulum
+from lavender.lab.phenomena.analytic_solutions import (
+    compute_period_of_free_rotation,
+    compute_period_of_pendulum,
+)
 from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantity, Track, Values
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import make_quaternion
@@ -78,7 +81,7 @@ def get_moments_of_inertia() -> FloatArray:
 
 def compute_flip_period(p: Values) -> float:
     """Compute the exact period [s] in which the free body flips over and back."""
-    return compute_period_of_flip(get_moments_of_inertia(), np.array(get_initial_spin(p)))
+    return compute_period_of_free_rotation(get_moments_of_inertia(), np.array(get_initial_spin(p)))
 
 
 def _measure_free_rotation_errors(p: Values, track: Track) -> dict[str, float]:

@@ -186,7 +186,7 @@ STACK_PHENOMENA = (
         why="it stands by thrust alone: the contacts of a whole structure must be correct at once",
         truth=(
             "limit analysis: it stands if one thrust keeps the resultant inside every joint "
-            "(`analytic_solutions.compute_arch_thrust_bounds`); the thinnest such arch is the unit of thickness"
+            "(`analytic_solutions.compute_pointed_arch_thrust_bounds`); the thinnest such arch is the unit of thickness"
         ),
         parameters={
             "thickness": Parameter(1.1, 0.5, 2.0, "over the thinnest that stands [-]"),

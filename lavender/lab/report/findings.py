@@ -84,7 +84,10 @@ class Report:
 
     @cached_property
     def load_summary(self) -> str:
-        """Sentences on the load during the runs, with numbers; empty without times or loads."""
+        """Sentences on the mean and largest load of the newest run, and on runs with more processes than cores.
+
+        Empty without times or loads.
+        """
         if self.is_campaign or not len(self.newest_run):
             return ""
         (run,) = self.newest_run.runs.values()

@@ -93,8 +93,11 @@ def label_axis(
     return title.replace("[s]", f"[{unit}]"), [write(tick / scale) for tick in ticks]
 
 
-def _mask_points_outside_axes(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
-    """Return the points of a curve; points outside the axes are nan, so that the line has a gap there."""
+def _mask_undrawable_points(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
+    """Return the points of a curve; points that the axes cannot show become nan, so that the line has a gap there.
+
+    These are points that are not finite, or not positive on a logarithmic axis.
+    """
     points = []
     for x, y in zip(curve.x, curve.y, strict=True):
         is_shown = all(
@@ -109,7 +112,7 @@ def _draw_figure(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[floa
 
     Return (curve, points, line, band) for each curve that has a point; the band is None if the curve has no band.
     """
-    curves = [(c, points) for c in figure.curves for points in [_mask_points_outside_axes(c, figure)]]
+    curves = [(c, points) for c in figure.curves for points in [_mask_undrawable_points(c, figure)]]
     curves = [(c, points) for c, points in curves if any(not math.isnan(y) for _, y in points)]
     drawn = [p for _, points in curves for p in points if not math.isnan(p[1])]
     bands = [v for c, _ in curves for v in (*c.low, *c.high) if math.isfinite(v)]

@@ -70,7 +70,10 @@ class Section:
 
 
 def list_sections(report: Report) -> list[Section]:
-    """List the tables of a report with their headings, from the recommendations to changes since an earlier report."""
+    """List the tables of a report with their headings, from the recommendations to changes since an earlier report.
+
+    An empty table is left out, unless its section has a text for this case.
+    """
     records, tolerances = report.ranked_records, report.tolerances
     moved = "largest velocity error of a body"
     if report.is_campaign:
@@ -357,7 +360,7 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
 
 
 def tabulate_motion_errors(report: Report) -> Table:
-    """Tabulate the time to each motion error, and the smallest motion error with its bound, by case and solver."""
+    """Tabulate, by case and solver, the time to each motion error and the smallest [m/s], with its bound [sqrt J]."""
     tolerances = report.velocity_tolerances
     rows: Rows = []
     for m in statistics.summarize_runs_by_case(report.records_by_motion_error, tolerances):
@@ -538,7 +541,7 @@ def tabulate_backends(records: Records) -> Table:
 
 
 def tabulate_residuals_by_order(spreads: Sequence[statistics.Spread]) -> Table:
-    """Tabulate residuals after one budget in several orders of the blocks."""
+    """Tabulate the worst over the best residual in several orders of the blocks, by case and solver."""
     rows: Rows = [
         [
             s.case, s.solver, str(s.budget), format_ratio(s.worst_to_best_ratio),

@@ -84,7 +84,7 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
 
     The numbers depend on the versions of MuJoCo and of the package (`get_package_versions`).
     """
-    path, known = _find_model_file(package, model), tuple(MUJOCO_CONES)
+    path, known = _get_model_path(package, model), tuple(MUJOCO_CONES)
     check_name("cone", cone, known)
     import mujoco
 
@@ -125,7 +125,7 @@ def get_package_versions(package: str) -> str:
     return ", ".join(f"{name} {version(name)}" for name in ("mujoco", package)) if package else ""
 
 
-def _find_model_file(package: str, model: str) -> Path:
+def _get_model_path(package: str, model: str) -> Path:
     """Return the path of a model file, or raise SolverUnavailable or UnknownName."""
     check_name("package of models", package, MODEL_FOLDERS)
     spec, message = find_spec(package), explain_missing_packages(package)

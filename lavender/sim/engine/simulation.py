@@ -205,7 +205,7 @@ class Simulation(Stepping):
 
     @run_exclusively
     def start_film(self) -> Film:
-        """Return a new film with the present poses; every step adds a frame until `end_film`."""
+        """Return a new film with the present poses; every step adds a frame until `end_film`. Earlier films go on."""
         film = Film(make_film_header(self.scene, self.state))
         film.add(self.time, self._make_observation())
         self.films.append(film)

@@ -253,7 +253,7 @@ def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool
         a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
         a["dyn"][i] = -1
         if not b.is_static:
-            inverse = arithmetic.invert_definite_matrix(b.inertia)
+            inverse = arithmetic.invert_definite_3x3(b.inertia)
             a["dyn"][i] = dynamic
             a["body_of"][dynamic] = i
             a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass

@@ -71,7 +71,7 @@ def rotate_vector_back(r: FloatArray, x: FloatArray) -> FloatArray:
     return rotate_vector(r.T, x)
 
 
-def invert_definite_matrix(x: FloatArray) -> FloatArray | None:
+def invert_definite_3x3(x: FloatArray) -> FloatArray | None:
     """Return the inverse (3, 3) of a symmetric positive definite X = L D L^T, or None if a pivot is not positive."""
     (a, _, _), (b, d, _), (c, e, f) = x.tolist()
     if not a > 0.0:

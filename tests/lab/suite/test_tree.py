@@ -16,7 +16,7 @@ from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers import costs
-from lavender.solvers.auto import DecisionTree, can_factorise_later, solve
+from lavender.solvers.auto import DecisionTree, has_time_to_factorise_after, solve
 from lavender.solvers.certify import certify_infeasibility
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, Newton, Step, Sweeps
@@ -103,13 +103,13 @@ def test_sweeps_use_up_a_limit_where_who_factors_had_no_time_and_not_where_they_
     get_zero_impulse_reference(problem)
     tree = DecisionTree(problem, Deadline(60.0))
     steps = {name: Newton(name, SolveLog(problem, 1e-6, 10)) for name in tree.states}
-    assert steps and can_factorise_later(tree, steps, 1.0)
+    assert steps and has_time_to_factorise_after(tree, steps, 1.0)
     for step in steps.values():
         step.over = True
-    assert can_factorise_later(tree, steps, 1.0)
+    assert has_time_to_factorise_after(tree, steps, 1.0)
     for step in steps.values():
         step.late = True
-    assert not can_factorise_later(tree, steps, 1.0)
+    assert not has_time_to_factorise_after(tree, steps, 1.0)
 
 
 def test_turns_end_where_nobody_gains():

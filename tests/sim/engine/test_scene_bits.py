@@ -77,7 +77,7 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     for _ in range(300):
         g = rng.normal(size=(3, 3))
         x = g @ g.T + 10.0 ** rng.uniform(-6, 0) * np.eye(3)
-        found = arithmetic.invert_definite_matrix(x)
+        found = arithmetic.invert_definite_3x3(x)
         assert np.array_equal(found, found.T)
         # an elimination without pivots is backward stable on definite matrices: some ulp times the condition
         assert np.abs(found @ x - np.eye(3)).max() <= 1e-14 * np.linalg.cond(x)
@@ -102,7 +102,7 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     "x", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3)), np.diag([np.nan, 1, 1])]
 )
 def test_what_has_no_inverse_says_so(x):
-    assert arithmetic.invert_definite_matrix(x) is None
+    assert arithmetic.invert_definite_3x3(x) is None
 
 
 def test_half_turns_have_quaternions():
