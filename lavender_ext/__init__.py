@@ -1,1 +1,1 @@
-"""Compiled kernels of lavender: raw arrays in, numbers out. Nothing here imports lavender."""
+"""Compiled kernels of lavender: they read and write plain arrays. No module of this package imports lavender."""

@@ -37,7 +37,7 @@ def directives(*, debug: bool = False) -> dict[str, Any]:
         "initializedcheck": debug,
         "cdivision": True,
         "embedsignature": True,
-        "emit_code_comments": False,  # C code without its Cython lines is a third shorter
-        "auto_pickle": False,  # classes that can be copied define it themselves (lavender.problem, lavender.judge)
+        "emit_code_comments": False,  # C code is a third shorter without the Cython lines as comments.
+        "auto_pickle": False,  # Classes of lavender.problem and lavender.judge define their own pickling.
         "freethreading_compatible": True,
     }

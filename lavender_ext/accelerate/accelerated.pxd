@@ -1,4 +1,4 @@
-"""Accelerated sweeps: their data, and their workspace size, start and step for any host; compiled once, in `accelerated.pyx`."""
+"""Declarations of accelerated sweeps (`accelerated.pyx`): data, workspace size, start and step, usable without Python."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t
@@ -6,14 +6,14 @@ from lavender_ext.sweep.serial cimport Sweeps, sweep_context_t, sweep_run_t
 
 
 cdef struct acceleration_t:
-    sweep_context_t* sweeps     # sweeps of the iteration; prepared blocks are read if sweeps are exact or under the cone law
+    sweep_context_t* sweeps     # the sweep S; it reads prepared blocks if blocks are solved exactly or under the cone law
     blocks_t cone               # the blocks under the cone law
     int32_t convex              # number of iterations at the beginning that use the cone law
     int32_t iterations          # number of iterations done so far
     int32_t memory
-    int32_t keeps               # nncg: with beta > 1, p is dropped only if it points against the sweep
-    double* control             # (CONTROL) indices of accelerate/mixing.pxd, or of accelerated.pyx for nncg
-    double* gram                # (MAX_MEMORY, MAX_MEMORY) products of differences, for anderson
+    int32_t keeps               # nncg with beta > 1: 1 to drop p only if it points against the sweep, (3) of accelerated.pyx
+    double* control             # (CONTROL) state, by the indices of accelerate/mixing.pxd, or of accelerated.pyx for nncg
+    double* gram                # (MAX_MEMORY, MAX_MEMORY) inner products of the differences of f in (2), for anderson
     double* work                # workspace: 3 (m + n_v) doubles for nncg, (4 + 2 memory) m for anderson
 
 

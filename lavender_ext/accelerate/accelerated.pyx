@@ -6,7 +6,8 @@
     anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
-D = diag d, so that both methods use the energy norm. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pyx), over A
+nncg is the nonsmooth nonlinear conjugate gradient method, anderson is Anderson mixing. D = diag d, with which both methods use
+the energy norm. S is a sweep of projected Gauss-Seidel or of exact blocks (local/gauss_seidel.pyx), over A
 in compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam. With the symmetric order S
 is a sweep followed by the same sweep backwards. The returned iterate is always the result y of a sweep. All sums have a fixed
 order.
@@ -40,7 +41,7 @@ cdef enum:                      # indices in `control` of nncg
 
 
 cdef inline void sweep_once_in_order(acceleration_t* c, double* lam, int32_t first) noexcept nogil:
-    """Sweep once, or with the symmetric order forwards and backwards."""
+    """Apply S to lam (m) in place: one sweep, or with the symmetric order one forwards and one backwards."""
     cdef const blocks_t* p = c.sweeps.blocks
     cdef bint exact = c.sweeps.exact
     cdef int32_t k
@@ -52,7 +53,7 @@ cdef inline void sweep_once_in_order(acceleration_t* c, double* lam, int32_t fir
 
 
 cdef inline void project_block_to_bounds(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
-    """Project lam of block i to its bounds, normal first."""
+    """Project the impulses of block i in lam (m) to their bounds, the normal before the friction that it bounds."""
     cdef int32_t j = p.ptr[i], g, k
     cdef double bound, size
     cdef friction_components_t q
@@ -72,7 +73,7 @@ cdef inline void project_block_to_bounds(const blocks_t* p, int32_t i, double* l
 
 
 cdef inline double weighted_dot(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
-    """Return x.D y."""
+    """Return x.D y for x, y and the diagonal d of D (m)."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= m:
@@ -88,7 +89,7 @@ cdef inline double weighted_dot(const double* d, const double* x, const double* 
 
 
 cdef inline double subtract_and_weighted_norm(const double* d, double* x, const double* y, int32_t m) noexcept nogil:
-    """Subtract y from x and return x.D x, summed as in `weighted_dot`."""
+    """Replace x by x - y and return its x.D x, summed as in `weighted_dot`; d, x and y are (m)."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= m:
@@ -109,7 +110,7 @@ cdef inline double subtract_and_weighted_norm(const double* d, double* x, const 
 
 
 cdef inline void extrapolate_nesterov(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
-    """Set y and x to y + beta p, and p to beta p - x with the old x, in one pass."""
+    """Set y and x (n) to y + beta p, and p (n) to beta p minus the old x, in one pass."""
     cdef int32_t i
     cdef double q
     for i in range(n):
@@ -121,10 +122,10 @@ cdef inline void extrapolate_nesterov(double* y, double* x, double* p, double be
 
 
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """Run n iterations of (1)."""
+    """Run n iterations (1) of nncg on lam (m) [N s] in place; first_sweep is 1 if no sweep was made before."""
     cdef acceleration_t* c = <acceleration_t*>context
     cdef int32_t m = c.sweeps.blocks.n_rows, n_v = c.sweeps.n_v, i, s
-    cdef double* x = c.work                             # x, then g: the part of lam is followed by that of v
+    cdef double* x = c.work                             # x, later g: m entries for lam, then n_v for v
     cdef double* q = c.work + m + n_v                   # beta p, added before the next sweep
     cdef double* p = q + m + n_v
     cdef double* v = c.sweeps.v
@@ -166,7 +167,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
 
 
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """Run n iterations of (2)."""
+    """Run n iterations (2) of Anderson mixing on lam (m) [N s] in place; first_sweep is 1 if no sweep was made before."""
     cdef acceleration_t* c = <acceleration_t*>context
     cdef const blocks_t* p = c.sweeps.blocks
     cdef int32_t m = p.n_rows, i, s, mixed
@@ -186,7 +187,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
-        # No limit on sum |gamma|: recorded rockfalls need large ones for 1e-10.
+        # Do not limit sum |gamma|: recorded rockfalls need large sums to reach a residual of 1e-10.
         mixed = mix_anderson_iterates(&mixing, lam, 1.0 / 0.0)
         if mixed:
             for i in range(p.n_blocks):
@@ -205,7 +206,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
 
 
 cdef void restart_acceleration(void* context, const double* lam) noexcept nogil:
-    """Restart from lam (m) without memory; the counts are kept."""
+    """Restart from lam (m) [N s] and forget all earlier sweeps; the counts of iterations and restarts are kept."""
     cdef acceleration_t* c = <acceleration_t*>context
     cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
     if c.memory == 0:
@@ -220,15 +221,16 @@ cdef void restart_acceleration(void* context, const double* lam) noexcept nogil:
 
 
 cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
-    """Return the number of doubles of workspace of a run."""
+    """Return the number of doubles of workspace of a run with m rows, n_v velocities and this memory (0 for nncg)."""
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
 cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil:
-    """Turn a started run of sweeps x into an accelerated one, before its first iteration.
+    """Accelerate a run of sweeps x that has been started and has made no sweep.
 
-    memory = 0 is nncg. workspace (`accelerated_workspace_size`) must be zero-initialised.
+    memory is the number of sweeps that Anderson mixing combines; 0 selects nncg. workspace has `accelerated_workspace_size`
+    doubles, all 0.
     """
     cdef sweep_context_t* sweeps = &x.context
     x.step, x.step_context, x.forget = lav_nncg if memory == 0 else lav_anderson, c, restart_acceleration
@@ -241,21 +243,23 @@ cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t me
 
 
 cdef double count_undone_steps(const acceleration_t* c) noexcept nogil:
-    """Return the number of dropped directions or undone mixed steps."""
+    """Return the number of directions that nncg has dropped, or of mixed steps that Anderson mixing has undone."""
     return c.control[RESTARTS if c.memory == 0 else UNDONE]
 
 
 cdef class AcceleratedSweeps(Sweeps):
-    """Accelerated sweeps; `undone` counts restarts.
+    """Accelerated sweeps of a problem. The property `undone` is the number of restarts.
 
+    Parameters
+    ----------
     p, order, split, mode, rng, exact
         As in `Sweeps`.
     memory : int
-        Number of sweeps that are combined, up to 16; 0 is nncg.
+        Number of sweeps that Anderson mixing combines, up to 16; 0 selects nncg.
     convex : int
-        Number of first iterations under the cone law, whose blocks are solved exactly.
+        Number of iterations at the beginning that use the cone law and solve blocks exactly.
     keeps : bool
-        nncg drops a direction only if it points against the sweep.
+        If true, nncg with beta > 1 drops a direction only if it points against the sweep, (3) of the module.
     """
 
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,

@@ -44,8 +44,9 @@ from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_stric
 cdef enum:
     RHO_UPDATE_INTERVAL = 20    # Iterations before the first update of rho; later updates follow after a quarter of those done.
     MAX_CONVEX_ITERATIONS = 200     # Largest number of iterations without De Saxce's shift.
-    # Largest c of a block that its bounds hold at zero impulse, over the largest c of the others. Below, a block that the others
-    # can make act would keep a wrong c; above 1e6, rho and the mixing lose the digits of the others (|b| up to 1e60 tried).
+    # c of a block that is inactive at zero impulse is limited to this multiple of the largest c of the other blocks. With a smaller
+    # limit, a block that becomes active would have a wrong c. Above 1e6, rho and the mixing lose digits of the other blocks to
+    # rounding (tested with |b| up to 1e60).
     MAX_INACTIVE_RATIO = 10000
 
 
@@ -118,7 +119,7 @@ cdef inline void project_round_cone(int32_t n, const double* root, double mu, co
 
 cdef inline void scale_friction_components(const blocks_t* p, const double* root, int32_t i, const double* x,
                                            friction_components_t* q, double* t) noexcept nogil:
-    """Write the friction components of contact i with coefficients in the scale of x, and |x_g| in t."""
+    """Write the friction components of contact i to q, with coefficients in the scale of x, and |x_g| of each to t."""
     cdef int32_t j = p.ptr[i], g
     get_friction_components(p, i, q)
     for g in range(q.n):
@@ -149,7 +150,7 @@ cdef inline void project_scaled_block(const blocks_t* p, const double* root, int
 
 cdef inline double compute_friction_shift_of_normal(const blocks_t* p, const double* root, int32_t i,
                                                     const double* y) noexcept nogil:
-    """Return the shift s of the normal of contact i."""
+    """Return De Saxce's shift s of the normal of contact i, from y (m) of all rows."""
     cdef friction_components_t q
     cdef double t[3]
     cdef double s = 0.0
@@ -161,7 +162,7 @@ cdef inline double compute_friction_shift_of_normal(const blocks_t* p, const dou
 
 
 cdef inline double compute_residual_imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
-    """Compute the imbalances (3) and return the larger one."""
+    """Write both imbalances (3) to `primal` and `dual`, and return the larger value."""
     cdef int32_t i, m = c.blocks.n_rows
     cdef double x = 0.0, y = 0.0, s, t
     primal[0] = dual[0] = 0.0
@@ -182,7 +183,7 @@ cdef inline double compute_residual_imbalance(const admm_t* c, double* primal, d
 
 
 cdef inline double compute_balanced_rho(const admm_t* c) noexcept nogil:
-    """Return the rho that balances the last iteration, or the present one if the imbalance is small."""
+    """Return the rho that makes the imbalances (3) of the last iteration equal, or the present rho if their ratio is small."""
     cdef double primal, dual, s
     compute_residual_imbalance(c, &primal, &dual)
     if not primal > 0.0:
@@ -193,7 +194,7 @@ cdef inline double compute_balanced_rho(const admm_t* c) noexcept nogil:
 
 
 cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept nogil:
-    """Return the number of doubles of a run, as a double because some hosts pass no 64-bit integers by value."""
+    """Return the number of doubles of workspace of a run, as a double since some callers cannot receive 64-bit integers."""
     return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
@@ -222,7 +223,7 @@ cdef public void lav_begin_admm(admm_t* c, const blocks_t* p, int32_t memory, do
 
 
 cdef inline bint is_strictly_inactive_block(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
-    """Return whether all rows of block i are strictly inactive at zero impulse with slack w (m)."""
+    """Return whether block i is strictly inactive at zero impulse, as in judge/reference.pxd, with slack w (m) [m/s]."""
     cdef int32_t k
     if not has_independent_rows(p, i):
         return is_strictly_inactive_contact(p, i, w)
@@ -233,9 +234,9 @@ cdef inline bint is_strictly_inactive_block(const blocks_t* p, int32_t i, const 
 
 
 cdef inline void limit_scale_of_inactive_blocks(const blocks_t* p, const double* w, double* c) noexcept nogil:
-    """Reduce c of blocks inactive at zero impulse, slack w, to MAX_INACTIVE_RATIO times the largest c of the others.
+    """Limit c of blocks that are inactive at zero impulse, with slack w (m), to MAX_INACTIVE_RATIO times the largest other c.
 
-    A distant limit or a placeholder bound would otherwise dominate the rounding errors of the active rows, and rho.
+    The c of a joint limit that is far away would otherwise determine rho and the rounding errors of the active rows.
     """
     cdef double size = 0.0, own
     cdef int32_t i, k
@@ -255,7 +256,10 @@ cdef inline void limit_scale_of_inactive_blocks(const blocks_t* p, const double*
 
 
 cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* n) noexcept nogil:
-    """Run at most n iterations; return 0, or the rho of the next factorisation. n receives the remaining iterations."""
+    """Run at most n iterations from c into lam (m) [N s]; n receives the number of remaining iterations.
+
+    Return 0, or the new rho if the kernel has stopped early for a new factorisation.
+    """
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
     cdef double rho = c.rho, primal, dual
@@ -295,7 +299,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             clear_mixing_memory(&c.mixing)
             c.mixed = 0
             return rho
-        # Without a limit, impulses on rows of low rank reach 1e15; 1e3 and 1e5 also work.
+        # Limit sum |gamma| to 1e4: otherwise impulses on linearly dependent rows reach 1e15. Limits of 1e3 and 1e5 also work.
         c.mixed = mix_anderson_iterates(&c.mixing, c.u, 1e4)
     return 0.0
 
@@ -319,15 +323,16 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
 
 
 cdef class Splitting:
-    """A run over a problem, with factorisations that the caller computes.
+    """A run of proximal splitting over a problem, with factorisations that the caller computes.
 
     Parameters
     ----------
     p : Data
+        The problem.
     memory : int
-        Number of iterations that are mixed, 0 to MAX_MEMORY.
+        Number of iterations that Anderson mixing combines, 0 to MAX_MEMORY.
     rho, alpha : float
-        The first penalty; the relaxation.
+        First penalty rho and over-relaxation alpha of the module's iteration [-].
     """
     cdef admm_t c
     cdef object keep
@@ -342,7 +347,7 @@ cdef class Splitting:
 
     @property
     def rho(self):
-        """Penalty that the factor must have."""
+        """Penalty rho [-] of the matrix B + rho that the caller must have factored for the next `run`."""
         return self.c.rho
 
     @property
@@ -351,15 +356,15 @@ cdef class Splitting:
         return int(self.c.mixing.control[UNDONE])
 
     def start(self, const double[::1] lam, const double[::1] w):
-        """Start from an impulse and its slack (m,)."""
+        """Start from an impulse lam (m,) [N s] and its slack w (m,) [m/s]."""
         if lam.shape[0]:
             lav_admm_start(&self.c, &lam[0], &w[0])
 
     def run(self, double[::1] lam, int n, factor):
-        """Run at most `n` iterations in place, without the GIL; return their number.
+        """Run at most `n` iterations without the GIL, write the impulse to `lam` (m,) [N s], and return the number of iterations.
 
-        If `rho` has changed on return, a new factor is needed. factor is (LinearSystem,), over bodies followed by the arrays of
-        `factor_t` in its order.
+        If `rho` has changed afterwards, the next call needs a new factor. `factor` is a tuple: a `LinearSystem`, and over bodies
+        also the arrays of `factor_t` in its order.
         """
         cdef factor_t f
         cdef int32_t remaining = n

@@ -43,9 +43,10 @@ cdef struct mixing_t:
 
 cdef inline int32_t solve_mixing_coefficients(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
                                   double* gamma) noexcept nogil:
-    """Solve the normal equations over the n newest differences for gamma (memory), by slot; return the number of columns used.
+    """Solve the normal equations of (1) over the n newest differences; return the number of columns that were used.
 
-    Cholesky factorisation, newest first. A column whose pivot is at most 1e-12 of its square is linearly dependent and omitted.
+    gamma (memory) receives the coefficient of each slot of the ring buffers. The method is Cholesky's with the newest
+    difference first. A column with a pivot of at most 1e-12 of its square is linearly dependent and gets the coefficient 0.
     """
     cdef double l[MAX_MEMORY * MAX_MEMORY]
     cdef double y[MAX_MEMORY]
@@ -87,7 +88,10 @@ cdef inline int32_t solve_mixing_coefficients(int32_t n, int32_t head, int32_t m
 
 
 cdef inline int32_t mix_anderson_iterates(const mixing_t* c, double* u, double max_weight) noexcept nogil:
-    """Replace u, which holds the last v, by (1) and return 1; return 0 if nothing is mixed, as if sum |gamma| > max_weight."""
+    """Replace u (m), which holds the last v, by (1) and return 1, or return 0 if nothing is mixed.
+
+    Nothing is mixed without differences in memory, after a window without progress, or if sum |gamma| exceeds max_weight.
+    """
     cdef int32_t n_differences = <int32_t>c.control[N_DIFFERENCES], head = <int32_t>c.control[NEXT_SLOT], i, j, k
     cdef double rhs[MAX_MEMORY]
     cdef double gamma[MAX_MEMORY]
@@ -115,7 +119,7 @@ cdef inline int32_t mix_anderson_iterates(const mixing_t* c, double* u, double m
 
 
 cdef inline void clear_mixing_memory(const mixing_t* c) noexcept nogil:
-    """Clear the memory."""
+    """Forget all stored evaluations and differences."""
     c.control[N_DIFFERENCES] = 0.0
     c.control[HAS_PREVIOUS] = 0.0
 

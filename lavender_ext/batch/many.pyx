@@ -1,7 +1,8 @@
 """Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `task.pxd`.
 
-`Worlds` holds problems and their results. Each `Worker` belongs to one thread and processes the next world without the
-interpreter. The caller solves deferred worlds with the general solvers.
+A world is one problem of a batch. `Worlds` holds the worlds and their results. Each `Worker` belongs to one thread and takes
+the next world, without the interpreter. A worker leaves some worlds to the caller, who solves them with the general solvers:
+these are called deferred.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
@@ -52,7 +53,7 @@ cdef enum:
 
 
 cdef int set_task_from_problem(task_t* j, problem) except -1:
-    """Set up a task from a `Problem` of A or of bodies without derived data."""
+    """Set up a task from a `Problem` that is given by A or by bodies and whose derived numbers are not computed."""
     cdef Blocks blocks = problem.cones._blocks
     cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
     rows, matrix = problem.rows, problem.matrix
@@ -76,7 +77,7 @@ cdef int set_task_from_problem(task_t* j, problem) except -1:
 
 
 cdef int set_task_from_data(task_t* j, Data p, start, double* lam, double* slack_error) except -1:
-    """Set up a task from the data `p`, with the start `start` (m,) [N s] or the zero impulse if it is None."""
+    """Set up a task from the data `p`. It starts from `start` (m,) [N s], or from the zero impulse if `start` is None."""
     j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
     j.has_derived = p.ready
     j.made = p.derived
@@ -87,7 +88,7 @@ cdef int set_task_from_data(task_t* j, Data p, start, double* lam, double* slack
 
 
 cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) except -1:
-    """Set the task's start and output arrays, and reset its result."""
+    """Set the start of a task, (m,) [N s] or None for the zero impulse, and its output arrays; reset its result."""
     cdef const double[::1] values
     j.lam, j.slack_error = lam, slack_error
     j.solved, j.limit_reached, j.cold, j.cost_limit, j.by_island = False, False, start is None, INFINITY, NULL
@@ -109,7 +110,7 @@ cdef make_task_result(task_t* j, Data p, impulse, both):
 
 
 cdef void store_zero_residual(task_t* j, Data p):
-    """Store the residual of the zero impulse in the data, unless it has one."""
+    """Store the residual of the zero impulse that the task has computed in `p`, unless `p` has one."""
     if p.reference_energy < 0.0 and j.zero_residual[0] >= 0.0:
         p.store_reference(j.p.islands, j.zero_residual)
 
@@ -169,7 +170,7 @@ cdef enum:                      # rows of `Worlds.numbers`: results of each worl
     N_NUMBERS = 10
 
 
-#: Columns of `at` by name.
+#: {name: column of the argument `at` of `Worlds`}.
 PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "mass": MASS, "free": FREE, "target": TARGET,
          "soft": SOFT, "mu": MU, "block": BLOCK, "cone_row": CONE_ROW, "row": AT_ROW, "velocity": VELOCITY}
 
@@ -187,7 +188,11 @@ cdef enum:                      # results of `Worker.process_worlds` other than 
 
 
 def list_problem_data(list problems, kind):
-    """Return (per problem its Data, True without derived data, or None if the loop does not support it; rows of each (n,))."""
+    """Return (data, rows) of n problems: a list and the number of rows of each (n,).
+
+    An item of `data` is the `Data` of a problem, True if its derived numbers are not computed, or None if workers do not
+    support it.
+    """
     cdef Py_ssize_t i, n = len(problems)
     cdef list data = [None] * n
     sizes = np.empty(n, np.int64)
@@ -216,7 +221,7 @@ cdef struct worker_t:             # memory of one thread
 
 
 cdef inline bint judge_world_zero(task_t* j, worker_t* h) noexcept nogil:
-    """Judge the zero impulse of a world of J and M; return False without memory."""
+    """Judge the zero impulse of a world that is given by J and M; return False if memory is exhausted."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     return judge_zero_impulse_of_task(j, &v, &h.small.islands, h.workspace.real)
 
@@ -230,7 +235,7 @@ cdef class Worlds:
     Parameters
     ----------
     problems, data : list
-        Problems that are objects, and their `list_problem_data`, with starts (m,) [N s] or None.
+        Problems that are objects, and the result of `list_problem_data` for them, with starts (m,) [N s] or None.
     at : (n, PLACES) int64
         Sizes and offsets as in `world.pxd`; for objects only the columns ROWS and AT_ROW.
     arrays : sequence of 6
@@ -274,7 +279,7 @@ cdef class Worlds:
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
     def set_from_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
-        """Set the worlds from arrays that are validated except for their values."""
+        """Set the worlds from arrays with checked shapes and types. Their values are checked when a world is converted."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
         cdef const int32_t[::1] ptr, col
@@ -368,7 +373,7 @@ cdef class Worlds:
         return code
 
     cdef void store_result(self, int64_t i, const task_t* j, const worker_scratch_t* scratch) noexcept nogil:
-        """Store the judge's results, and v+ of worlds in arrays."""
+        """Store the judge's results of world i, and its velocity v+ after the step if the worlds are given as arrays."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef double* v
         cdef int64_t n = self.w.n + 1
@@ -387,7 +392,7 @@ cdef class Worlds:
                 v[k] = scratch.free[k] + j.push[k]
 
     cdef int32_t store_empty_world(self, int64_t i, const worker_scratch_t* scratch) noexcept nogil:
-        """Store v+ = v* of a world without rows."""
+        """Store the velocity v+ after the step of a world without rows, which is v*."""
         memcpy(self.v + self.w.at[i * PLACES + VELOCITY], scratch.free,
                self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
         return READY
@@ -514,15 +519,15 @@ cdef class Worker:
         return self.process_worlds(tol, limits, rules, max_cost, 0, False)
 
     def judge_worlds(self, double tol, bint narrow, bint late=False):
-        """Judge the impulses of worlds until one is deferred; narrow: with the round-off floor of float32.
+        """Judge the impulses of worlds until one is deferred, and return its index, or DONE_ALL if there are no more.
 
-        late: the worlds keep their starts, because there was no time to solve.
+        narrow: use the round-off floor of float32. late: the worlds keep their starts, since there was no time to solve them.
         """
         return self.process_worlds(tol, None, None, INFINITY, LATE if late else READY, narrow)
 
     cdef int64_t process_worlds(self, double tol, Limits limits, Rules rules, double max_cost, int32_t judges,
                                 bint narrow) except? -3:
-        """Process worlds until one is deferred; judges: 0 to solve, or the status of judged worlds."""
+        """Process worlds until one is deferred; judges: 0 to solve them, otherwise the status that judged worlds get."""
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
         cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL

@@ -36,7 +36,8 @@ from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 cdef enum:
     NEWTON_STEPS_PER_ISLAND = 128
-    # Costs in passes over all entries of J L^-1, fitted to 500 random problems: within a factor of 1.4 of the time of 90 % of them.
+    # Costs as numbers of passes over all entries of J L^-1. They were fitted to 500 random problems and predict the time of 90 % of
+    # these within a factor of 1.4.
     SETUP_PASSES = 10           # setup and judgement
     FACTOR_PASSES = 3           # forming N, in addition to half of the estimated factorisation
     LINE_ROW_ENTRIES = 11       # one evaluation of a line search, in entries per row
@@ -56,7 +57,7 @@ cdef struct task_t:
     bint has_derived            # `made` is valid for this problem
     double zero_residual[3]     # E0, V0, relative residual of the zero impulse; E0 < 0: not known
     islands_t islands           # target of p.islands, if this call computed the islands
-    double* by_island           # NULL, or (n, 2) for `score_t.by_island`
+    double* by_island           # NULL, or the array (islands, 2) that `score_t.by_island` points to
     int32_t cold                # 1: start from the zero impulse, 0: from lam
     double cost_limit           # ns, limit of the estimated cost, at which the current iterate is the result; inf: no limit
     bint solved
@@ -79,7 +80,7 @@ cdef struct task_workspaces_t:  # workspaces of one thread
 
 
 cdef inline bint judge_zero_impulse_of_task(task_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
-    """Judge the zero impulse: E0, V0, relative residual and islands; return False without memory.
+    """Judge the zero impulse for E0, V0, its relative residual and the islands; return False if memory is exhausted.
 
     v: view of the task's data; w (3 m + `count_judge_scratch`): scratch.
     """
@@ -133,9 +134,9 @@ cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept
                 if j.g.jval[q] != 0.0:
                     return False
             if p.b[k] == 0.0 or (not has_independent_rows(p, i) and k > p.ptr[i]):
-                continue                                # no impulse required: tangents and spin are bounded by mu lambda_n
+                continue                                # b = 0 requires no impulse; mu lambda_n bounds friction rows.
             if p.b[k] < 0.0 and p.law == CONE and not has_independent_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
-                # under the cone law a separating normal row supports the friction of a sliding contact
+                # Keep the impulse: under the cone law, a sliding contact may have a normal impulse although its normal separates.
                 continue
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
             if fabs(bound) < INFINITY:
@@ -304,7 +305,7 @@ cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
 
 
 cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
-    """Set up A or bodies for a solve or the judge; return False to defer the task, as with empty rows."""
+    """Set up a task of A or of bodies for a solve or for the judge; return False to defer it, for example with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
         if j.factored:
@@ -325,14 +326,14 @@ cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task
 
 
 cdef inline void copy_small_judgement(task_t* j, const small_problem_t* s) noexcept nogil:
-    """Copy the judge's result of a small problem to its task."""
+    """Copy the judge's result of the small problem s to the task j."""
     j.score, j.relative, j.floor, j.float64_relative = s.score, s.relative, s.floor, NAN
     j.above_floor = residual_above_floor(&s.score, s.relative, s.floor)
 
 
 cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, const small_rules_t* rules,
                                      double tol) noexcept nogil:
-    """Solve A or bodies by the call for small problems; return LEFT, TRIED, STARTED or READY."""
+    """Solve a task of A or of bodies by the call for small problems; return its status LEFT, TRIED, STARTED or READY."""
     cdef small_problem_t s
     cdef int32_t code
     cdef bint pivots = are_all_rows_bounded(&j.p)

@@ -128,7 +128,7 @@ cdef inline const double* convert_matrix_to_float64(const worlds_t* w, int32_t w
 
 cdef inline int32_t drop_zeros_of_triangle(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
                                int32_t* idx, double* val) noexcept nogil:
-    """Copy a lower triangle in compressed rows without its off-diagonal zeros and return the number of entries."""
+    """Copy a lower triangle (n, n) in compressed rows, except off-diagonal zeros, and return the number of copied entries."""
     cdef int32_t i, k, q = 0
     ptr[0] = 0
     for i in range(n):
@@ -149,7 +149,7 @@ cdef inline void compute_factor_pattern(int32_t n, int64_t capacity, const int32
 
 
 cdef inline void bind_factor_pattern(const int32_t* t, int32_t n, generalized_t* g) noexcept nogil:
-    """Point g at the pattern of L in t."""
+    """Point the pattern of g at t, which `compute_factor_pattern` has filled."""
     g.lptr, g.parent, g.lidx = t, t + n + 1, t + 2 * n + 1
 
 
@@ -173,7 +173,7 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
 
 
 cdef inline int32_t count_zeros_and_detect_new(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
-    """Count the zeros of x (n); new: whether one is not in `known`. Branch-free, to be vectorised."""
+    """Return the number of zeros of x (n); `new` receives whether any of these is not in `known`. Compilers vectorise the loop."""
     cdef int64_t zeros = 0, unknown = 0, zero
     cdef int32_t k
     for k in range(n):
@@ -186,7 +186,9 @@ cdef inline int32_t count_zeros_and_detect_new(const double* x, int32_t n, const
 
 cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d, int32_t n, const double* x,
                                          generalized_t* g) noexcept nogil:
-    """Return the number of nonzeros of an M with shared pattern; -1 if its zeros change the pattern of L, or without memory.
+    """Return the number of nonzeros of an M with the shared pattern; -1 if its zeros change the pattern of L.
+
+    It is also -1 if memory is exhausted.
 
     If a set of zeros does not change the pattern of L, no subset does: M is then used in place, and the set is remembered.
     """
@@ -234,7 +236,7 @@ cdef inline void remove_from_shared_pattern(const worlds_t* w, int32_t n, const 
 
 cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p,
                                               generalized_t* g) noexcept nogil:
-    """Convert world i of J and M in the worker's scratch; return READY, BAD or LEFT."""
+    """Convert world i of J and M to p and g, in the worker's scratch d; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
     cdef bint shared = True
@@ -302,7 +304,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
 
 cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, const double** a,
                                int64_t* row) noexcept nogil:
-    """Convert world i of A (m, m), with row stride `row`, in the worker's scratch; return READY, BAD or LEFT."""
+    """Convert world i of A to p and to a (m, m) with row stride `row`, in the worker's scratch d; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
     cdef double* b
@@ -320,13 +322,13 @@ cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_sc
 
 
 cdef inline int32_t convert_body_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, rows_t* r) noexcept nogil:
-    """Convert world i of bodies; return READY, or LEFT: `Rows` then corrects small errors or raises."""
+    """Convert world i of bodies to p and r. Return READY, or LEFT if an array has a fault: `Rows` then corrects it or raises."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef const bodies_t* o = &w.bodies
     cdef const double* x[FIELDS]
     cdef int32_t m = <int32_t>at[ROWS], kj = o.joints, c = o.contacts, k
     cdef int32_t size[FIELDS]
-    cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10, 0.0, 1e-6)      # as `find_body_fault` of core/checks.pyx
+    cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10, 0.0, 1e-6)      # as in core/checks.pyx
     cdef int64_t index
     cdef double* b
     cdef double* mu
@@ -357,7 +359,10 @@ cdef inline int32_t convert_body_world(const worlds_t* w, int64_t i, worker_scra
 
 cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
                                double* mu, bint has_mu=False) noexcept nogil:
-    """Bind a world's blocks, with rows from 0, and its own mu if given (`has_mu`: already in mu); return READY or BAD."""
+    """Bind the blocks of a world to p, with rows numbered from 0; return READY or BAD.
+
+    A mu that is given per world replaces that of the blocks; with has_mu it is in mu already.
+    """
     cdef const blocks_t* all = &w.blocks
     cdef int32_t k, first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
     p[0] = all[0]

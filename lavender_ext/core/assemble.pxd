@@ -1,4 +1,4 @@
-"""Assembly of A from bodies, for other compiled loops."""
+"""Declarations of `assemble.pyx`: the assembly of A from bodies."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t

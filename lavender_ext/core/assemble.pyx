@@ -22,7 +22,7 @@ cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
-    """Write J and M^-1 J^T of every row as (m, 12), in the layout of joint rows."""
+    """Write J and M^-1 J^T (m, 12) of every row, in the layout of joint rows: linear and angular on body a, then on body b."""
     cdef int32_t i, j, k, c, a, b, end
     for i in range(p.n_blocks):
         j = p.ptr[i]
@@ -106,7 +106,7 @@ cdef inline int32_t list_coupled_blocks(const rows_t* r, int32_t i, const int32_
 
 
 cdef inline int32_t find_shared_bodies(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
-    """Return a bit set: bit 2 s + t means that side s of block i and side t of block j are the same moving body."""
+    """Return a bit set. Bit 2 s + t is set if body s (0 or 1) of block i and body t of block j are the same moving body."""
     cdef int32_t s, t, x, bits = 0
     for s in range(2):
         x = get_block_bodies(r, i)[s]
@@ -117,7 +117,10 @@ cdef inline int32_t find_shared_bodies(const rows_t* r, int32_t i, int32_t j) no
 
 
 cdef inline double compute_coupling_entry(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
-    """Return the entry of A of two rows: the sum over shared bodies; bit 2 s + t is side s of jac and side t of minv_jac."""
+    """Return the entry of A of two rows, J (12) of one times M^-1 J^T (12) of the other over the bodies that they share.
+
+    bits is the result of `find_shared_bodies`.
+    """
     cdef double value = 0.0
     if bits & 1:
         value += dot6(jac, minv_jac)

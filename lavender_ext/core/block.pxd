@@ -111,7 +111,7 @@ cdef inline void compute_coulomb_error(const double* lam, const double* w, const
 
 
 cdef inline double scale_projection_argument(double lam, double w, double d, double r) noexcept nogil:
-    """Return r (lam - w / d) with r = sqrt(d)."""
+    """Return r (lam - w / d) with r = sqrt(d), one entry of the vector that (7) projects."""
     return r * (lam - w / d)
 
 
@@ -169,7 +169,7 @@ cdef inline void compute_cone_error(const double* lam, const double* w, const do
         for i in range(j, end):
             e[i] = lam[i] - f * y[i] if t[g] > a[g] * s else w[i] / d[i]
     if total != total:
-        e[0] = total                                    # NaN: comparisons above would hide it
+        e[0] = total                                    # Return NaN, which the comparisons above would hide.
 
 
 cdef inline int32_t index_of_row_group(int32_t tangent) noexcept nogil:
@@ -266,7 +266,7 @@ cdef inline void compute_round_cone_error(const double* lam, const double* w, co
             y = lam[i] - e[i]
             e[i] = e[i] + compute_round_cone_scale_complement(a[index_of_row_group(i)], r, yn) * y if f > 0.5 else lam[i] - f * y
     if not (yn == yn and inside == inside):
-        e[0] = yn + inside                              # NaN: comparisons above would hide it
+        e[0] = yn + inside                              # Return NaN, which the comparisons above would hide.
 
 
 cdef inline void compute_contact_error(int32_t law, const double* lam, const double* w, const double* d,
@@ -288,7 +288,7 @@ cdef inline void compute_block_error(const blocks_t* p, int32_t i, const double*
         while j < end:
             e[j] = compute_row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
             j += 1
-    elif is_disk_friction_contact(p, i):                                 # the common case, compiled with constant sizes
+    elif is_disk_friction_contact(p, i):                                 # This common case is compiled with constant sizes.
         get_disk_component(p, i, &q)
         compute_contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
     elif is_round_cone_contact(p, i):

@@ -66,7 +66,7 @@ cdef inline void project_contact_components(int32_t law, const int32_t n_compone
     s = project_cone_normal(n_components, q.friction_coefficient, t, y[0]) if law == CONE else y[0] if y[0] > 0.0 else 0.0
     out[0] = s
     if x != x:
-        out[0] = x                                      # NaN: the comparisons below would hide it
+        out[0] = x                                      # Return NaN, which the comparisons below would hide.
         return
     if not s > 0.0:
         return
@@ -105,7 +105,7 @@ cdef inline void project_contact(int32_t law, const friction_components_t* q, co
     n is 1 + the number of rows of the friction components q, at most 6.
     """
     cdef friction_components_t disk
-    if q.n == 1 and q.size[0] == 2:                     # one disk: compiled with constant sizes
+    if q.n == 1 and q.size[0] == 2:                     # The common case, one disk, is compiled with constant sizes.
         disk.n, disk.first[0], disk.size[0], disk.friction_coefficient[0] = 1, 1, 2, q.friction_coefficient[0]
         project_contact_components(law, 1, 3, &disk, y, out, p)
     elif q.n:

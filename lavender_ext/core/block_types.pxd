@@ -73,7 +73,7 @@ cdef inline void bind_friction_arrays(blocks_t* p, const double* x, Py_ssize_t s
 
 
 cdef inline void get_friction_arrays(const blocks_t* p, const double** x) noexcept nogil:
-    """Write the addresses of the N_FRICTION_ARRAYS arrays into x."""
+    """Write the addresses of mu, patch_radius and rolling of `p` into x (N_FRICTION_ARRAYS)."""
     x[0], x[1], x[2] = p.mu, p.patch_radius, p.rolling
 
 
@@ -151,7 +151,7 @@ cdef inline void get_friction_components(const blocks_t* p, int32_t i, friction_
             append_friction_component(q, 1, p.mu[i] * p.patch_radius[i])
         append_friction_component(q, 2, p.rolling[i])
         return
-    if n > 1:                                           # all but the last row, which is spin or the second side of a box
+    if n > 1:                                           # The last row is spin, or the second side of a box.
         append_friction_component(q, n - 1, p.mu[i])
     append_friction_component(q, 1, p.mu[i] * p.patch_radius[i])
 

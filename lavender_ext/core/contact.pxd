@@ -60,9 +60,9 @@ ctypedef fused contact_kind_t:
 
 
 cdef inline void relax_contact(const contact_kind_t* kind, number_t* lam, number_t* va, number_t* vb) noexcept nogil:
-    """Update a contact: normal, tangents (together; of a box one after the other), spin row, rolling rows.
+    """Update a contact: its normal, its tangents (together, or for a box one by one), its spin row, then its rolling rows.
 
-    lam (n) are its impulses, va and vb (6) the velocities of its bodies, which are not read if the body is static.
+    lam (n) [N s] are the impulses of the contact; va and vb (6) are the velocities of its bodies, not read for a static body.
     """
     # arrays and numbers of rows
     cdef const contact_t* c = &kind.contact
@@ -220,7 +220,7 @@ cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t
 
 
 cdef inline void relax_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam, double* v) noexcept nogil:
-    """Update block i, a joint or a contact."""
+    """Update block i, a joint or a contact; lam (m) [N s], v (n_bodies, 6) [m/s, rad/s]."""
     if i < r.n_joints:
         relax_joint_block(p, r, i, lam, v)
     else:

@@ -196,7 +196,7 @@ cdef class Operator:
     cdef generalized_t g                # without panels and compliance
     cdef readonly int failed            # the row of M with a pivot that is not positive, or -1
     cdef readonly object jac            # (indptr, indices, data) of J
-    cdef readonly object mass           # the same of the lower triangle of M
+    cdef readonly object mass           # (indptr, indices, data) of the lower triangle of M
     cdef list keep
 
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx)

@@ -20,7 +20,7 @@ cdef int64_t MAX_INDEX = 2**31 - 1      # largest number of entries of L with 32
 
 
 cdef object allocate_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t max_entries=MAX_INDEX):
-    """Return the pattern of L in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
+    """Return an array with the pattern of L: lptr (n + 1), parent (n), 3 n integers of scratch, then lidx; int32."""
     cdef int64_t workspace = mptr[n] + 1
     cdef int32_t count = -1
     cdef int32_t[::1] whole
@@ -49,7 +49,7 @@ cdef class Operator:
     mptr_, midx_, mval_ : ndarray
         Lower triangle of M (nv, nv) in the same form.
     like : Operator, optional
-        Operator that shares its pattern of L if its M has the same pattern.
+        Operator from which the pattern of L is taken if its M has the same pattern.
     max_entries : int
         MemoryError is raised if L has more entries.
 
@@ -102,7 +102,7 @@ cdef class Operator:
         self.failed = other.failed
 
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx):
-        """Return whether M has this pattern."""
+        """Return whether the lower triangle of M has n rows and this pattern in compressed rows."""
         return self.g.n == n and (self.g.mptr == mptr or memcmp(self.g.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
             self.g.midx == midx or memcmp(self.g.midx, midx, mptr[n] * sizeof(int32_t)) == 0)
 
@@ -145,7 +145,7 @@ cdef class Operator:
 
     @property
     def work(self):
-        """Multiply-adds of the factorisation."""
+        """Multiply-adds of the factorisation of M."""
         return count_mass_factor_work(&self.g)
 
     @property
@@ -208,7 +208,7 @@ cdef class Operator:
         return result
 
     def compute_rhs(self, velocity, target):
-        """Return b = target - J v (m,), a new array; the caller checks its range."""
+        """Return b = target - J v (m,) [m/s], a new array; the caller checks its range."""
         cdef const double* v = as_double_pointer(velocity, self.g.n)
         cdef const double* t = as_double_pointer(target, self.g.m)
         cdef int32_t i

@@ -13,7 +13,7 @@ from lavender_ext.core.view cimport get_block_bodies, csr_t, generalized_t, rows
 
 
 cdef inline int32_t merge_components(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
-    """Connect i and j; return 1 if they were in different components. The smaller number stays the root."""
+    """Connect the components of i and j; return 1 if these were different. The smaller of their roots stays a root."""
     i = find_root(parent, i)
     j = find_root(parent, j)
     if i < j:
@@ -102,7 +102,10 @@ cdef inline int64_t island_workspace_integers(const view_t* v) noexcept nogil:
 
 
 cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out) noexcept nogil:
-    """Return the number of islands; if there are several, `out` has them in `index` (`island_workspace_integers`)."""
+    """Return the number of islands; if there are several, `out` receives them.
+
+    The arrays of `out` are in `index` (`island_workspace_integers`).
+    """
     cdef int32_t i, k = v.p.n_blocks, count
     cdef int32_t* label = index
     cdef int32_t* order = index + k

@@ -8,8 +8,8 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
-    THIN_PADDING = 8            # entries that `thin` may write beyond the end
-    EXPECTED_FACTORISATIONS = 20        # factorisations of M by the solves of a problem, to weigh the search of an order
+    THIN_PADDING = 8            # number of entries that `thin` may write beyond the end of an array
+    EXPECTED_FACTORISATIONS = 20        # assumed number of factorisations of M for one problem, for which an order is searched
 
 
 # -- layout ------------------------------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ cdef inline int32_t compress_dense_rows(const double* a, int64_t stride, int32_t
 
 
 cdef inline bint is_symmetric(const double* a, int64_t stride, int32_t n) noexcept nogil:
-    """Return whether a is exactly symmetric, up to the sign of 0; branch-free."""
+    """Return whether a (n, n) is exactly symmetric, where 0 equals -0. The loop has no branch, so that compilers vectorise it."""
     cdef int32_t i, j, differs = 0
     for i in range(n):
         for j in range(i):
@@ -36,16 +36,16 @@ cdef inline bint is_symmetric(const double* a, int64_t stride, int32_t n) noexce
 
 
 cdef inline double relative_entry_asymmetry(const double* a, int64_t stride, int32_t i, int32_t j) noexcept nogil:
-    """Return |a_ij - a_ji| / sqrt(a_ii a_jj); the denominator is 1 if a_ii a_jj is not positive."""
+    """Return |a_ij - a_ji| / sqrt(a_ii a_jj), or |a_ij - a_ji| if a_ii a_jj is not positive."""
     cdef double gap = fabs(a[i * stride + j] - a[j * stride + i]), size = a[i * (stride + 1)] * a[j * (stride + 1)]
     return gap / sqrt(size) if gap > 0.0 and size > 0.0 else gap
 
 
 cdef inline int32_t compress_lower_triangle(const double* a, int64_t stride, double max_asymmetry, int32_t n, int32_t* ptr,
                                             int32_t* idx, double* val) noexcept nogil:
-    """Write the lower triangle with every diagonal entry in compressed rows; return the number of entries.
+    """Write the lower triangle of a (n, n) in compressed rows, with every diagonal entry; return the number of entries.
 
-    Returns -1 if the asymmetry of an entry is above `max_asymmetry`.
+    Returns -1 if `relative_entry_asymmetry` of an entry is above `max_asymmetry`.
     """
     cdef bint symmetric = is_symmetric(a, stride, n)
     cdef const double* row = a
@@ -84,9 +84,9 @@ cdef inline double count_mass_factor_work(const generalized_t* g) noexcept nogil
 cdef inline bint ordering_pays_off(const generalized_t* g, int32_t entries) noexcept nogil:
     """Return whether the search of an order with less fill-in takes less time than the factorisations of M save.
 
-    entries: of the lower triangle of M. A factorisation without fill-in needs at least the work of evenly distributed entries,
-    so a matrix that is nearly full is not ordered. Times [ns] were measured on trees of 9 to 800 velocities in the wrong order:
-    the search and the factorisation in the new order take 0.2 ms and 0.13 us for each entry; a multiply-add takes 2 ns. (For
+    `entries` is the number of entries of the lower triangle of M. A factorisation without fill-in takes the least work if all
+    rows have the same number of entries; this lower bound excludes matrices that are nearly full. Times [ns] were measured on
+    trees of 9 to 800 velocities in the wrong order: the search and the factorisation in the new order take 0.2 ms and 0.13 us for each entry; a multiply-add takes 2 ns. (For
     example, a robot of 9 velocities whose root slides in two directions has a fill-in of one entry.)
     """
     cdef double off_diagonal = entries - g.n, work
@@ -97,7 +97,10 @@ cdef inline bint ordering_pays_off(const generalized_t* g, int32_t entries) noex
 
 
 cdef inline int32_t factor_mass(generalized_t* g, double* lval, double* inv_pivot, double* root) noexcept nogil:
-    """Factor M of g by its pattern; bind L, 1 / D and D^-1/2 to these arrays. Return -1, or the row of a pivot that fails."""
+    """Factor M of g in the pattern of L; bind L, 1 / D and D^-1/2 to the last three arguments.
+
+    Return -1, or the row of a pivot that is too small.
+    """
     cdef int32_t i, failed
     g.lval, g.inv_pivot, g.root = lval, inv_pivot, root
     if g.n == 0:

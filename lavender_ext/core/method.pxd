@@ -1,4 +1,4 @@
-"""Interface of an iterative method: three functions on plain structs, without Python, allocation or clocks.
+"""Interface of an iterative method: three functions on plain structs that neither use Python, nor allocate, nor read a clock.
 
     view_t v                      the problem: blocks with d and nu, and one of A, bodies, J and M
     options_t o                   method, tolerance, budget
@@ -36,7 +36,7 @@ cdef struct options_t:
     int32_t budget              # maximum units of work
     int32_t proven              # the caller confirmed that the direction of a CERTIFICATE is a proof
     int32_t stop                # the next step ends with the present result
-    int32_t wide                # the processor has four-lane instructions: same bits, faster
+    int32_t wide                # 1: use instructions for four doubles, which the processor has; the results have the same bits
     double tol                  # relative residual
     double e0                   # judge's energy error of the zero impulse, sqrt J
     double v0                   # judge's velocity error of the zero impulse, m/s
@@ -72,7 +72,7 @@ cdef struct method_t:
 
 
 cdef inline bint require_workspace(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
-    """Return whether r has this much workspace; if not, store the required sizes in r."""
+    """Return whether r has n_index int32 and n_real doubles of workspace; if not, store these sizes in r."""
     cdef bint is_enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
     if not is_enough:
         r.n_index, r.n_real = n_index, n_real

@@ -1,4 +1,4 @@
-"""A started method for Python: steps and statistics."""
+"""The class `Method`: steps and statistics of a method of core/method.pxd for Python."""
 import numpy as np
 
 from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, options_t, info_t)
@@ -24,7 +24,7 @@ cdef class Method:
     def step(self, int work, double[::1] impulse):
         """Do `work` units of work and return one of `OUTCOMES`.
 
-        impulse (m,) [N s] receives the best impulse; over J and M it receives the impulse from which the method continues.
+        impulse (m,) [N s] receives the best impulse so far, or over J and M the impulse from which the method continues.
         """
         with nogil:
             self.how = self.own.step(&self.view, &self.options, &self.space, work, &impulse[0], &self.info)

@@ -44,7 +44,7 @@ cdef inline number_t clip_number(number_t x, number_t low, number_t high) noexce
 
 
 cdef inline number_t clip_to_bound(number_t x, number_t bound) noexcept nogil:
-    """Clip x to [-bound, bound]. A pair inside is not clipped, so that the next operations do not wait for the bound."""
+    """Clip x to [-bound, bound]. If both numbers of a pair are inside, x is returned at once, without waiting for the bound."""
     if number_t is double:
         return clip(x, -bound, bound)
     else:

@@ -1,4 +1,4 @@
-"""Sweep orders of blocks: the next sweep's order, levels from the ground, greedy colours; compiled once, in `order.pyx`.
+"""Declarations of `order.pyx`: the order of blocks in the next sweep, their levels from the ground, and greedy colours.
 
 An order is a permutation of block numbers (int32). GIVEN keeps it, SYMMETRIC reverses it before every sweep except the
 first, and RANDOM shuffles it before every sweep with SplitMix64 (Steele, Lea, Flood 2014), so that a seed gives the same

@@ -1,4 +1,4 @@
-"""Orders and colours of blocks: the functions of core/order.pxd, colours of the blocks of a matrix, and wrappers for Python."""
+"""Orders, levels and colours of blocks: the functions of core/order.pxd, colours from the pattern of A, and Python functions."""
 from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
@@ -7,7 +7,7 @@ from lavender_ext.core.order cimport RANDOM, SYMMETRIC, next_random
 
 
 cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
-    """Shuffle order[first:end] (Fisher-Yates); an index below n is (32 random bits) * n / 2^32."""
+    """Shuffle order[first:end] (Fisher-Yates). A random index below n is r n / 2^32, rounded down, with 32 random bits r."""
     cdef int32_t i = end - 1, j, t
     while i > first:
         j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
@@ -30,7 +30,7 @@ cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept no
 
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                         uint64_t* rng) noexcept nogil:
-    """Update order[first:end] in place for the next sweep."""
+    """Update order[first:end] in place for the next sweep, as `mode` requires; first_sweep is 1 before the first sweep."""
     if mode == RANDOM:
         shuffle_blocks(order, first, end, rng)
     elif mode == SYMMETRIC and not first_sweep:

@@ -1,4 +1,4 @@
-"""Pairs of doubles: arithmetic on two numbers at once, each rounded as it would be alone.
+"""Pairs of doubles: arithmetic on two numbers at once, with the same rounding as on single numbers.
 
 A pair is a vector of gcc and clang, and arithmetic is written as on a double. Other compilers, and builds with
 LAVENDER_ONE_LANE, have pairs of one number; LANES is the number of numbers in a pair.

@@ -40,7 +40,7 @@ LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
 cdef inline void replace_empty_diagonal(int32_t m, double* d) noexcept nogil:
-    """Replace entries of d (m) that are not above 0 by the mean of the others, or by 1; NaN is kept."""
+    """Replace entries of d (m) [1/kg] that are not positive by the mean of the positive ones, or by 1 without any; keep NaN."""
     cdef int32_t i, count = 0
     cdef double total = 0.0, mean
     for i in range(m):
@@ -74,7 +74,7 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
         if empty[i]:
             d[i] = 0.0
         n_empty += empty[i]
-        step[i] = big                                   # row maximum, used by (3) below
+        step[i] = big                                   # Store the largest |A_ij| of the row, which (3) needs below.
     replace_empty_diagonal(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
@@ -88,7 +88,7 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
 
 
 cdef public void lav_compute_csr_velocity_weights(const blocks_t* p, double* nu) noexcept nogil:
-    """Compute nu (2) if only a matrix is known."""
+    """Compute nu (2) of a problem that is given by a matrix A."""
     compute_velocity_weights(p, p.d, nu)
 
 
@@ -197,7 +197,7 @@ cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const ge
 
 
 cdef void bind_derived_numbers(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
-    """Point p and g at the derived numbers."""
+    """Point d, nu, step of p and the panels of Y of g at the arrays of `derived`."""
     cdef ssize_t k = p.n_blocks, m = p.n_rows
     p.d = derived.numbers
     p.nu = derived.numbers + m + 1
@@ -212,7 +212,7 @@ cdef void bind_derived_numbers(blocks_t* p, generalized_t* g, const derived_t* d
 
 
 cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexcept nogil:
-    """Return `Data.entries_of_matrix`; on (n) is scratch: the number of rows of each tree, stored at its root."""
+    """Return the value of `Data.entries_of_matrix`. on (n) is scratch: at the root of each tree, the number of its rows."""
     cdef int32_t b, q, rows
     cdef double out = 0.0, dense = <double>g.m * g.m
     for b in range(g.n):
@@ -277,7 +277,7 @@ cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, 
 
 
 cdef class Workspace:
-    """Memory owned by a Python object, created in a quarter of the time of a NumPy array with a view."""
+    """Memory that is freed with its Python object. Creating it takes a quarter of the time of a NumPy array with a view."""
 
     def __dealloc__(self):
         free(self.at)
@@ -347,7 +347,7 @@ cdef class Data:
         free(self.derived.numbers)
 
     cdef view_t get_pointers(self) noexcept nogil:
-        """Return pointers into this object, which must outlive them."""
+        """Return the problem as structs that point into this object, which must live as long as they are used."""
         cdef view_t v = view_t(self.blocks, NULL, NULL, NULL)
         if self.is_general:
             v.g = &self.general
@@ -469,7 +469,7 @@ cdef class Data:
 
     @property
     def outside(self):
-        """First row with a d above the range of core/validate.pxd, or -1."""
+        """First row with a d above the valid range of core/validate.pxd, or -1 if there is none."""
         return find_invalid_number(self.blocks.d, self.blocks.n_rows)
 
     @property
@@ -497,7 +497,7 @@ cdef class Data:
 
     @property
     def products_of_matrix(self):
-        """Multiply-adds of A = Y Y^T, from J and M: the sum over columns of Y of the squared number of entries."""
+        """Multiply-adds of forming A = Y Y^T from J and M: the sum over columns of Y of (number of entries)^2."""
         cdef const generalized_t* g = &self.general
         cdef double[::1] on = np.zeros(g.n + 1)
         cdef int32_t b, q
@@ -577,7 +577,10 @@ cdef class Data:
 
 
 def make_generalized_data(Blocks blocks, b, Operator operator, compliance, int law):
-    """Create the data of a problem in generalised coordinates; `prepare` derives its numbers. law: COULOMB or CONE."""
+    """Create the data of a problem by J and M (`operator`); `compute_derived_numbers` derives its numbers.
+
+    law is COULOMB or CONE; b (m,) [m/s], compliance (m,) [1/kg].
+    """
     cdef Data data = Data.__new__(Data)
     data.keep = [blocks, b, operator, compliance]
     data.blocks = blocks.at

@@ -1,7 +1,7 @@
 """Slack w = A lam - b of one row [m/s] in forms of A in which rows are updated one by one, and the change of its impulse.
 
     csr_t            A in compressed rows                                    w = A lam - b
-    damped_csr_t     the same, with steps multiplied by omega
+    damped_csr_t     A in compressed rows, steps multiplied by omega         w = A lam - b
     stored_slack_t   slacks that do not change during a sweep, and omega     w as stored
     generalized_t    J and M, with velocities v = Y^T lam (nv)               w = Y v + compliance lam - b
 """
@@ -31,7 +31,7 @@ ctypedef fused row_form_t:
 
 
 cdef inline int32_t find_panel(const row_form_t* form, int32_t i) noexcept nogil:
-    """Return the panel of block i over J and M, else 0."""
+    """Return the panel of block i if the form is J and M, otherwise 0."""
     if row_form_t is generalized_t:
         return form.home[i]
     else:
@@ -40,7 +40,7 @@ cdef inline int32_t find_panel(const row_form_t* form, int32_t i) noexcept nogil
 
 cdef inline double compute_row_slack(const row_form_t* form, const blocks_t* p, int32_t panel, int32_t row, const double* lam,
                              const double* v) noexcept nogil:
-    """Return w of a row; panel: that of its block, v: read over J and M only."""
+    """Return the slack w [m/s] of a row. `panel` is `find_panel` of its block; v (nv) is read only if the form is J and M."""
     if row_form_t is csr_t:
         return csr_row_dot(form, row, lam) - p.b[row]
     elif row_form_t is damped_csr_t:
@@ -61,7 +61,7 @@ cdef inline double get_row_step(const row_form_t* form, const blocks_t* p, int32
 
 cdef inline void set_row_impulse(const row_form_t* form, int32_t panel, int32_t row, double impulse, double* lam,
                              double* v) noexcept nogil:
-    """Set the impulse of a row and update v."""
+    """Set the impulse [N s] of a row in lam (m), and update v (nv) if the form is J and M."""
     if row_form_t is generalized_t:
         add_scaled_whitened_row(form, panel, row, impulse - lam[row], v)
     lam[row] = impulse

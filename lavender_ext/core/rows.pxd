@@ -1,4 +1,4 @@
-"""The factored form: joint rows, compact contacts, and the bodies between them.
+"""The factored form of A: rows of joints, contacts stored by normal, tangent and arms, and the bodies on which these act.
 
 A body's velocity is six numbers (linear [m/s], angular [rad/s]). Body -1 is static: its velocity is zero and is never
 written. Relative velocity at a contact, from body a to body b:
@@ -72,7 +72,7 @@ cdef inline void apply_impulse_to_body(double* v, double inv_mass, const double*
 cdef inline void apply_impulse_to_bodies(double* v, int32_t a, int32_t b, const double* inv_mass,
                              const double* inv_inertia, const double* arm_a, const double* arm_b,
                              const double* impulse, const double* twist) noexcept nogil:
-    """Apply an impulse and a twist to both bodies by (3)."""
+    """Apply an impulse (3) [N s] and an angular impulse `twist` (3) [N m s] or NULL to the velocities of both bodies by (3)."""
     if a >= 0:
         apply_impulse_to_body(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
     if b >= 0:
@@ -147,7 +147,7 @@ cdef inline void form_contact_jacobian(const rows_t* r, int32_t c, int32_t nt, i
     for row in range(1 + nt + n_angular):
         for k in range(12):
             jac[12 * row + k] = 0.0
-        if row > nt:                                    # spin about n, rolling about t1 and t2
+        if row > nt:                                    # Spin is about n, rolling about t1 and t2.
             for k in range(3):
                 axis[k] = n[k] if row == nt + (n_angular & 1) else r.tangent[3 * c + k]
             if row == nt + (n_angular & 1) + 2:
@@ -279,7 +279,7 @@ cdef inline void compute_contact_delassus_block(const double* normal, const doub
 
 
 cdef inline double reciprocal_or_zero(double x) noexcept nogil:
-    """Return 1 / x, or 0 if x is not positive (a row that no impulse moves)."""
+    """Return 1 / x, or 0 if x is not positive, as for a row that no impulse moves."""
     return 1.0 / x if x > 0.0 else 0.0
 
 

@@ -22,7 +22,10 @@ cdef inline double get_csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept 
 
 
 cdef inline double largest_eigenvalue_of_csr_pair(const csr_t* a, int32_t j, const double* d, const double* big) noexcept nogil:
-    """Return lambda_max of (3) on rows j and j + 1, or d[j] if it is not clearly positive; big: largest entry of each row."""
+    """Return lambda_max of (3) on rows j and j + 1, or d[j] if lambda_max is zero or negative within rounding.
+
+    big (m) is the largest absolute entry of each row of A.
+    """
     cdef double scale = big[j] if big[j] > big[j + 1] else big[j + 1], e
     e = largest_eigenvalue_2x2(get_csr_entry(a, j, j), 0.5 * (get_csr_entry(a, j, j + 1) + get_csr_entry(a, j + 1, j)),
                            get_csr_entry(a, j + 1, j + 1))

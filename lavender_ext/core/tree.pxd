@@ -23,19 +23,19 @@ cdef inline double min_mass_pivot_ratio() noexcept nogil:
 
 
 cdef inline void sort_row_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
-    """Sort the columns of row k, the columns below k with the mark k, in ascending order.
+    """Sort cols (count), the columns of row k, in ascending order; mark[j] is k for these columns and no other j < k.
 
-    They are sorted by insertion, or collected by scanning the marks if that is cheaper.
+    The columns are sorted by insertion, or collected by scanning the marks if that is cheaper.
     """
     cdef int32_t i = 1, j, x, first
-    while i < count and cols[i - 1] < cols[i]:              # rows of a tree are already sorted
+    while i < count and cols[i - 1] < cols[i]:              # Rows of a tree are already sorted.
         i += 1
     if i >= count:
         return
     first = cols[0]
     for j in range(i, count):
         first = min(first, cols[j])
-    if <int64_t>count * count > 4 * <int64_t>(k - first):   # estimated cost of insertion
+    if <int64_t>count * count > 4 * <int64_t>(k - first):   # The left side estimates the cost of insertion.
         i = 0
         for j in range(first, k):
             if mark[j] == k:
@@ -57,8 +57,8 @@ cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, con
                                  int32_t* first_child) noexcept nogil:
     """Compute the pattern of L from the lower triangle of M; return the number of entries, -1 if `workspace` is too small.
 
-    The last row comes first. Row k has the entries of M and the fill-in of the rows with last column k. Rows are written
-    from the end of `lidx` backwards; at the end they are moved to the front, and `lptr` is adjusted.
+    Rows are computed from the last to the first. Row k has the entries of row k of M and those that the elimination of the
+    rows with last column k adds. Rows are written from the end of `lidx` backwards, and finally moved to its front.
     """
     cdef int32_t k, q, c, j, at = workspace, start, end
     for k in range(n):
@@ -107,7 +107,7 @@ cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, con
 cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """Compute L and 1 / D of (1) of a mass matrix; return -1, or the row with too small a pivot."""
+    """Compute L and 1 / D of (1) for a mass matrix; return -1, or the row of a pivot that is too small."""
     cdef int32_t k, q, j, first, count, at
     # copy M into the pattern of L
     for k in range(n):
@@ -134,7 +134,7 @@ cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* m
 
 cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                    double* inv_pivot, double min_pivot) noexcept nogil:
-    """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row with too small a pivot.
+    """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row of a pivot that is too small.
 
     lptr indexes both lidx and lval. `pivot` and `inv_pivot` contain the diagonal of M. A pivot is too small if it is at most
     `min_pivot` M_kk, or below `min_magnitude`. Consecutive rows of a chain, which have the same columns except themselves,
@@ -182,7 +182,7 @@ cdef inline void eliminate_chain_rows(const int32_t* lptr, const int32_t* lidx, 
     cdef bint are_zero = True
     for t in range(s):
         are_zero = are_zero and row[t][count] == 0.0
-    if are_zero:                                            # rows of contacts that do not push have no entries
+    if are_zero:                                            # Rows of contacts that do not push have no entries.
         return
     for t in range(s):
         z[t] = row[t][count] * inv_pivot[k - t]
@@ -190,7 +190,7 @@ cdef inline void eliminate_chain_rows(const int32_t* lptr, const int32_t* lidx, 
     if count > 0:
         while lidx[at] != lidx[first]:
             at += 1
-    if lptr[j + 1] - at == count:                           # row j has exactly these columns
+    if lptr[j + 1] - at == count:                           # Row j has exactly these columns.
         subtract_row_combination(lval + at, row, z, s, count)
     else:
         for b in range(count):

@@ -87,7 +87,7 @@ cdef inline double norm_inf(const double* x, int64_t n) noexcept nogil:
 
 cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
     """Return whether x holds neither NaN nor infinity."""
-    cdef double s = 0.0, t = 0.0, u = 0.0, v = 0.0      # These stay 0, or become NaN.
+    cdef double s = 0.0, t = 0.0, u = 0.0, v = 0.0      # Each sum stays 0, or becomes NaN after an infinite or NaN entry.
     cdef int64_t i = 0
     while i + 4 <= n:
         s += 0.0 * x[i]

@@ -96,7 +96,7 @@ cdef inline void compute_body_wrenches(const blocks_t* p, const rows_t* r, const
         j = p.ptr[i]
         nt = count_tangent_rows(p, i)
         n_angular = count_angular_rows(p, i)
-        if n_angular or nt == 1:                            # the two common kinds below have constant sizes
+        if n_angular or nt == 1:                            # The two common kinds below are compiled with constant sizes.
             add_contact_wrench(r, c, nt, n_angular, lam + j, f)
         elif nt == 2:
             add_contact_wrench(r, c, 2, 0, lam + j, f)

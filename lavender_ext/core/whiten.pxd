@@ -14,7 +14,7 @@ cdef inline int32_t collect_panel_columns(const generalized_t* g, int32_t first,
                                     int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
     """List the columns of Y in rows [first, last), unsorted, in out (n); return their number.
 
-    The columns are marked with `stamp`. `same` receives the number of them that were marked `previous`.
+    mark (n) receives `stamp` at these columns. `same` receives the number of these columns that had the mark `previous`.
     """
     cdef int32_t q, k, count = 0, n_same = 0
     for q in range(g.jptr[last] - 1, g.jptr[first] - 1, -1):
@@ -48,7 +48,7 @@ cdef inline void sort_descending_runs(int32_t* x, int32_t n) noexcept nogil:
 cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* ancestors,
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                int32_t* n_cols, double* n_values) noexcept nogil:
-    """Compute `find_panel_pattern` for at most 64 velocities, with column sets as bits; ancestors (n) is scratch."""
+    """Do what `find_panel_pattern` does for at most 64 velocities, with bit sets of columns; ancestors (n) is scratch."""
     cdef int32_t i, q, k, first, last, count = 0, previous_entries = -1, at = 0, n = 0, nv = g.n, end, entries, differs
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
@@ -180,7 +180,7 @@ cdef inline void whiten_panel(const generalized_t* g, int32_t panel, int32_t* pl
         z = root[k]
         x = y
         if count == a > 0 and lptr[cols[a - 1] + 1] - lptr[cols[a - 1]] == a - 1:
-            # two dense columns at once, with the same bits as one after the other
+            # Eliminate two dense columns at once, with the same bits as one after the other.
             a -= 1
             u = g.lval + lptr[cols[a]]
             for _i in range(rows):

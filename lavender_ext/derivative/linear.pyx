@@ -122,7 +122,10 @@ cdef public void lav_adjoint(const linearised_t* a, const double* y, const doubl
 
 
 cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to):
-    """Write the address of a contiguous float64 array (n,), acquired in `view`, or NULL for None; return whether it is valid."""
+    """Write the address of a contiguous float64 array (n,) to `to`, or NULL if it is None; return whether the array is valid.
+
+    The caller must release its buffer `view`.
+    """
     to[0] = NULL
     if array is None:
         return True
@@ -130,7 +133,7 @@ cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to
         return False
     try:
         PyObject_GetBuffer(array, view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
-    except ValueError:                                  # datetime arrays have no buffer
+    except ValueError:                                  # Arrays of datetime have no buffer.
         return False
     if view.format[0] != 100 or view.format[1] != 0 or view.ndim != 1 or view.shape[0] != n:    # "d"
         return False
@@ -140,7 +143,7 @@ cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to
 
 
 cdef void form_derivative_system(const linearised_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
-    """Compute G of H + shift, for A of J and M or in compressed rows; h (rows, rows + n) is scratch."""
+    """Compute g (rows, rows) = G of H + shift, for A from J and M or in compressed rows; h (rows, rows + n) is scratch."""
     cdef int32_t i, n = a.rows
     if v.g != NULL:
         form_scaled_generalized(v.g, n, a.system_row, a.x.root, h + <ssize_t>n * n, h)
@@ -152,7 +155,7 @@ cdef void form_derivative_system(const linearised_t* a, const view_t* v, double 
 
 
 cdef ssize_t count_projection_derivative_values(const blocks_t* b) noexcept nogil:
-    """Return the number of values of P."""
+    """Return the number of stored values of P: n for a block of n bounded rows, n^2 for a contact of n rows."""
     cdef int32_t i, n
     cdef ssize_t size = 0
     for i in range(b.n_blocks):
@@ -170,7 +173,7 @@ cdef void judge_and_linearise(linearised_t* a, const double* lam, double energy,
                            double* scratch) noexcept nogil:
     """Judge and linearise the impulse lam (m) of a.v; energy and velocity are the references of the zero impulse.
 
-    at (`linearisation_workspace_size`) is stored, scratch (m + `count_judge_scratch`) is not.
+    The results are stored in at (`linearisation_workspace_size`). scratch (m + `count_judge_scratch`) is free afterwards.
     """
     cdef const blocks_t* b = &a.v.p
     cdef int32_t m = b.n_rows
@@ -204,7 +207,7 @@ cdef ssize_t derivative_factor_scratch_size(int32_t n, const view_t* v) noexcept
 cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
     """Factor G of H + shift, with A of v; return whether it is regular.
 
-    at (`derivative_factor_workspace_size`) is stored, scratch (`derivative_factor_scratch_size`) is not.
+    The factor is stored in at (`derivative_factor_workspace_size`). scratch (`derivative_factor_scratch_size`) is free afterwards.
     """
     cdef int32_t i, n = a.rows
     cdef double smallest = 1.0 / 0.0, norm_inf = 0.0, x
@@ -224,7 +227,7 @@ cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shif
 
 
 cdef bint prepare_problem_data(Data p):
-    """Prepare p; return False if it has too many entries or d outside the valid range."""
+    """Compute the derived numbers of p; return False if it has too many entries, or a d outside the valid range."""
     try:
         p.compute_derived_numbers()
     except OverflowError:
@@ -270,9 +273,9 @@ cdef object copy_to_array(const void* x, Py_ssize_t n, dtype):
 
 
 cdef class Linear:
-    """One item of `Linears`. `solve` and `adjoint` use the last factor."""
+    """One linearised solution of `Linears`. `solve` and `adjoint` use the factor that `prepare` computed last."""
     cdef linearised_t at
-    cdef Data judge, data                               # data: the problem whose A is in G
+    cdef Data judge, data                               # the problem for the judge, and the problem with the A that is in G
     cdef Workspace workspace, factor
 
     @property

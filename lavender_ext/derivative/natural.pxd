@@ -174,7 +174,7 @@ cdef inline void multiply_block_derivatives(const natural_t* x, const blocks_t* 
                 out[j + k] = a[k] * v[j + k]
                 continue
             s = 0.0
-            if x.case_[j] == OPEN:                      # all zeros
+            if x.case_[j] == OPEN:                      # The block of an open contact is 0.
                 out[j + k] = s
                 continue
             for l in range(n):
@@ -230,7 +230,7 @@ cdef inline void form_scaled_generalized(const generalized_t* g, int32_t count, 
 
 cdef inline void form_reduced_system(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* system_row,
                              const double* h, double* g) noexcept nogil:
-    """Compute G (count, count) of (3) from H; system_row is row of G of each row, or -1."""
+    """Compute G (count, count) of (3) from H; system_row (m) is the row of G of each row, or -1."""
     cdef int32_t i, j, k, l, n, c
     cdef const double* p
     cdef double* row

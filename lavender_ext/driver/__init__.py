@@ -1,1 +1,1 @@
-"""Dispatch of solver methods (workspace size, start, step) on plain structs, for any host."""
+"""Calls of a method's functions (workspace size, start, step) on plain structs, for Python, C and WebAssembly."""

@@ -1,8 +1,8 @@
-"""Table of methods with the interface of `core/method.pxd`, and the three functions that dispatch to them.
+"""The methods with the interface of `core/method.pxd`, and the three functions that call the method for a problem's form.
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|
-| NEWTON | bounded rows, cones, Coulomb's law; dense | the same; sparse supernodes | the same, islands |
+| NEWTON | every law; dense factors | every law; sparse supernodes | every law; islands one by one |
 """
 from libc.stdint cimport int32_t
 

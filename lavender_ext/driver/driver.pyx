@@ -1,4 +1,4 @@
-"""Dispatch of workspace size, start and step to the methods, for any host, and a Python class."""
+"""The functions of `driver.pxd`, which call the method for a problem's form, and the class `Driver` for Python."""
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 
@@ -51,7 +51,7 @@ cdef class Driver(Method):
     max_values : float
         Maximum number of values of the matrix N of an island over J and M. A larger island is not accepted.
     work : float
-        Multiply-adds of a factorisation above which an island may be rejected without analysis.
+        Number of multiply-adds of a factorisation above which an island may be rejected without analysis.
 
     Notes
     -----
@@ -90,12 +90,12 @@ cdef class Driver(Method):
 
     @property
     def work(self):
-        """Multiply-adds of one factorisation; over J and M of N and a factor of each island."""
+        """Multiply-adds of one factorisation; over J and M, of forming and factoring N of every island."""
         return self.space.work
 
     @property
     def islands(self):
-        """Number of islands: independent problems without common velocities."""
+        """Number of islands, which are independent problems without common velocities."""
         return self.space.islands
 
     @property

@@ -46,7 +46,7 @@ cpdef enum:
     H_LOST = 16             # first body with a state that is not finite, or -1
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     H_STEPPER = 18          # method between collision detection and integration, see below
-    H_RELAXING = 19         # relaxing sweeps of SOFT_STEP: without bias, after the biased ones
+    H_RELAXING = 19         # number of relaxing sweeps of SOFT_STEP, which follow the sweeps with bias and have none
     H_FRICTION_SHAPE = 20   # 1: each tangent is bounded separately (box friction)
     N_HEAD = 24
 

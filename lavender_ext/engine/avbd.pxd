@@ -159,7 +159,7 @@ cdef inline void solve_cholesky_6x6(double* m, double* g) noexcept nogil:
         s = m[7 * j]
         for k in range(j):
             s -= m[6 * j + k] * m[6 * j + k]
-        m[7 * j] = sqrt(s) if s > 0.0 else 1.0 / 0.0        # a direction without a positive pivot, lost to rounding, does not move
+        m[7 * j] = sqrt(s) if s > 0.0 else 1.0 / 0.0        # If rounding leaves no positive pivot, this direction does not move.
         for i in range(j + 1, 6):
             s = m[6 * i + j]
             for k in range(j):
@@ -238,7 +238,7 @@ cdef inline void increase_stiffness(double* kappa, double kappa0, double error, 
 
 
 cdef inline void update_multipliers(engine_t* e) noexcept nogil:
-    """Set lambda = p for all rows, and increase the stiffness of rows inside their bounds."""
+    """Set lambda = p of (1) for all rows, and increase the stiffness of rows inside their bounds by (3)."""
     cdef int32_t i, c, row, k, sticks
     cdef double h = e.setting[S_H], beta = e.setting[S_RATIO], slop = e.setting[S_SLOP], x
     cdef double p[3]
@@ -287,7 +287,7 @@ cdef inline void warm_start_stiffness(engine_t* e, double gamma) noexcept nogil:
 
 
 cdef inline void run_avbd_substep(engine_t* e) noexcept nogil:
-    """Run the solve of a substep on the prepared rows and set dv = z/h - v*."""
+    """Solve the prepared rows of a substep by passes of (2) over all bodies, and set dv = z/h - v*."""
     cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, _pass
     cdef int32_t* first = e.order_scratch               # (nd + 1), followed by two entries per block
     cdef int32_t* rows = first + nd + 1

@@ -242,7 +242,7 @@ cdef inline int32_t remove_excluded_pairs(engine_t* e, int32_t n_pairs) noexcept
 
 
 cdef inline int32_t update_pair_list(engine_t* e) noexcept nogil:
-    """Rebuild the pair list if a body has left its box, and return the needed capacity (see CAP_PAIR)."""
+    """Rebuild the pair list if a body has left its box; return the number of pairs, for which CAP_PAIR must have places."""
     cdef int32_t n = e.size[N_BODY], i, j, k, n_pairs = 0
     cdef double half[3]
     cdef double enlargement = e.setting[S_MARGIN] + e.setting[S_SKIN]

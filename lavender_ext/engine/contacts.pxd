@@ -258,7 +258,7 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         if m.n == 0:
             continue
         if c + m.n > e.size[CAP_CONTACT]:
-            c += m.n                                    # beyond the capacity contacts are only counted
+            c += m.n                                    # Only count contacts beyond the capacity.
             continue
         mu = sqrt(e.friction[a] * e.friction[b])
         bounce = get_pair_restitution(e, a, b)
@@ -329,7 +329,7 @@ cdef inline void store_contact_cache(engine_t* e) noexcept nogil:
         elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
                 e.cache_roll[3 * at + k] = 0.0
-        if e.head[H_STEPPER] == AVBD:                   # AVBD has no spin row: the entry holds the contact's stiffness
+        if e.head[H_STEPPER] == AVBD:                   # AVBD has no spin rows; this entry then holds the contact's stiffness.
             p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):
             e.cache_local[6 * at + k] = e.local[6 * c + k]

@@ -35,7 +35,7 @@ cdef struct manifold_t:
 
 cdef inline void collide_sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
                                manifold_t* m) noexcept nogil:
-    """Collide two spheres."""
+    """Compute the manifold m of two spheres with centres xa, xb (3) and radii ra, rb [m]; empty beyond the margin."""
     cdef double d[3]
     cdef double s, f
     cdef int32_t k
@@ -47,12 +47,12 @@ cdef inline void collide_sphere_sphere(const double* xa, double ra, const double
     if s > min_magnitude():
         for k in range(3):
             m.normal[k] = d[k] / s
-    else:                                               # concentric: use a fixed normal
+    else:                                               # The spheres are concentric: use a fixed normal.
         s = 0.0
         m.normal[0] = 0.0
         m.normal[1] = 0.0
         m.normal[2] = 1.0
-    f = 0.5 * (ra - rb + s)                             # halfway between the surfaces
+    f = 0.5 * (ra - rb + s)                             # The point is halfway between the surfaces.
     add_scaled3(xa, f, m.normal, m.point)
     m.gap[0] = s - ra - rb
     m.feature[0] = 0
@@ -61,7 +61,7 @@ cdef inline void collide_sphere_sphere(const double* xa, double ra, const double
 
 cdef inline void collide_plane_sphere(const double* plane, const double* x, double r, double margin,
                               manifold_t* m) noexcept nogil:
-    """Collide a plane and a sphere."""
+    """Compute the manifold m of a plane (normal, offset) and a sphere with centre x (3) and radius r [m]."""
     cdef double gap = dot3(plane, x) - plane[3] - r
     if gap > margin:
         return
@@ -74,7 +74,10 @@ cdef inline void collide_plane_sphere(const double* plane, const double* x, doub
 
 cdef inline void collide_plane_box(const double* plane, const double* x, const double* rot, const double* half,
                            double margin, manifold_t* m) noexcept nogil:
-    """Collide a plane and a box: the four corners with the smallest gaps g + sum +-p_k, ties to the lower corner number."""
+    """Compute the manifold m of a plane and a box: the four corners with the smallest gaps g + sum +-p_k.
+
+    Of equal gaps, the lower corner number is taken first.
+    """
     cdef double p[3]
     cdef double gap[8]
     cdef double low, g = dot3(plane, x) - plane[3]
@@ -115,7 +118,7 @@ cdef inline void collide_plane_box(const double* plane, const double* x, const d
 
 cdef inline void collide_box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
                             double r, double margin, manifold_t* m) noexcept nogil:
-    """Collide a box and a sphere."""
+    """Compute the manifold m of a box (centre xa, axes rot, half extents) and a sphere (centre xb, radius r [m])."""
     cdef double d[3]
     cdef double c[3]
     cdef double near[3]
@@ -135,7 +138,7 @@ cdef inline void collide_box_sphere(const double* xa, const double* rot, const d
         s = sqrt(s)
         for k in range(3):
             d[k] = d[k] / s
-    else:                                               # the centre is inside: separate along the nearest face's normal
+    else:                                               # The centre is inside: separate along the nearest face's normal.
         best = -1.0 / 0.0
         for k in range(3):
             if fabs(c[k]) - half[k] > best:
@@ -400,7 +403,7 @@ cdef inline void build_edge_manifold(const double* xa, const double* ra, const d
 
 cdef inline void collide_box_box(const double* xa, const double* ra, const double* ha, const double* xb,
                          const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
-    """Collide two boxes: separating axis test, then a face or edge manifold on the axis of least penetration."""
+    """Compute the manifold m of two boxes: separating axis test, then a face or edge manifold on the axis of least penetration."""
     cdef double c[9]            # R_a^T R_b
     cdef double f[9]            # |c|
     cdef double d[3]
@@ -495,7 +498,7 @@ cdef inline void collide_bodies(const engine_t* e, int32_t a, int32_t b, double 
     if ka == BOX and kb == BOX:
         collide_box_box(xa, e.rot + 9 * a, sa, xb, e.rot + 9 * b, sb, margin, m)
         return
-    if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # swap: planes first, then boxes
+    if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # Exchange the bodies: planes come first, then boxes.
         flip = 1
         a, b = b, a
         ka, kb = kb, ka

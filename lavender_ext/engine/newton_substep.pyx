@@ -32,10 +32,12 @@ from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES
 
 
 cdef enum:
-    SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's, [2] needed
-    SCRATCH_TOO_SMALL = -2      # result of `plan`
+    # Number of integers at the beginning of scratch: [0] band width, [1] number of integers of Newton's method, which follow these,
+    # [2] needed number of integers in all.
+    SCRATCH_HEADER = 4
+    SCRATCH_TOO_SMALL = -2      # result of `lav_newton_plan` if scratch has too few integers
     INDEX_LIMIT = 2147483647
-    MAX_SUBSTEP_FACTORISATIONS = 200    # maximum in a substep, because a frame waits for them
+    MAX_SUBSTEP_FACTORISATIONS = 200    # maximum number of factorisations of a substep, because an image waits for the substep
 
 
 cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:
@@ -84,7 +86,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     if all_stages and bodies_workspace_size(&v, NULL, &n):
         scratch[1] = <int32_t>(available - own_index_size(&v))
         n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
-        start_newton_over_bodies(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
+        start_newton_over_bodies(&v, NULL, &n, NULL)                # Computes the pattern and the size of the other workspace.
         if n.is_bound:
             needed = n.n_real
         elif scratch[1] < n.n_index < INDEX_LIMIT - own_index_size(&v):
@@ -123,7 +125,7 @@ cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, war
         return result
     s.relative = 1.0 / 0.0
     if not zero_impulse_errors(p, &e0, &v0):
-        if e0 == 0.0 and v0 == 0.0:                     # lam = 0 is the solution
+        if e0 == 0.0 and v0 == 0.0:                     # The solution is lam = 0.
             for j in range(p.n_rows):
                 lam[j] = 0.0
             judge_impulse(p, r, s, lam, v, 1.0, 1.0)
@@ -219,7 +221,7 @@ cdef class Substep:
         self.noted = np.zeros((MAX_TRACED_SCORES if all_stages else 0, 3))
 
     cdef int _make_scratch(self, int32_t n) except -1:
-        """Allocate at least n scratch integers."""
+        """Make sure that scratch has at least n integers."""
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if 2 * self.scratch.shape[0] < n:

@@ -67,7 +67,7 @@ cdef inline void set_normal_impulse(engine_t* e, int32_t c, double impulse) noex
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
-    """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR at the start of the substep."""
+    """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR of the poses before the substep."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
     cdef double max_correction = e.setting[S_MAX_PUSH]

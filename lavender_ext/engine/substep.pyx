@@ -68,7 +68,7 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
         build_joint_rows(e)
     if e.head[H_STEPPER] == SOFT_STEP:
         for i in range(e.size[CAP_CONTACT] * e.size[ROWS_PER_CONTACT]):
-            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # a previous substep may have stopped between prepare and solve
+            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # Not 0 if the last substep stopped between prepare and solve.
     contacts = build_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
@@ -181,7 +181,7 @@ cdef inline void run_velocity_sweeps(engine_t* e, const blocks_t* p, const rows_
 cdef inline void run_position_stepper(engine_t* e) noexcept nogil:
     """Run a stepper over positions (XPBD, AVBD); its velocity residuals are undefined and set to NaN."""
     cdef int32_t k
-    cdef uint64_t nan = 0x7FF8000000000000              # as bits: the sign of 0/0 depends on the processor
+    cdef uint64_t nan = 0x7FF8000000000000              # NaN as bits, since the sign of 0/0 depends on the processor.
     if e.head[H_STEPPER] == XPBD:
         set_sweep_order_of_blocks(e)
         run_xpbd_substep(e)
@@ -222,7 +222,7 @@ cdef inline int32_t first_dynamic_body_of_pair(const engine_t* e, const int32_t*
 
 
 cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
-    """Return a dynamic body of the first block with a value that is not finite, or -1 if all values are finite."""
+    """Return a dynamic body of the first block with an impulse or error that is not finite, or -1 if all are finite."""
     cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
     cdef int32_t n_statistics = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
     if (all_finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and all_finite(e.gap, c)

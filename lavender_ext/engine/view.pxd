@@ -23,7 +23,7 @@ cdef inline void bind_substep_problem(const engine_t* e, blocks_t* p, rows_t* r)
     p.d = e.d
     p.nu = e.d
     p.step = e.step
-    p.islands = NULL                                    # the engine measures all bodies as one island
+    p.islands = NULL                                    # The engine measures all bodies as one island.
     r.n_bodies = e.size[N_DYNAMIC]
     r.n_joints = e.size[N_JOINT]
     r.n_contacts = e.head[H_CONTACTS]

@@ -18,7 +18,7 @@ cdef enum:
 
 
 cdef inline double invert_pivot_or_count_it(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
-    """Return 1 / p, or 0 for a small pivot, and count small and negative pivots."""
+    """Return 1 / p of pivot i, or 0 if p is small compared with `size`; count small and negative pivots in `out`."""
     if p < out.least * size:
         out.least = p / size
     if not p > tiny * size:
@@ -118,7 +118,7 @@ cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t wid
 
 
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
-    """Return the number of columns that have all `width` rows; they come first. It is 0 without rows (width 0)."""
+    """Return the number of columns that have all `width` rows, which come first; 0 if width is 0."""
     return n - width + 1 if n >= width > 0 else 0
 
 
@@ -142,7 +142,7 @@ cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const doub
 
 cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                              double* x) noexcept nogil:
-    """Solve with L for columns begin ... end - 1."""
+    """Overwrite x by forward substitution with columns begin ... end - 1 of L."""
     cdef int32_t i, last
     cdef const double* col
     for i in range(begin, end):
@@ -153,7 +153,7 @@ cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t
 
 cdef inline void back_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                           double* x) noexcept nogil:
-    """Solve with D L^T for columns end - 1 ... begin."""
+    """Overwrite x by back substitution with columns end - 1 ... begin of D L^T."""
     cdef int32_t i, t, last
     cdef double y
     cdef const double* col

@@ -16,8 +16,8 @@ cdef extern from *:
 
 
 cdef struct pivots_t:
-    int32_t small               # number of small pivots (up to tiny size_i); their rows and columns are left out of the solution
-    int32_t negative            # number of negative pivots, which are used
+    int32_t small               # number of small pivots, at most tiny size_i; the solution is 0 in their rows
+    int32_t negative            # number of negative pivots, with which solves work normally
     double least                # smallest p_i / size_i
     int32_t first_small         # index of the first small pivot, or -1
 

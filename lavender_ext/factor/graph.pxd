@@ -1,7 +1,7 @@
 """An elimination order of bodies, and the pattern of the matrix over them in that order.
 
-Bodies with a common block are neighbours. They are ordered by minimum degree (`minimum_degree.pxd`), with columns of one
-pattern adjacent.
+Bodies with a common block are neighbours. Bodies are ordered by minimum degree (`minimum_degree.pxd`), such that columns of the
+factor with the same pattern are adjacent.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy

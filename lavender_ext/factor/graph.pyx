@@ -44,21 +44,22 @@ cdef enum:
 
 
 def find_bodies_of_velocities(Data p, order):
-    """Group velocities of J and M to bodies of which each block touches at most two.
+    """Group the velocities of J and M to bodies, such that each block acts on at most two bodies.
 
-    A body is a run of at most six velocities, in the given order, of which neighbours are mostly in the same panels of Y.
+    A body is at most six velocities that follow each other in the original order. Successive velocities belong to one body if
+    they are mostly in the same panels of Y.
 
     Parameters
     ----------
     p : Data
     order : (nv,) int32 or None
-        That of `Generalized`.
+        Velocity of each row of the factor of M, as `Generalized.order`; None for the original order.
 
     Returns
     -------
     body (k, 2), n, column (nv,), or None
-        Bodies of each block, -1 if it touches fewer; number of bodies; 6 times the body of each velocity plus its index in it.
-        None if a block touches more than two.
+        Bodies of each block, -1 for a missing body; number of bodies; 6 times the body of each velocity plus its index in the
+        body. None if a block acts on more than two bodies.
     """
     p.compute_derived_numbers()
     cdef const generalized_t* g = &p.general

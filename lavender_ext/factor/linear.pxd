@@ -1,10 +1,10 @@
-"""One linear system A x = r, for every method that factors a matrix.
+"""One linear system A x = r with a dense, banded or sparse matrix, for every method that factors a matrix.
 
     kind     matrix                                       factor                                              source
     DENSE    full, row by row                             L L^T, or L U with row exchanges                    dense.pxd
     BAND     lower diagonals of a symmetric matrix        L D L^T, with the number of negative pivots         band.pxd
     ROWS     compressed rows of a symmetric pattern       L L^T, or L U with exchanges within supernodes      sparse.pxd
-    BLOCKS   square blocks of a symmetric pattern         the same                                            blocks.pxd
+    BLOCKS   square blocks of a symmetric pattern         L L^T, or L U with exchanges within supernodes      blocks.pxd
     TREE     rows of kinematic trees                      L^T D L                                             core/tree.pxd
 
     analyse     `analyse_dense`, ... set kind, order, pattern and cost; of ROWS and BLOCKS `LinearSystem` and `analyse_blocks`
@@ -19,7 +19,7 @@ D^-1/2 A D^-1/2. Exchanges within supernodes may lose digits that exchanges betw
 
     max |r - A x| <= BACKWARD_TOLERANCE (max |A_ij| max |x| + max |r|)                                              (3)
 
-The fallback is a factorisation by the caller: SuperLU of SciPy (`lavender/base/lu.py`), the only one.
+The fallback is a factorisation by the caller. There is one: SuperLU of SciPy (`lavender/base/lu.py`).
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -60,7 +60,7 @@ cdef struct linear_t:
     int32_t factored            # CHOLESKY, LU, FALLBACK or NO_FACTOR
     pivots_t pivots             # statistics of the pivots; `small` counts the lost ones
     # fields of DENSE, BAND and TREE
-    double* matrix              # (n, n), L U overwrites it; (n, width), overwritten; entries left of the diagonal, overwritten
+    double* matrix              # DENSE (n, n), overwritten by L U; BAND (n, width) and TREE (left of the diagonal), overwritten
     double* lower               # DENSE: (`cholesky_workspace_size`) L L^T
     double* scale               # (n) DENSE with d: D^-1/2 or smallest pivots; may be d itself. TREE: 1 / D
     int32_t* swap               # (n) DENSE: row exchanges of L U
@@ -77,7 +77,7 @@ cdef struct linear_t:
 
 
 cdef inline double backward_tolerance() noexcept nogil:
-    """Return the largest accepted backward error (3): thousands of roundings."""
+    """Return BACKWARD_TOLERANCE of (3) [-], which allows thousands of roundings."""
     return 1e-12
 
 
@@ -93,7 +93,10 @@ cdef inline void analyse_band(linear_t* f, int32_t n, int32_t width) noexcept no
 
 cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const int32_t* lidx, double* values,
                               double* diagonal) noexcept nogil:
-    """Set the pattern of L^T D L, with the entries of A left of the diagonal and on it; `scale` also has the diagonal."""
+    """Set the pattern of L^T D L and the arrays of A: entries left of the diagonal, and the diagonal (n).
+
+    `scale` must have the diagonal as well.
+    """
     f.kind, f.n, f.lptr, f.lidx, f.matrix, f.diagonal = TREE, n, lptr, lidx, values, diagonal
 
 

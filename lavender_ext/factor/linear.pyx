@@ -1,4 +1,4 @@
-"""One linear system: the functions of `linear.pxd`, compiled once, and `LinearSystem`, which gives Python the same system."""
+"""One linear system: the functions of `linear.pxd`, and the class `LinearSystem`, by which Python uses them."""
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -194,7 +194,7 @@ cdef inline void factor_compressed_rows(linear_t* f) noexcept nogil:
 
 
 cdef inline void replace_factor_by_fallback(linear_t* f) noexcept nogil:
-    """Replace the factor by the caller's fallback. Without a fallback, or if it fails, there is no factor afterwards."""
+    """Replace the factor by the caller's fallback. Without a fallback, or if it fails, the system then has no factor."""
     f.factored = NO_FACTOR
     if f.fallback != NULL and f.fallback.factor(f.fallback.at):
         f.factored, f.pivots.small = FALLBACK, 0
@@ -224,7 +224,7 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
 
 
 cdef void solve_linear_system(linear_t* f, double* x) noexcept nogil:
-    """Overwrite x (n) with the solution of the system with right-hand side x; infinite if there is no factor."""
+    """Overwrite the right-hand side x (n) with the solution, which is infinite if the system has no factor."""
     cdef int32_t j
     if f.factored == FALLBACK:
         f.fallback.solve(f.fallback.at, x)
@@ -390,8 +390,8 @@ cdef class LinearSystem:
     wide : bool
         Use four lanes if the processor has them; the bits are the same.
     splu : callable, optional
-        Factor this system's matrix another way: called with the system if pivots are lost in compressed rows; it returns an
-        object with `solve(r)`, or raises RuntimeError if the matrix is singular.
+        Fallback for a matrix in compressed rows: called with the system if pivots are lost, it factors the matrix and returns
+        an object with `solve(r)`, or raises RuntimeError if the matrix is singular.
     """
 
     def __init__(self, pattern, bint wide=True, splu=None):
@@ -435,7 +435,7 @@ cdef class LinearSystem:
         self.f.rows.indices = &index[0] if index.shape[0] else NULL
 
     cdef int allocate_factor_memory(self, bint lu) except -1:
-        """Allocate the memory that the next factorisation needs and earlier ones did not."""
+        """Allocate the memory that the next factorisation needs, L U or L L^T, unless it is allocated."""
         cdef int32_t n = self.f.n
         cdef int64_t size
         cdef double[::1] x
@@ -469,7 +469,7 @@ cdef class LinearSystem:
         return 0
 
     cpdef factor_rows_of_kernel(self, data, double tiny):
-        """Let a kernel form the entries of compressed rows in `data` (nnz,) and factor them, by L L^T or L U."""
+        """Prepare compressed rows for a kernel that writes the entries to `data` (nnz,) and factors them by L L^T or L U."""
         cdef double[::1] x = data
         self.allocate_factor_memory(True)
         self.data = data
@@ -490,7 +490,7 @@ cdef class LinearSystem:
         return self.f.cost
 
     def factor(self, data, d=None, double shift=0.0, double tiny=0.0, bint lu=False):
-        """Factor A + shift D, L U or L L^T; return how many pivots do not exceed tiny d.
+        """Factor A + shift D as L U (`lu`) or L L^T; return the number of pivots that do not exceed tiny d.
 
         Parameters
         ----------
@@ -498,7 +498,7 @@ cdef class LinearSystem:
             Entries of A. L L^T reads those at and after the diagonal in the order of elimination, or of each row of a full
             matrix, whose diagonal receives the shift; L U overwrites a full matrix.
         d : (n,) float64, optional
-            D > 0; default 1.
+            Diagonal of D, positive; default 1.
         """
         cdef const double[::1] metric
         cdef const double[::1] x = data.reshape(-1)         # a view of `data`
@@ -570,7 +570,7 @@ cdef class LinearSystem:
 
     @property
     def order(self):
-        """(n,) rows of a matrix in compressed rows, in the order of their elimination."""
+        """Row (n,) that is eliminated first, second, ...; for a matrix in compressed rows."""
         self.analyse()
         return self.analysis[0][:self.f.n]
 

@@ -54,7 +54,7 @@ cdef inline void insert_degree(quotient_t* g, int32_t i) noexcept nogil:
 
 
 cdef inline void compact_lists(quotient_t* g) noexcept nogil:
-    """Move the lists in use to the front, in their order. Meanwhile, the first entry of each list is -1 - its owner."""
+    """Move the lists in use to the front of `list` in their order; until a list is moved, its first entry is -1 - its owner."""
     cdef int32_t i, j, q = 0, to = 0, k
     for i in range(g.n):
         if g.kind[i] != GONE and g.length[i] > 0:

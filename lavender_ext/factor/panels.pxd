@@ -13,8 +13,8 @@ from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, solve_th
 
 
 cdef enum:
-    CHOLESKY_STRIP = 3          # Columns of (1) that are finished together, which is the width of a tile of `gemm_subtract_nt`.
-    LU_STRIP = 12               # Columns of (2) that are finished together, which is the width of four tiles.
+    CHOLESKY_STRIP = 3          # number of columns of (1) that are finished together: the width of a tile of `gemm_subtract_nt`
+    LU_STRIP = 12               # number of columns of (2) that are finished together: the width of four tiles
 
 
 cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a,

@@ -108,7 +108,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
     while q + n < end and f.row_indices[q + n] < after:
         n += 1
     low = f.local_row[f.row_indices[q]]
-    is_run = f.local_row[f.row_indices[end - 1]] - low == m - 1         # The rows are consecutive in the panel.
+    is_run = f.local_row[f.row_indices[end - 1]] - low == m - 1         # whether the rows are consecutive in the panel
     f.next_row[k] = q + n
     if not lu:
         if is_run:
@@ -139,7 +139,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
 
 
 cdef inline void clear_descendant_lists(const supernodal_t* f) noexcept nogil:
-    """Begin a factorisation; no supernode has updated another one yet."""
+    """Begin a factorisation: empty the lists of descendants that update a supernode next."""
     cdef int32_t i
     for i in range(f.supernodes):
         f.head[i] = -1

@@ -7,7 +7,7 @@ cdef enum:
 
 
 cdef inline double max_zero_fraction() noexcept nogil:
-    """Return the fraction of a panel that may be stored zeros. Products with more zeros cost more than larger panels save."""
+    """Return the largest fraction of a panel that may be zeros. With more zeros, products cost more than larger panels save."""
     return 0.1
 
 
@@ -129,7 +129,7 @@ cdef inline void apply_postorder(int32_t n, const int32_t* ptr, const int32_t* n
 
 cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_t* lind, const int32_t* size,
                                     int32_t* first) noexcept nogil:
-    """Merge adjacent vertices, each the parent of the one before, to supernodes; return their number.
+    """Merge adjacent vertices, each the parent of its predecessor, to supernodes; return the number of supernodes.
 
     first (n + 1) receives the first vertex of each supernode. A vertex has size (n) columns, or one if that is NULL. It joins the
     supernode before it if the fraction of stored zeros stays within `max_zero_fraction`.

@@ -1,6 +1,6 @@
 """Analysis of a sparse matrix for factorisation: rows of one pattern, an order of minimum degree, supernodes.
 
-Rows with the same columns are one vertex, whose size is their number.
+Consecutive rows with the same columns are one vertex; its size is the number of these rows.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -39,7 +39,7 @@ cdef public int32_t lav_find_equal_rows(int32_t n, const int32_t* indptr, const 
 
 cdef public int32_t lav_find_vertex_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* vertex,
                                           const int32_t* first, int32_t* ptr, int32_t* neighbour) noexcept nogil:
-    """List the neighbours of each vertex, without itself; return their total number. Columns must ascend."""
+    """List the neighbours of each vertex, without itself; return the length of all lists. Columns must ascend."""
     cdef int32_t k, q, j, last, total = 0
     for k in range(count):
         ptr[k] = total

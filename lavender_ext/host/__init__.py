@@ -1,1 +1,1 @@
-"""Functions for engine hosts without Python: solver values and growth of buffers."""
+"""Functions for programs without Python that contain the engine: solver values, and growth of the buffers."""

@@ -1,7 +1,7 @@
-"""Functions for engine hosts without Python: solver values, and growth of the buffers.
+"""Functions for programs without Python that contain the engine: solver values, and growth of the buffers.
 
-Such a host (WebAssembly, C) allocates every buffer itself. engine/arrays.pyx returns the offsets of the arrays in the order of
-`bind_engine_arrays`: the length of an array is the distance to the next array of the same buffer.
+Such a program (a web page, a C program) allocates every buffer itself. engine/arrays.pyx returns the offsets of the arrays in
+the order of `bind_engine_arrays`: the length of an array is the distance to the next array of the same buffer.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
@@ -33,7 +33,7 @@ cdef inline int32_t add_quarter_capacity(int32_t need) noexcept nogil:
 
 cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                       int32_t* out) noexcept nogil:
-    """Write sizes (N_SIZES) with capacity for the pairs and contacts that did not fit, and a quarter more."""
+    """Write sizes (N_SIZES) of buffers for the pairs and contacts that did not fit in the last substep, and a quarter more."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
@@ -55,7 +55,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
     bind_engine_arrays(size, real, index, keys, &a, used)
     bind_engine_arrays(to_size, to_real, to_index, to_keys, &b, used)
-    # Consecutive arrays of sizes that do not depend on the capacities are copied together.
+    # Copy consecutive arrays together if their sizes do not depend on the capacities.
     memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
     memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
     memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
@@ -65,7 +65,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
     memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
     memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
-    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # joint stiffness; the cache has the stiffness of contacts
+    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # Stiffness of joints; that of contacts is in the cache.
     memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 

@@ -21,7 +21,7 @@ from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
 cpdef enum:
-    # Equalities of at most this many rows form one block. Larger ones, as a flex with one row per edge, form single rows.
+    # An equality constraint of at most this many rows is one block. In a larger one, such as a flex, each row is a block.
     MAX_EQUALITY_ROWS = 6
     CODES = 8                   # number of kinds of constraints
 
@@ -64,7 +64,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                 upper[i + size] = inf
                 scale[i + size] = 1.0
                 size += 1
-            if size > MAX_EQUALITY_ROWS:                # single rows, because one block would couple every vertex
+            if size > MAX_EQUALITY_ROWS:                # Form single rows, because one block would couple every vertex.
                 count = size
                 size = 1
                 for j in range(1, count):
@@ -77,7 +77,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
         elif code <= 4:
             lower[i] = 0.0
             if k > 0 and (key[k - 1] | 0xFFFF) == (key[k] | 0xFFFF):
-                key[k] = key[k - 1] + 1                 # second limit of the same joint
+                key[k] = key[k - 1] + 1                 # This is the second limit of the joint.
         else:
             nth = 0
             j = of - 1
@@ -160,7 +160,7 @@ def make_blocks_of_rows(type_, id_, codes, tuple n_objects, dim, friction, geom,
 
 
 def scale_dense_rows(values, int32_t m, int32_t n, scale):
-    """Return (indptr, indices, data) of J with scaled rows, from at least m n values, row by row."""
+    """Return (indptr, indices, data) of J (m, n) with scaled rows, from its values row by row; further values are ignored."""
     cdef int32_t i, j, at = 0
     cdef double x
     cdef const double* value = as_double_pointer(values, values.size)
@@ -186,9 +186,9 @@ def scale_dense_rows(values, int32_t m, int32_t n, scale):
 
 
 def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
-    """Return (indptr, indices, data) of J with scaled rows, from compressed rows of n columns that may have gaps between them.
+    """Return (indptr, indices, data) of J with scaled rows, from rows of n columns that are given by first index and length.
 
-    None is returned if columns do not ascend, and the number of the first row with invalid indices if there is one.
+    The result is None if columns do not ascend, and a row's number if its indices are invalid (the first such row).
     """
     cdef int32_t i, m = <int32_t>len(scale), is_invalid
     cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)
@@ -235,9 +235,9 @@ def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
 def extract_lower_triangle_of_mass(first_, count_, columns, values, x, y, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
-    The denominator is max |y| if the ratio is then at most `bound`. Rows are given by first index and length and must be
-    consecutive; columns must ascend to the diagonal entry; otherwise the result is None. `like` is (indptr, indices) of a
-    lower triangle that is shared if it has the same pattern.
+    The second number is max |M x - y| / max |y| instead, if that is at most `bound`. Rows are given by first index and length.
+    The result is None if they are not consecutive or their columns do not ascend to the diagonal entry. `like` is (indptr,
+    indices) of a lower triangle; these arrays are reused if the pattern is the same.
     """
     cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
     cdef double gap = 0.0, big = 0.0
@@ -324,7 +324,7 @@ cdef bint has_row_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* fir
 
 
 def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
-    """Return the largest difference of the spatial velocities c (n, 6) from the ones that v (nv) gives, and the largest term.
+    """Compare the spatial velocities c (n, 6) with those that v (nv) gives; return the largest difference and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
 
@@ -332,7 +332,7 @@ def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
     """
     cdef Py_ssize_t i, j, k, n = len(v_), bodies = len(spatial)
     cdef double term, z
-    cdef double[6] big, gap, lost                       # per component; lost is 0, or NaN
+    cdef double[6] big, gap, lost                       # One number per component; lost is 0, or NaN after a NaN.
     if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
     cdef Workspace scratch = allocate_workspace(6 * bodies * sizeof(double))

@@ -45,7 +45,7 @@ cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noex
 
 
 cdef inline void copy_score_without_islands(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
-    """Write the score of a pass to `now` if the problem has no islands; otherwise the pass has already written it."""
+    """Write the score x of a pass to `now` if the problem has no islands; with islands the pass has written `now` itself."""
     if p.islands == NULL:
         s.now[0], s.now[1] = relative, x.energy if x.finite else INFINITY
 
@@ -81,9 +81,9 @@ cdef inline void store_better_start(best_t* s, const blocks_t* p, const double* 
 
 
 cdef inline bint store_better_islands(best_t* s, const blocks_t* p, const double* lam, double tol) noexcept nogil:
-    """Store lam (m), scored in `now`, in the islands in which it is better; return whether there is such an island.
+    """Store lam (m), scored in `now`, in the islands in which it is better; return whether it is better in any island.
 
-    The first impulse is a start.
+    The first impulse that is stored counts as a start.
     """
     cdef int32_t i
     cdef bint changed = False

@@ -84,7 +84,7 @@ cdef inline void judge_csr_block(const blocks_t* p, const csr_t* a, int32_t i, c
     cdef double size[6]
     for k in range(j, p.ptr[i + 1]):
         w[k] = csr_row_dot_with_abs_sum(a, k, lam, size + (0 if has_independent_rows(p, i) else k - j)) - p.b[k]
-        if has_independent_rows(p, i):                               # The block may have any number of rows.
+        if has_independent_rows(p, i):                               # Such a block may have any number of rows.
             add_row_floor(p, k, lam[k], w[k], size[0], f)
     compute_block_error(p, i, lam, w, e)
     add_block_error(p, i, e, s)

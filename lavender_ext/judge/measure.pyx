@@ -30,7 +30,10 @@ from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms, make_empty_
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                      score_t* out) noexcept nogil:
-    """Compute slack w (m), error e (m) and their norms; scratch (`count_judge_scratch`; half of it over bodies without a floor)."""
+    """Judge lam (m) [N s]: compute its slack w (m) [m/s], its error e (m) [N s] and the norms in `out`, with `floor` the floors.
+
+    scratch has `count_judge_scratch` doubles; half of these suffice over bodies without a floor.
+    """
     if v.g != NULL:
         judge_impulse_over_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
@@ -68,7 +71,7 @@ cdef void score_given_slack(const blocks_t* p, const double* lam, const double* 
 
 
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
-    """Compute `compute_reference` of judge/reference.pxd."""
+    """Call `compute_reference` of judge/reference.pxd, which is compiled here for other modules."""
     compute_reference(p, x, w, e, out)
 
 
@@ -127,7 +130,7 @@ def is_residual_at_floor(double relative_, double floor):
 def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
     """Compute slack w and error e; return (energy [sqrt J], velocity [m/s], relative residual, `residual_above_floor`).
 
-    All four are inf if a slack or an error is not finite. Without a floor the last is the relative residual.
+    All four numbers are inf if a slack or an error is not finite. Without a floor the last number is the relative residual.
     """
     cdef score_t s = make_empty_score()
     cdef double now, above
@@ -261,7 +264,7 @@ def all_finite(const double[::1] x):
 
 
 def compute_rhs_norms(Data p):
-    """Return b in the judge's two norms [sqrt J, m/s]."""
+    """Return the energy norm [sqrt J] and the velocity norm [m/s] of b."""
     cdef double energy, velocity
     with nogil:
         rhs_energy_and_velocity_norms(&p.blocks, &energy, &velocity)
@@ -305,7 +308,7 @@ def store_zero_impulse_residual(Data p):
 def residuals_by_island(Data p, const double[::1] lam):
     """Return the islands of the blocks (k,) and a table (n, 5) of an impulse (m,) [N s], with one row per island.
 
-    Columns: relative residual, E [sqrt J], V [m/s] (worst row), E0 [sqrt J], V0 [m/s]; the last two -1 if no row acts.
+    Columns: relative residual, E [sqrt J], V [m/s], E0 [sqrt J], V0 [m/s] of judge/score.pxd; E0 and V0 are -1 if no row acts.
     """
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.get_pointers()
@@ -339,7 +342,7 @@ def residuals_by_island(Data p, const double[::1] lam):
 
 
 def combine_best_islands(Data p, list starts, list impulses, double tol):
-    """Combine the best island impulses of starts and impulses (m,), compared by judge/best.pxd, in a new array."""
+    """Return a new impulse (m,) [N s]: for each island the best of the starts and the impulses (m,), by judge/best.pxd."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.get_pointers()
     cdef best_t best
@@ -457,7 +460,7 @@ def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t f
 
     Returns
     -------
-    r_p, r_d, gap, the three relative ones, and the largest of these
+    r_p, r_d, gap, the relative value of each, and the largest of the relative values
     """
     cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
     cdef const double* x = as_double_pointer(x_, n)
@@ -475,7 +478,7 @@ def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t f
     cdef Workspace workspace = allocate_workspace((n + 2 * m) * sizeof(double))
     cdef double* size = <double*>workspace.at
     cdef double* terms = size + n
-    cdef double* acts = terms + m                       # 1 for a row that acts, otherwise 0
+    cdef double* acts = terms + m                       # (m) 1 for a row that acts, otherwise 0
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
     cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, sums = 0.0
     cdef double uncancelled = 0.0, rows = 0.0, violation, own, scale, largest, floor

@@ -60,7 +60,7 @@ cdef inline void record_impulse(progress_t* s, int32_t at, const double* lam, in
 
 
 cdef inline int32_t residual_envelope_slope(const progress_t* s, double* fall, double* low) noexcept nogil:
-    """Return k of (1) at the last check, with f in `fall` and the later minimum in `low`; 0 if there are too few checks."""
+    """Return k of (1) at the last check, or 0 if there are too few checks; write f to `fall` and the later minimum to `low`."""
     cdef int32_t i = s.n - 1, first = s.n - N_STORED_CHECKS if s.n > N_STORED_CHECKS else 0, t, at, late_at = 0, early_at = 0
     cdef double late = 1.0 / 0.0, early = 1.0 / 0.0, r
     t = s.at[i % N_STORED_CHECKS] if i >= 0 else 0
@@ -108,7 +108,7 @@ cdef inline bint closes_gap_within(double gap, double closing_speed, double max_
 cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end,
                                         double slope,
                             double normal, double rate, double max_sweeps) noexcept nogil:
-    """Return whether rows [first, end), with norm at most slope times the normal, reach that bound in time."""
+    """Return whether the norm of rows [first, end) reaches its bound, slope times the normal, within `max_sweeps` sweeps."""
     cdef double size = 0.0, along = 0.0, v = 0.0
     cdef int32_t k
     for k in range(first, end):

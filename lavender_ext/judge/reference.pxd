@@ -103,7 +103,7 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
     If an error is not finite both are 0, which makes every relative residual infinite.
     """
     cdef int32_t a, i, k
-    cdef double energy = 0.0, fast = 0.0, check = 0.0       # check: 0, or NaN once a slack is not finite
+    cdef double energy = 0.0, fast = 0.0, check = 0.0       # check stays 0, or becomes NaN at a slack that is not finite.
     cdef bint rest = True
     cdef tally_t s = make_empty_tally()
     for a in range(first, end):
@@ -126,7 +126,7 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
         out[0], out[1] = sqrt(energy), sqrt(fast)
         return relative_residual(s.energy, s.fast, out[0], out[1])
     out[0] = out[1] = -1.0
-    return relative_residual_by_rows(p, order, first, end, e, 0.0)   # 0, or bounded by (1)
+    return relative_residual_by_rows(p, order, first, end, e, 0.0)   # This is 0, or small because of (1).
 
 
 cdef inline void compute_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
@@ -153,5 +153,5 @@ cdef inline void compute_reference(blocks_t* p, const double* x, const double* w
 
 
 cdef inline bint reference_needs_islands(const blocks_t* p, const double* out) noexcept nogil:
-    """Return whether (3) applies to a problem without an islands list, which then needs one."""
+    """Return whether (3) applies to a problem that has no list of islands. (3) requires such a list."""
     return p.islands == NULL and out[0] < 0.0 and p.n_rows > 0

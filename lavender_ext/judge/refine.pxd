@@ -104,7 +104,7 @@ cdef inline double estimate_factor_loss(const blocks_t* p, const generalized_t* 
     """
     cdef int32_t i = 0
     cdef double energy = 0.0, other = 0.0, nu = 0.0, size
-    while i + 2 <= p.n_rows:                            # two sums, to halve the latency of the additions
+    while i + 2 <= p.n_rows:                            # Two sums halve the latency of the additions.
         energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
         other += lam[i + 1] * (w[i + 1] + (p.b[i + 1] - g.compliance[i + 1] * lam[i + 1]))
         nu = p.nu[i] if p.nu[i] > nu else nu
@@ -114,9 +114,9 @@ cdef inline double estimate_factor_loss(const blocks_t* p, const generalized_t* 
         energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
         nu = p.nu[i] if p.nu[i] > nu else nu
     energy += other
-    if g.n == 0 or energy == 0.0:                       # no impulse moves anything
+    if g.n == 0 or energy == 0.0:                       # The impulse changes no velocity.
         return 0.0
-    energy = sqrt(fabs(energy))                         # negative only by rounding
+    energy = sqrt(fabs(energy))                         # `energy` is negative only by rounding.
     take_smallest_island_reference(p, &reference_energy, &reference_velocity)
     size = 0.1 * relative_residual(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
     size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
@@ -144,7 +144,7 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
         x_low[i] = 0.0
     solve_mass_matrix(g, x)
     norm = dot(force, x, n)
-    norm = last = sqrt(fabs(norm))                    # negative only by rounding
+    norm = last = sqrt(fabs(norm))                    # `norm` is negative only by rounding.
     for _step in range(MAX_CORRECTIONS):
         memcpy(r, force, n * sizeof(double))
         memcpy(r_low, force_low, n * sizeof(double))
@@ -152,7 +152,7 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
         for i in range(n):
             r[i] += r_low[i]
             r_low[i] = r[i]
-        solve_mass_matrix(g, r_low)                            # the correction
+        solve_mass_matrix(g, r_low)                            # Computes the correction.
         size = sqrt(fabs(dot(r, r_low, n)))
         if not size < 0.5 * last:
             return 2.0 * last

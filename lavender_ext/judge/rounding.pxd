@@ -126,7 +126,7 @@ cdef inline double relative_size_of_change(const blocks_t* p, int32_t island, co
             if not v <= velocity:
                 velocity = v
             v = sqrt(square[k])
-            if v > own * fabs(p.b[k]):                  # relative to the row's own terms
+            if v > own * fabs(p.b[k]):                  # The change is compared with the row's own terms.
                 own = v / fabs(p.b[k]) if p.b[k] != 0.0 else 1.0 / 0.0
     return own if island >= 0 and e0 < 0.0 else relative_residual(sqrt(energy), velocity, e0, v0)
 

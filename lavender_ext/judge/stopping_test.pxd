@@ -46,8 +46,8 @@ cdef struct stopping_test_t:
     int32_t last_at             # sweeps at the last check
     int32_t best_at             # sweeps at the last better check, -1 before any
     int32_t patience            # minimum number of sweeps without a better check before a run stalls
-    int32_t again_at            # best_at of the impulse from which the run was restarted, 0 before any restart
-    double start                # largest relative residual of the first N_EARLY_SWEEPS sweeps
+    int32_t again_at            # value of best_at at the last restart, 0 before any restart
+    double start                # largest relative residual of checks in the first N_EARLY_SWEEPS sweeps
     double last                 # relative residual at the last check
     double best_relative        # relative residual of `best`
     double lowest               # lowest relative residual of all checks
@@ -106,5 +106,5 @@ cdef class StoppingTest:
     cdef object keep
     cdef view_t view
     cdef view_t other
-    cdef const view_t* confirm  # pointer to `other`, or NULL
+    cdef const view_t* confirm  # address of `other`, or NULL if no status needs confirmation in another form
     cdef stopping_test_t state

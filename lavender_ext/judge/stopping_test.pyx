@@ -106,7 +106,7 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_residual_of_check(s, &x)
-    if now <= tol:                                      # repeat the pass with a floor
+    if now <= tol:                                      # Repeat the pass with a floor.
         now = judge_with_refinement(s, v, lam, tol, &x, &refined)
     elif needs_floor(s, p, lam):
         now = judge_with_floor(s, v, lam, &x)
@@ -127,7 +127,7 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     if not lost or s.best.seen > 0:
         store_better_islands(&s.best, p, lam, tol)
         s.best_relative = relative_residual_of_best(&s.best)
-    if s.best_relative <= tol:                          # islands were solved at different checks
+    if s.best_relative <= tol:                          # The islands were solved at different checks.
         x = make_empty_score()
         last = judge_with_refinement(s, v, s.best.impulse, tol, &x, &refined)
         end = CONVERGED if last <= tol else status_after_refinement(s, &x, last, tol) if refined else RUNNING
@@ -184,7 +184,7 @@ cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view
     cdef int32_t status = RUNNING
     if not tol > 0.0:
         return RUNNING
-    if s.total >= s.check_at:                           # total exceeds check_at after sweeps without checks
+    if s.total >= s.check_at:                           # `total` may exceed `check_at` after sweeps without checks.
         status = perform_residual_check(s, v, lam, tol)
         if confirm != NULL and (status == CONVERGED or status == AT_FLOOR):
             status = confirm_status_in_other_form(s, confirm, lam, tol, status)

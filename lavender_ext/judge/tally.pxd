@@ -60,7 +60,7 @@ cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* o
 
 
 cdef inline tally_t make_empty_tally() noexcept nogil:
-    """Return the tally of no rows."""
+    """Return a tally to which no row has been added."""
     cdef tally_t s
     s.energy = 0.0
     s.fast = -1.0
@@ -69,7 +69,7 @@ cdef inline tally_t make_empty_tally() noexcept nogil:
 
 
 cdef inline void add_row_error(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
-    """Add the error e of row k."""
+    """Add the error e [N s] of row k to the tally s."""
     cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
     s.energy += v * e
     if t > s.fast:
@@ -78,7 +78,7 @@ cdef inline void add_row_error(const blocks_t* p, int32_t k, double e, tally_t* 
 
 
 cdef inline void add_pair_error(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
-    """Add the errors of rows k and k + 1; the maximum is over the norm of the two."""
+    """Add the errors of rows k and k + 1 to the tally s; the norm of both errors enters its maximum."""
     cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
     s.energy += x * e[k] + y * e[k + 1]
     x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
@@ -88,7 +88,7 @@ cdef inline void add_pair_error(const blocks_t* p, int32_t k, const double* e, t
 
 
 cdef inline void add_block_error(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
-    """Add the errors of block i; e (m) is the error of all rows."""
+    """Add the errors of block i to the tally s; e (m) [N s] has the errors of all rows."""
     cdef int32_t k, g, j = p.ptr[i]
     cdef friction_components_t q
     if has_independent_rows(p, i):
@@ -155,7 +155,7 @@ cdef inline void rhs_energy_and_velocity_norms(const blocks_t* p, double* energy
 
 
 cdef inline floor_t make_empty_floor() noexcept nogil:
-    """Return the floor of no rows."""
+    """Return a floor to which no row has been added."""
     return floor_t(0.0, 0.0, 0.0)
 
 
@@ -291,10 +291,10 @@ cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const do
                               const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
     """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
 
-    A problem without an islands list has only the sums, from which the caller computes the relative residual.
+    If the problem has no list of islands, only the sums are added; the caller computes the relative residual from them.
     """
     cdef double now, floor = 0.0
-    cdef double check = 0.0                             # This stays 0, or becomes NaN.
+    cdef double check = 0.0                             # This stays 0, or becomes NaN at an infinite or NaN slack.
     cdef int32_t a, i, k
     if p.islands == NULL:
         total[0] = s[0]
