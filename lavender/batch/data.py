@@ -33,6 +33,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
+from lavender_ext.core.checks import are_lower_triangles_valid, are_pointers_valid
 from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
 
 __all__ = ["Batch"]
@@ -501,12 +502,12 @@ def _compute_offsets(sizes: Any) -> np.ndarray:
 
 def _check_world_pointers(name: str, value: Any) -> np.ndarray:
     """Convert pointers of worlds to an array (n + 1,); raise InputError for invalid ones."""
-    ptr = as_array(name, value, (None,), dtype=np.int32).astype(np.int64)
-    if not len(ptr) or ptr[0] != 0 or (np.diff(ptr) < 0).any():
+    ptr = as_array(name, value, (None,), dtype=np.int32)
+    if not are_pointers_valid(ptr, 0):
         raise InputError(
             f"{name} must start with 0 and must not decrease: the first index of each world, then their total number"
         )
-    return ptr
+    return ptr.astype(np.int64)
 
 
 def check_shared_lower_triangles(
@@ -520,13 +521,7 @@ def check_shared_lower_triangles(
         for name, x in zip(("indices of M", "indptr of M"), arrays, strict=True)
     )
     nv = len(ptr) - 1
-    row = np.repeat(np.arange(nv), np.maximum(np.diff(ptr), 0))
-    is_valid = nv >= 0 and ptr[:1] == 0 and (np.diff(ptr) > 0).all() and len(row) == len(col)
-    if (
-        not is_valid
-        or (col[ptr[1:] - 1] != np.arange(nv)).any()
-        or not (np.diff(col)[np.diff(row) == 0] > 0).all()
-    ):
+    if not are_lower_triangles_valid(ptr, col):
         raise InputError("M must hold lower triangles: ascending columns in each row, the diagonal last")
     if (nvs != nv).any() or values.ndim != 2 or values.shape[1] != len(col):
         raise InputError(

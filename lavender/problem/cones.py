@@ -53,7 +53,7 @@ from lavender.problem.friction import (
     convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, is_increasing_from_zero
+from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, are_pointers_valid
 
 __all__ = [
     "CONTACT",
@@ -74,15 +74,15 @@ ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE
 CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
 # Messages name the product of mu and patch_radius so.
 SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"
-# For each kind of contact: minimum and maximum number of rows, its name, and its permitted rows.
+# For each kind of contact: its name, and its permitted rows, for messages.
 CONTACT_ROWS = {
-    CONTACT: (1, 3, "a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
-    CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are allowed"),
-    ROUND: (4, 6, "a round cone", "a normal and three to five tangents (2 sliding, 1 spin, 2 rolling) are allowed"),
-    CONTACT_BOX: (3, 3, "a box", "a normal and two tangents are needed"),
-    CONTACT_ROLLING: (5, 6, "a contact with rolling",
+    CONTACT: ("a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
+    CONTACT_SPIN: ("a contact with spin", "a normal, up to two tangents and one spin row are allowed"),
+    ROUND: ("a round cone", "a normal and three to five tangents (2 sliding, 1 spin, 2 rolling) are allowed"),
+    CONTACT_BOX: ("a box", "a normal and two tangents are needed"),
+    CONTACT_ROLLING: ("a contact with rolling",
                       "a normal, two tangents, optionally a spin row, and two rolling rows are needed: 5 or 6"),
-    CONTACT_ELLIPSE: (3, 3, "an ellipse", "a normal and two tangents are needed"),
+    CONTACT_ELLIPSE: ("an ellipse", "a normal and two tangents are needed"),
 }  # fmt: skip
 
 
@@ -187,7 +187,7 @@ class Cones:
     def _convert_fields(self) -> tuple[np.ndarray, ...]:
         """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
-        if not is_increasing_from_zero(ptr):
+        if not are_pointers_valid(ptr, 1):
             raise InputError(
                 "cones.ptr must start with 0 and increase: the first row of each block, then the number of "
                 "rows"
@@ -200,7 +200,7 @@ class Cones:
                 f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
                 f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
             )
-        kind = _check_block_kinds(kind, np.diff(ptr))
+        kind = _simplify_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
         upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
         check_not_nan("lower", lower)
@@ -597,7 +597,10 @@ def get_block_kinds(
 
 def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoReturn:
     """Raise the InputError of a fault (`lavender_ext/core/faults.pxd`) of a block or row."""
-    _, kind, lower, upper, mu, radius, rolling = fields
+    ptr, kind, lower, upper, mu, radius, rolling = fields
+    if fault == "kind":
+        name, requirement = CONTACT_ROWS[int(kind[index])]
+        raise InputError(f"block {index} is {name} of {ptr[index + 1] - ptr[index]} rows; {requirement}")
     if fault == "bounds":
         raise InputError(
             f"row {index}: lower = {lower[index]}, upper = {upper[index]}; a finite number must lie "
@@ -611,7 +614,7 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     if fault in ("lower", "upper"):
         bound = lower if fault == "lower" else upper
         check_finite_and_in_range(
-            fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(fields[0])), 0.0, bound), "N s"
+            fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(ptr)), 0.0, bound), "N s"
         )
     check_nonnegative_magnitudes("mu", mu, "-")
     check_nonnegative_magnitudes("patch_radius", radius, "m")
@@ -620,20 +623,10 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     raise InputError(f"block {index} is invalid: {fault}")
 
 
-def _check_block_kinds(kind: IntArray, size: IntArray) -> IntArray:
-    """Return the kinds of blocks after a check of their numbers of rows.
-
-    A round cone of up to two tangents, or a box of one, becomes a CONTACT.
-    """
+def _simplify_kinds(kind: IntArray, size: IntArray) -> IntArray:
+    """Return the kinds of blocks; a round cone of up to two tangents, or a box of one, becomes a CONTACT."""
     is_disk = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
-    if is_disk.any():
-        kind = np.where(is_disk, CONTACT, kind).astype(np.int32)
-        kind.flags.writeable = False
-    for contact_kind, (min_rows, max_rows, name, requirement) in CONTACT_ROWS.items():
-        bad = np.flatnonzero((kind == contact_kind) & ((size < min_rows) | (size > max_rows)))
-        if len(bad):
-            raise InputError(f"block {bad[0]} is {name} of {size[bad[0]]} rows; {requirement}")
-    return kind
+    return mark_read_only(np.where(is_disk, CONTACT, kind).astype(np.int32)) if is_disk.any() else kind
 
 
 def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
-from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
+from lavender_ext.core.checks import MIN_MAGNITUDE, is_rhs_valid
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import make_generalized_data
 from lavender_ext.judge import measure
@@ -352,8 +352,8 @@ class ProblemData:
 
 def _check_rhs(b: FloatArray) -> None:
     """Raise InputError if the largest |b_i| [m/s] is not 0 but below MIN_MAGNITUDE."""
-    max_abs = max_abs_of_array(b)
-    if 0.0 < max_abs < MIN_MAGNITUDE:
+    if not is_rhs_valid(b):
+        max_abs = np.abs(b).max()
         raise InputError(
             f"b [m/s] is {max_abs:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
             f"{MIN_MAGNITUDE:g}: another unit of length or time brings it nearer to 1"

@@ -140,7 +140,7 @@ class Rows:
         masses, normals = get_shape("inv_mass", self.inv_mass), get_shape("normal", self.normal)
         n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
-        if not checks.is_increasing_from_zero(ptr):
+        if not checks.are_pointers_valid(ptr, 1):
             raise InputError(
                 "joint_ptr must start with 0 and increase: the first row of each joint, then the "
                 "number of joint rows"
@@ -201,27 +201,17 @@ class Rows:
 
     def _orthonormalise_frames(self) -> None:
         """Orthonormalise normals and tangents that float32 has rounded; raise InputError for larger errors."""
-        n, t = self.normal, self.tangent
-        with np.errstate(over="ignore", invalid="ignore"):
-            cosine = np.einsum("ij,ij->i", n, t)
-            errors = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, cosine]
-            # A NaN comes from inf - inf and counts as an infinite error.
-            error = np.nan_to_num(np.abs(np.stack(errors)).max(axis=0), nan=np.inf, posinf=np.inf)
-        if error.max() > MAX_CORRECTED_ERROR:
-            i = int(np.argmax(error))
+        normal, tangent = self.normal.copy(), self.tangent.copy()
+        i, error = checks.correct_frames(normal, tangent, MAX_UNCORRECTED_ERROR)
+        if error > MAX_CORRECTED_ERROR:
             raise InputError(
-                f"contact {i}: normal {n[i]} and tangent {t[i]} must be orthogonal unit vectors; they are off by "
-                f"{error[i]:.2g}, and up to {MAX_CORRECTED_ERROR:g} (float32 leaves 1e-7) is corrected: divide each by "
-                "its length, after the part along the normal was taken out of the tangent"
+                f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be orthogonal unit vectors; "
+                f"they are off by {error:.2g}, and up to {MAX_CORRECTED_ERROR:g} (float32 leaves 1e-7) is corrected: "
+                "divide each by its length, after the part along the normal was taken out of the tangent"
             )
-        if error.max() <= MAX_UNCORRECTED_ERROR:
-            return
-        n = n / np.linalg.norm(n, axis=1)[:, None]
-        t = t - np.einsum("ij,ij->i", n, t)[:, None] * n
-        t /= np.linalg.norm(t, axis=1)[:, None]
-        is_corrected = (error > MAX_UNCORRECTED_ERROR)[:, None]
-        object.__setattr__(self, "normal", mark_read_only(np.where(is_corrected, n, self.normal)))
-        object.__setattr__(self, "tangent", mark_read_only(np.where(is_corrected, t, self.tangent)))
+        if error > MAX_UNCORRECTED_ERROR:
+            object.__setattr__(self, "normal", mark_read_only(normal))
+            object.__setattr__(self, "tangent", mark_read_only(tangent))
 
     @property
     def n_bodies(self) -> int:

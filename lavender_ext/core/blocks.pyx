@@ -3,12 +3,12 @@
 The same work in ten NumPy calls takes longer than a solve of eight rows. If a function returns None, the arrays need
 conversion, or have a fault of core/faults.pxd: `lavender.problem.cones` converts them and raises.
 """
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.core.arrays cimport DOUBLE, INT, make_read_only, has_element_type, ndarray
-from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault
+from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault, find_body_block_fault
 from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, bind_friction_arrays,
                                             blocks_t, choose_contact_kind, write_contact_bounds)
 
@@ -151,11 +151,9 @@ def concatenate_blocks(list each):
 def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
     """Return whether the blocks are ROW blocks with these pointers, followed only by contacts without round cones."""
     cdef int32_t i, kj = <int32_t>joint_ptr.shape[0] - 1
-    if kj > blocks.at.n_blocks or blocks.has_round:
+    cdef int64_t index
+    if kj > blocks.at.n_blocks or find_body_block_fault(&blocks.at, kj, &index) != NO_FAULT:
         return False
-    for i in range(blocks.at.n_blocks):
-        if (blocks.at.kind[i] == ROW) != (i < kj):
-            return False
     for i in range(kj + 1):
         if blocks.at.ptr[i] != joint_ptr[i]:
             return False

@@ -6,7 +6,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core cimport validate
 from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, as_double_pointer, as_int_pointer, has_element_type, ndarray
-from lavender_ext.core.faults cimport body_tolerances_t, find_body_fault as find_body_fault_of
+from lavender_ext.core.faults cimport (NO_FAULT, body_tolerances_t, find_body_fault as find_body_fault_of, find_matrix_fault,
+                                        find_pointer_fault, is_valid_rhs, measure_frame_error, orthonormalise_frame)
 from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number, max_magnitude, min_magnitude
 from lavender_ext.core.view cimport rows_t
 
@@ -14,6 +15,7 @@ from lavender_ext.core.view cimport rows_t
 FAULT_NAMES = (
     "", "pointers", "kind", "mu", "patch_radius", "spin", "rolling", "bounds", "lower", "upper", "mass", "inertia_size",
     "inertia", "joint_body", "joint_pair", "contact_body", "contact_pair", "frame", "column", "diagonal", "ratio",
+    "number", "small_rhs", "body_block",
 )
 #: The largest and the smallest nonzero magnitude of a number of a problem.
 MAX_MAGNITUDE, MIN_MAGNITUDE = max_magnitude(), min_magnitude()
@@ -68,15 +70,37 @@ def has_negative_number(const double[::1] x):
     return False
 
 
-def is_increasing_from_zero(const int32_t[::1] ptr):
-    """Return whether the pointers begin with 0 and strictly increase."""
-    cdef Py_ssize_t i
-    if ptr.shape[0] == 0 or ptr[0] != 0:
-        return False
-    for i in range(1, ptr.shape[0]):
-        if ptr[i] <= ptr[i - 1]:
-            return False
-    return True
+def are_pointers_valid(const int32_t[::1] ptr, int min_size):
+    """Return whether the pointers begin with 0 and increase by at least min_size."""
+    return ptr.shape[0] > 0 and find_pointer_fault(&ptr[0], ptr.shape[0] - 1, 2147483647, min_size) < 0
+
+
+def is_rhs_valid(const double[::1] b):
+    """Return whether a right-hand side has no fault (core/faults.pxd)."""
+    return b.shape[0] == 0 or is_valid_rhs(&b[0], b.shape[0])
+
+
+def are_lower_triangles_valid(const int32_t[::1] indptr, const int32_t[::1] indices):
+    """Return whether this is the pattern of a lower triangle in compressed rows, with every diagonal entry."""
+    cdef int64_t index
+    cdef int32_t n = <int32_t>indptr.shape[0] - 1, entries = <int32_t>indices.shape[0]
+    return n >= 0 and find_matrix_fault(&indptr[0], &indices[0] if entries else NULL, n, n, entries, True, &index) == NO_FAULT
+
+
+def correct_frames(double[:, ::1] normal, double[:, ::1] tangent, double min_error):
+    """Orthonormalise the frames (c, 3) that are off by more than min_error; return the index of the largest error, and this error.
+
+    Errors are those before the correction.
+    """
+    cdef Py_ssize_t i, worst = 0
+    cdef double error, largest = -1.0
+    for i in range(normal.shape[0]):
+        error = measure_frame_error(&normal[i, 0], &tangent[i, 0])
+        if error > largest:
+            worst, largest = i, error
+        if error > min_error:
+            orthonormalise_frame(&normal[i, 0], &tangent[i, 0])
+    return worst, largest
 
 
 def find_body_fault(inv_mass, inv_inertia, joint_body, contact_body, normal, tangent, bint checks_inertia):

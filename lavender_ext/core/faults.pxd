@@ -6,10 +6,10 @@ messages. core/validate.pxd defines the ranges. All checks compare so that NaN i
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block_types cimport CONTACT_BOX, ROW, blocks_t, allows_rows
-from lavender_ext.core.validate cimport (find_invalid_magnitude, has_invalid_number, is_zero_or_definite_inertia,
-                                         is_orthonormal_pair, is_valid_number,
-                                         is_valid_magnitude, min_magnitude, norm_inf)
+from lavender_ext.core.block_types cimport CONTACT_BOX, ROUND, ROW, blocks_t, allows_rows
+from lavender_ext.core.validate cimport (find_invalid_magnitude, find_invalid_number, has_invalid_number,
+                                         is_orthonormal_pair, is_valid_magnitude, is_valid_number,
+                                         is_zero_or_definite_inertia, min_magnitude, norm_inf)
 from lavender_ext.core.view cimport rows_t
 
 
@@ -35,6 +35,9 @@ cdef enum:                      # faults, and what their index counts; `checks.F
     FAULT_COLUMN = 18           # entry of a matrix in compressed rows: columns do not ascend within their range
     FAULT_DIAGONAL = 19         # row of a lower triangle without a diagonal entry at its end
     FAULT_RATIO = 20            # block: mu_2 / mu_1 of an ellipse is out of range
+    FAULT_NUMBER = 21           # entry of a right-hand side: not finite, or out of range
+    FAULT_SMALL_RHS = 22        # the largest entry of a right-hand side is too small
+    FAULT_BODY_BLOCK = 23       # block: joints are not followed by contacts without round cones
 
 cdef enum:
     CONTACT_ELLIPSE = 7         # Only Python has this kind: kernels solve and judge `Problem.disk`.
@@ -45,6 +48,19 @@ cdef struct body_tolerances_t:
     double skew                 # permitted asymmetry of an inverse inertia, relative to its largest entry
     double shift                # An inverse inertia plus shift times its largest entry must be positive definite,
     double pivot                # with pivots above this fraction of its largest entry.
+
+
+# -- pointers ----------------------------------------------------------------------------------------------------
+
+cdef inline int64_t find_pointer_fault(const int32_t* ptr, int64_t n, int32_t end, int32_t min_size) noexcept nogil:
+    """Return the first of n + 1 pointers that is not 0, at least `min_size` above the last one, and at most `end`, or -1."""
+    cdef int64_t i
+    if ptr[0] != 0:
+        return 0
+    for i in range(1, n + 1):
+        if not <int64_t>ptr[i - 1] + min_size <= ptr[i] <= end:
+            return i
+    return -1
 
 
 # -- blocks ------------------------------------------------------------------------------------------------------
@@ -77,10 +93,9 @@ cdef inline int32_t find_block_fault(const blocks_t* p, int64_t* index) noexcept
     """Return the first fault of the blocks. Arrays that are NULL have their defaults: single, unbounded rows without friction."""
     cdef int32_t i, j, kind, first, end, fault
     cdef double max_ratio = 2.0**60                     # upper bound of mu_2 / mu_1 and mu_1 / mu_2 of an ellipse
-    for i in range(p.n_blocks + 1 if p.ptr != NULL else 0):
-        if p.ptr[i] != 0 if i == 0 else not p.ptr[i - 1] < p.ptr[i] <= p.n_rows:
-            index[0] = i
-            return FAULT_POINTERS
+    index[0] = find_pointer_fault(p.ptr, p.n_blocks, p.n_rows, 1) if p.ptr != NULL else -1
+    if index[0] >= 0:
+        return FAULT_POINTERS
     if (p.ptr[p.n_blocks] if p.ptr != NULL else p.n_blocks) != p.n_rows:
         index[0] = p.n_blocks
         return FAULT_POINTERS
@@ -100,6 +115,17 @@ cdef inline int32_t find_block_fault(const blocks_t* p, int64_t* index) noexcept
             if fault != NO_FAULT:
                 index[0] = j
                 return fault
+    return NO_FAULT
+
+
+cdef inline int32_t find_body_block_fault(const blocks_t* p, int32_t n_joints, int64_t* index) noexcept nogil:
+    """Return the fault of the first block that is not a joint, among the first n_joints blocks, or not a contact after them."""
+    cdef int32_t i, kind
+    for i in range(p.n_blocks):
+        index[0] = i
+        kind = p.kind[i] if p.kind != NULL else ROW
+        if (kind == ROW) != (i < n_joints) or kind == ROUND:
+            return FAULT_BODY_BLOCK
     return NO_FAULT
 
 
@@ -128,6 +154,20 @@ cdef inline double measure_frame_error(const double* n, const double* t) noexcep
     if is_orthonormal_pair(n, t, 5e-10):
         return 0.0
     return max(max(fabs(sqrt(nn) - 1.0), fabs(sqrt(tt) - 1.0)), fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]))
+
+
+cdef inline void orthonormalise_frame(double* n, double* t) noexcept nogil:
+    """Divide n by its length, take the part along n out of t, and divide t by its length."""
+    cdef int32_t k
+    cdef double size = sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), along = 0.0
+    for k in range(3):
+        n[k] /= size
+    along = n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
+    for k in range(3):
+        t[k] -= along * n[k]
+    size = sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+    for k in range(3):
+        t[k] /= size
 
 
 cdef inline int32_t find_body_fault(const rows_t* r, const body_tolerances_t* tolerances, int64_t* index) noexcept nogil:
@@ -160,19 +200,27 @@ cdef inline int32_t find_body_fault(const rows_t* r, const body_tolerances_t* to
 
 # -- right-hand sides and matrices -------------------------------------------------------------------------------
 
+cdef inline int32_t find_rhs_fault(const double* b, int64_t m, int64_t* index) noexcept nogil:
+    """Return the first fault of a right-hand side: every |b_i| must satisfy (1) of core/validate.pxd, the largest one (2)."""
+    index[0] = find_invalid_number(b, m) if has_invalid_number(b, m) else 0
+    if m > 0 and not is_valid_number(b[index[0]]):
+        return FAULT_NUMBER
+    return FAULT_SMALL_RHS if 0.0 < norm_inf(b, m) < min_magnitude() else NO_FAULT
+
+
 cdef inline bint is_valid_rhs(const double* b, int64_t m) noexcept nogil:
-    """Return whether every |b_i| satisfies (1) and the largest (2) of core/validate.pxd."""
-    return not has_invalid_number(b, m) and not 0.0 < norm_inf(b, m) < min_magnitude()
+    """Return whether a right-hand side has no fault."""
+    cdef int64_t index
+    return find_rhs_fault(b, m, &index) == NO_FAULT
 
 
 cdef inline int32_t find_matrix_fault(const int32_t* ptr, const int32_t* column, int32_t n_rows, int32_t n_columns,
                                       int32_t n_entries, bint is_lower, int64_t* index) noexcept nogil:
     """Return the first fault of a matrix in compressed rows; a lower triangle needs a diagonal entry in every row."""
     cdef int32_t i, k
-    for i in range(n_rows + 1):
-        if ptr[i] != 0 if i == 0 else not ptr[i - 1] <= ptr[i] <= n_entries:
-            index[0] = i
-            return FAULT_POINTERS
+    index[0] = find_pointer_fault(ptr, n_rows, n_entries, 0)
+    if index[0] >= 0:
+        return FAULT_POINTERS
     if ptr[n_rows] != n_entries:
         index[0] = n_rows
         return FAULT_POINTERS

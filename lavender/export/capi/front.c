@@ -243,10 +243,12 @@ static int32_t check_blocks(const lav_problem *q, where_t *at) {
     case core_faults_FAULT_LOWER: return refuse(at, LAV_ERROR_NUMBER, "lower", index);
     case core_faults_FAULT_UPPER: return refuse(at, LAV_ERROR_NUMBER, "upper", index);
   }
-  for (i = 0; q->form == LAV_BODIES && i < q->n_blocks; i++) {
-    const int32_t kind = q->kind ? q->kind[i] : LAV_ROW, rows = q->block_ptr ? q->block_ptr[i + 1] - q->block_ptr[i] : 1;
-    if ((kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (kind == LAV_CONTACT && rows == 1 && q->mu && q->mu[i] > 0.0) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
+  if (q->form != LAV_BODIES) return LAV_OK;
+  if (core_faults_find_body_block_fault(&p, q->n_joints, &index))
+    return refuse(at, q->kind && q->kind[index] == LAV_ROUND ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_BLOCKS, "kind", index);
+  for (i = q->n_joints; q->mu && i < q->n_blocks; i++) {
+    const int32_t rows = q->block_ptr ? q->block_ptr[i + 1] - q->block_ptr[i] : 1;
+    if (q->kind[i] == LAV_CONTACT && rows == 1 && q->mu[i] > 0.0) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
   }
   return LAV_OK;
 }
@@ -325,6 +327,7 @@ static int32_t check_velocities(const lav_problem *q, where_t *at) {
 
 static int32_t check_problem(const lav_problem *q, where_t *at) {
   const int64_t m = q->n_rows;
+  int64_t at_fault;
   int32_t i;
   GIVE_BACK(check_counts(q));
   GIVE_BACK(check_blocks(q, at));
@@ -333,10 +336,8 @@ static int32_t check_problem(const lav_problem *q, where_t *at) {
   OPTIONAL(compliance, m);
   for (i = 0; q->impulse && i < m; i++) /* The size is not limited: the judge measures it. */
     if (!isfinite(q->impulse[i])) return refuse(at, LAV_ERROR_NUMBER, "impulse", i);
-  for (i = 0; q->compliance && i < m; i++) {
-    if (q->compliance[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "compliance", i);
-    if (!core_validate_is_valid_magnitude(q->compliance[i])) return refuse(at, LAV_ERROR_NUMBER, "compliance", i);
-  }
+  at_fault = q->compliance ? core_validate_find_invalid_magnitude(q->compliance, m) : -1;
+  if (at_fault >= 0) return refuse(at, q->compliance[at_fault] < 0.0 ? LAV_ERROR_MASS : LAV_ERROR_NUMBER, "compliance", at_fault);
   if (q->form == LAV_BODIES) return check_bodies(q, at);
   if (q->form == LAV_VELOCITIES) return check_velocities(q, at);
   if (m > 0 && (!q->b || !q->value)) return refuse(at, LAV_ERROR_NULL, q->b ? "value" : "b", 0);

@@ -186,18 +186,12 @@ static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const do
 
 /* Copy the frames of contacts; correct those that are only accurate to float32: n / |n|, then t orthogonalised and normalised. */
 static void fill_frames(lav_solver *s, const lav_problem *q) {
-  double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent, size, along;
-  int32_t i, k;
+  double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent;
+  int32_t i;
   COPY(normal, q->normal, 3 * (int64_t)s->r.n_contacts);
   COPY(tangent, q->tangent, 3 * (int64_t)s->r.n_contacts);
   for (i = 0; i < s->r.n_contacts; i++, normal += 3, tangent += 3) {
-    if (core_faults_measure_frame_error(normal, tangent) <= EXACT) continue;
-    size = sqrt(core_rows_dot3(normal, normal));
-    for (k = 0; k < 3; k++) normal[k] /= size;
-    along = core_rows_dot3(normal, tangent);
-    for (k = 0; k < 3; k++) tangent[k] -= along * normal[k];
-    size = sqrt(core_rows_dot3(tangent, tangent));
-    for (k = 0; k < 3; k++) tangent[k] /= size;
+    if (!(core_faults_measure_frame_error(normal, tangent) <= EXACT)) core_faults_orthonormalise_frame(normal, tangent);
   }
 }
 
@@ -304,10 +298,9 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
 /* Check the range of computed numbers: b, and A_ii of J and M. */
 static int32_t check_derived(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows;
-  const double top = core_validate_norm_inf(s->p.b, m);
-  int64_t i = core_validate_find_invalid_number(s->p.b, m);
-  if (i >= 0) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
-  if (!core_validate_is_valid_magnitude(top)) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", 0);
+  int64_t i = 0;
+  const int32_t fault = core_faults_find_rhs_fault(s->p.b, m, &i);
+  if (fault) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
   i = core_validate_find_invalid_number(s->p.d, m);
   return i < 0 ? LAV_OK : refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", i);
 }
