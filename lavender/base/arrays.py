@@ -62,7 +62,9 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name} is not an array of numbers ({error})") from None
+            raise InputError(
+                f"{name} cannot be converted to an array ({error}); an array of numbers is needed"
+            ) from None
     if getattr(value, "requires_grad", False):
         raise InputError(
             f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
@@ -158,7 +160,7 @@ def as_array(
         and array.size
         and not np.array_equal(array, np.rint(array))
     ):
-        raise InputError(f"{label} must hold whole numbers")
+        raise InputError(f"{label} holds {array[array != np.rint(array)][0]:g}; whole numbers are needed")
     if array.ndim == 0 and len(shape) == 1 and shape[0] is not None:
         array = np.full(shape[0], array)
         copy = False
@@ -172,7 +174,10 @@ def as_array(
         required = f"({sizes}{',' * (len(shape) == 1)})"
         raise InputError(f"{label} has shape {array.shape}; {required} is needed")
     if dtype is np.int32 and array.size and (float(array.min()) < -(2**31) or float(array.max()) >= 2**31):
-        raise InputError(f"{label} holds numbers beyond 32 bits")
+        raise InputError(
+            f"{label} holds a number beyond 32 bits (from {array.min():g} to {array.max():g}); numbers from "
+            "-2^31 to 2^31 - 1 are needed"
+        )
     if array.dtype.itemsize > 8:
         array = _round_to_float64(array)
     array = np.array(array, dtype, order="C") if copy else np.require(array, dtype, ["C", "A", "E"])
@@ -211,7 +216,10 @@ def check_unmasked(name: str, value: Any) -> None:
     if hasattr(value, "mask") and np.ma.is_masked(value):
         masked = np.argwhere(np.ma.getmaskarray(value))
         index = ", ".join(map(str, masked[0]))
-        raise InputError(f"{name} has no value at [{index}], {len(masked)} masked in all: fill them")
+        raise InputError(
+            f"{name} is masked at [{index}] ({len(masked)} masked entries); an array without masked entries "
+            f"is needed: replace them, for example with {name}.filled(0.0)"
+        )
 
 
 def get_shape(name: str, value: Any) -> tuple[int, ...]:
@@ -219,7 +227,9 @@ def get_shape(name: str, value: Any) -> tuple[int, ...]:
     try:
         return np.shape(value)
     except ValueError as error:
-        raise InputError(f"{name} is not an array of numbers ({error})") from None
+        raise InputError(
+            f"{name} cannot be converted to an array ({error}); an array of numbers is needed"
+        ) from None
 
 
 def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
@@ -251,7 +261,7 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
     is_scalar = isinstance(i, np.ndarray) and i.ndim == 0 and i.dtype.kind in "iu"
     if is_scalar or (isinstance(i, (int, np.integer)) and not isinstance(i, (bool, np.timedelta64))):
         if not -n <= i < n:
-            raise IndexError(f"{thing} {i}; there are {n}")
+            raise IndexError(f"{thing} {i} does not exist; there are {n}, numbered from 0")
         return range(n)[i]
     check_unmasked(name, i)
     entries = check_sequence(name, i, "whole numbers, or a mask,")
@@ -330,7 +340,7 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         The matrix has too many nonzeros, invalid indices or pointers, or entries that are not finite real numbers.
     """
     if value.nnz >= 2**31:
-        raise InputError(f"{name} has {value.nnz} nonzeros, more than 32-bit indices reach{too_many}")
+        raise InputError(f"{name} has {value.nnz} nonzeros; at most 2^31 - 1 can be indexed{too_many}")
     if value.dtype.kind not in "buif":
         raise InputError(f"{name} has dtype {value.dtype}; real numbers are needed")
     try:
@@ -376,8 +386,8 @@ def check_finite(name: str, array: np.ndarray, csr: Any = None) -> None:
     if not all_finite(array.reshape(-1)):
         bad = np.argwhere(~np.isfinite(array))
         raise InputError(
-            f"{name} must be finite; entry [{_format_index(bad[0], csr)}] is {array[tuple(bad[0])]}, "
-            f"{len(bad)} in all"
+            f"{name} must be finite; entry [{_format_index(bad[0], csr)}] is {array[tuple(bad[0])]} "
+            f"({len(bad)} such entries)"
         )
 
 
@@ -397,7 +407,7 @@ def check_finite_and_in_range(name: str, array: np.ndarray, unit: str = "", csr:
     bad = np.argwhere(np.abs(array) > MAX_MAGNITUDE)
     raise InputError(
         f"{name} must be at most {MAX_MAGNITUDE:g} in size; entry [{_format_index(bad[0], csr)}] is "
-        f"{array[tuple(bad[0])]:g}, {len(bad)} in all: {_suggest_unit(unit)}"
+        f"{array[tuple(bad[0])]:g} ({len(bad)} such entries): {_suggest_unit(unit)}"
     )
 
 
@@ -428,7 +438,7 @@ def check_not_nan(name: str, array: np.ndarray) -> None:
     """Raise InputError at the first NaN of an array."""
     bad = np.flatnonzero(np.isnan(array))
     if len(bad):
-        raise InputError(f"{name} must not be NaN; entry [{bad[0]}] is, {len(bad)} in all")
+        raise InputError(f"{name} must not be NaN; entry [{bad[0]}] is NaN ({len(bad)} such entries)")
 
 
 def check_not_negative(name: str, array: np.ndarray) -> None:
@@ -445,7 +455,7 @@ def check_sequence(name: str, value: Any, things: str) -> list[Any]:
         isinstance(value, Iterable) and getattr(value, "ndim", 1) != 0 and not isinstance(value, type)
     )
     if isinstance(value, (str, bytes)) or not is_sequence or issparse(value):
-        raise InputError(f"{name}: {value!r:.60}; a sequence of {things} is needed")
+        raise InputError(f"{name} is {value!r:.60}; a sequence of {things} is needed")
     return list(value)
 
 
@@ -460,7 +470,7 @@ def as_names(things: str, value: Any, count: int) -> tuple[str, ...]:
     """Return names of `count` things as a tuple; raise InputError for another number of names."""
     names = tuple(map(str, check_sequence(f"names of {things}", value, f"{count} words")))
     if len(names) != count:
-        raise InputError(f"{len(names)} names for {count} {things}; one for each is needed")
+        raise InputError(f"names has {len(names)} entries for {count} {things}; one name for each is needed")
     return names
 
 

@@ -176,7 +176,10 @@ class ProcessBackend:
                 process.stdin.flush()
                 text_size, array_size = struct.unpack("<QQ", _read_bytes(process.stdout, 16))
                 if text_size > MAX_TEXT_SIZE or array_size > max_bytes:
-                    raise InvalidAnswer(f"answers of {text_size} and {array_size} bytes are too large")
+                    raise InvalidAnswer(
+                        f"the answer has {text_size} bytes of text and {array_size} bytes of arrays; at "
+                        f"most {MAX_TEXT_SIZE} and {max_bytes} are accepted"
+                    )
                 received.append(
                     (_read_bytes(process.stdout, text_size), _read_bytes(process.stdout, array_size))
                 )
@@ -273,7 +276,9 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
         values, start, arrays = np.frombuffer(numbers, float), 0, []
         for size in fields.pop("sizes"):
             if size is not None and not 0 <= size <= len(values) - start:
-                raise ValueError("arrays of another length")
+                raise ValueError(
+                    f"the answer announces an array of {size} numbers; {len(values) - start} numbers remain"
+                )
             arrays.append(None if size is None else values[start : start + size].copy())
             start += size or 0
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:

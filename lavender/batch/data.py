@@ -228,7 +228,9 @@ class Batch(Sequence[Problem]):
             raise InputError(f"fields is {fields!r:.60}; a mapping of arrays of Rows is needed")
         unknown = set(fields) - set(n_axes)
         if unknown:
-            raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(n_axes)}")
+            raise InputError(
+                f"fields has the unknown names {sorted(unknown)}; the arrays of Rows are {', '.join(n_axes)}"
+            )
         for name, x in (*fields.items(), *bounds.items()):
             get_shape(name, x)
             check_unmasked(name, x)
@@ -238,7 +240,8 @@ class Batch(Sequence[Problem]):
         lengths |= {len(x) for x in more.values() if isinstance(x, np.ndarray) and x.ndim == 2}
         if len(lengths) != 1:
             raise InputError(
-                f"stacked arrays are of {sorted(lengths)} worlds; one number of them, in at least one array, is needed"
+                f"the stacked arrays have {sorted(lengths) or 'no'} worlds; at least one array with a first "
+                "axis of worlds is needed, and all such arrays must have the same number of worlds"
             )
         n = lengths.pop()
         batch = cls._make_empty(n, 0, more.get("friction", "coulomb"), "float64")
@@ -297,15 +300,16 @@ class Batch(Sequence[Problem]):
                 else "; one Cones for all worlds needs worlds of equal size: give a list of Cones"
             )
             raise InputError(
-                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed, without "
-                f"padding rows{alternative}"
+                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} are needed, the rows of all "
+                f"worlds without padding rows{alternative}"
             )
         ends = first + sizes
         block, last = np.searchsorted(cones.ptr, first), np.searchsorted(cones.ptr, ends)
         bad = np.flatnonzero((cones.ptr[block] != first) | (cones.ptr[last] != ends))
         if len(bad):
             raise InputError(
-                f"a block of the cones begins in world {bad[0]} and ends in the next; or their sizes differ"
+                f"the blocks of the cones do not begin and end with the {sizes[bad[0]]} rows of world "
+                f"{bad[0]}; every block must belong to one world: give a list with one Cones for each world"
             )
         at[:, PLACE["block"]], at[:, PLACE["blocks"]], at[:, PLACE["cone_row"]] = block, last - block, first
 
@@ -374,8 +378,8 @@ class Batch(Sequence[Problem]):
         problem = Problem.from_rows(Rows(**fields), **bounds)
         if i and problem.m != self.shape[1]:
             raise InputError(
-                f"this world has {problem.m} rows, the first world {self.shape[1]}: give tangents=, because "
-                "contacts with mu 0 have no tangents by default"
+                f"this world has {problem.m} rows, the first world {self.shape[1]}; all worlds need the "
+                "same number: give tangents=, because contacts with mu 0 have no tangents by default"
             )
         return problem
 
@@ -505,7 +509,8 @@ def _check_world_pointers(name: str, value: Any) -> np.ndarray:
     ptr = as_array(name, value, (None,), dtype=np.int32)
     if not are_pointers_valid(ptr, 0):
         raise InputError(
-            f"{name} must start with 0 and must not decrease: the first index of each world, then their total number"
+            f"{name} is {ptr.tolist()!s:.60}; it must start with 0 and must not decrease: the first index "
+            "of each world, then their total number"
         )
     return ptr.astype(np.int64)
 
@@ -515,18 +520,23 @@ def check_shared_lower_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
     if len(arrays) != 2:
-        raise InputError(f"M is a tuple of {1 + len(arrays)}; (values, indices, indptr) is needed")
+        raise InputError(
+            f"M is a tuple of {1 + len(arrays)} arrays; three are needed: (values, indices, indptr)"
+        )
     col, ptr = (
         as_array(name, x, (None,), dtype=np.int32)
         for name, x in zip(("indices of M", "indptr of M"), arrays, strict=True)
     )
     nv = len(ptr) - 1
     if not are_lower_triangles_valid(ptr, col):
-        raise InputError("M must hold lower triangles: ascending columns in each row, the diagonal last")
+        raise InputError(
+            "the indices and indptr of M do not describe a lower triangle; every row needs ascending columns, "
+            "with the diagonal entry last"
+        )
     if (nvs != nv).any() or values.ndim != 2 or values.shape[1] != len(col):
         raise InputError(
-            f"M has values of shape {values.shape} for {len(col)} entries of {nv} velocities; (worlds, entries), and "
-            f"one number of velocities in all worlds, are needed"
+            f"values of M have shape {values.shape}, and its pattern has {len(col)} entries of {nv} "
+            f"velocities; (worlds, {len(col)}) is needed, and {nv} velocities in every world"
         )
     return ptr, col
 

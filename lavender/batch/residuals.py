@@ -340,7 +340,8 @@ def residual_many(
         for i, start in enumerate(starts):
             if start is None:
                 raise InputError(
-                    f"impulses of world {i} is None, and the problem has no guess; (m,) is needed"
+                    f"impulses[{i}] is None, and problem {i} has no guess that could be judged instead; an "
+                    f"array ({worlds[i].m},) [N s] is needed"
                 )
         precisions = [p.precision if precision is None else precision for p in worlds]
     residuals = Residuals(worlds, starts, precisions, threshold, like)
@@ -363,7 +364,10 @@ def check_problems(problems: Any, errors: str) -> Any:
     """Return a batch, or a list of problems; raise InputError for other arguments or an unknown `errors`."""
     check_choice("errors", errors, ERRORS)
     if isinstance(problems, Problem):
-        raise InputError("problems is one Problem; a list of them is needed, or `solve`")
+        raise InputError(
+            "problems is one Problem; a list of problems is needed: use [problem], or `lavender.solve` and "
+            "`lavender.residual`, which take one problem"
+        )
     if isinstance(problems, Batch):
         return problems
     problems = check_sequence("problems", problems, "Problems, or a Batch,")
@@ -377,7 +381,10 @@ def convert_impulses_or_guesses(problems: Any, impulses: Any) -> list[Any]:
     """Convert the impulses (m,) [N s] of each problem; its guess replaces None."""
     impulses = check_sequence("impulses", impulses, "(m,), one for each problem,")
     if len(impulses) != len(problems):
-        raise InputError(f"{len(impulses)} impulses for {len(problems)} problems; one for each is needed")
+        raise InputError(
+            f"impulses has {len(impulses)} entries for {len(problems)} problems; one array for each problem "
+            "is needed"
+        )
     return [
         p.guess if x is None else as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
         for i, (p, x) in enumerate(zip(problems, impulses, strict=True))

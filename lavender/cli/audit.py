@@ -68,7 +68,10 @@ def audit(
     if options["engine"] != "mujoco":
         for name in ("workers", "backend", "precision"):
             if is_option_set(context, name):
-                raise InputError(f"--{name} needs --engine mujoco: leave it out")
+                raise InputError(
+                    f"--{name} has no effect with another engine than MuJoCo: leave it out, or give "
+                    "--engine mujoco"
+                )
     if options["engine"] in CLAIM_ENGINES:
         if is_option_set(context, "control"):
             raise InputError(

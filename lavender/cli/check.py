@@ -91,7 +91,10 @@ def check(
     if unaccepted:
         print_escaped(f"{unaccepted} problems are not accepted by any of these solvers", style="bold red")
     if judges_stored and not solutions:
-        raise InputError("--precision, --threshold: no file has a solution to judge (an entry `impulse`)")
+        raise InputError(
+            "--precision and --threshold apply to stored solutions, and no file has one (entry `impulse`): "
+            "leave them out, or give files with solutions"
+        )
     if solutions:
         shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
         print_escaped(f"stored solutions: {shares}")

@@ -48,7 +48,10 @@ class Commands(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Reject an empty argument, which would mean the current folder, then parse as click does."""
         if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
-            raise click.UsageError("an argument is empty: is a variable of the shell not set?", ctx)
+            raise click.UsageError(
+                "an argument is empty; a value is needed: set the shell variable that it uses, or leave it out",
+                ctx,
+            )
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:

@@ -394,7 +394,7 @@ def parse_parameters(assignments: tuple[str, ...]) -> dict[str, Any]:
     for word in assignments:
         name, equals, value = word.partition("=")
         if not equals or not name:
-            raise InputError(f"--set {word!r}; NAME=VALUE is needed")
+            raise InputError(f"--set {word!r} has no name or no value; NAME=VALUE is needed, such as n=4")
         constants = {"true": True, "false": False, "none": None}
         if value.lower() in constants:
             parameters[name] = constants[value.lower()]

@@ -106,7 +106,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
 
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
-            raise InputError(f"time budget {limit} must be a positive number of seconds")
+            raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
     _reject_unused_options(context, files, options["solvers"])
     context.with_resource(lock_output(out, folder=True))
     used_folders: set[Path] = set()
@@ -123,7 +123,9 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
             )
         measured = Measured(bench.read_records(records_files[0]), False)
         if not (measured.records.records or measured.records.skips):
-            raise InputError(f"{records_files[0]} has no records")
+            raise InputError(
+                f"{records_files[0]} has no records: measure problems with `lavender report PROBLEM` first"
+            )
         if options["solvers"]:
             measured = replace(measured, records=measured.records.of_solvers(options["solvers"]))
     else:

@@ -176,7 +176,8 @@ def _collect_parameters(
             continue
         if name in values:
             raise InputError(
-                f"--set {name}={values[name]} and an option ({value}) both set {name}: leave one out"
+                f"--set {name}={values[name]} and the option {value} set the same parameter, {name}: leave "
+                "one of them out"
             )
         values[name] = value
     own_sweeps = values.get("solver", "sequential_impulses") == "sequential_impulses"
@@ -184,8 +185,8 @@ def _collect_parameters(
     if velocity_tol is not None:
         if own_sweeps:
             raise InputError(
-                "--velocity-tol is for solvers that stop at an error, and a scene's own sweeps run a fixed number: "
-                "name a solver, as --solver newton"
+                "--velocity-tol needs a solver that stops at an error, and the scene's sequential_impulses "
+                "runs a fixed number of sweeps: name another solver, for example --solver newton"
             )
         solver_options["velocity_tol"] = velocity_tol
     if not own_sweeps and "order" in values:

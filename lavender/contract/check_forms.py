@@ -43,7 +43,10 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
                     solve(problem, spec.name)
                 except CapabilityError:
                     continue
-                raise ContractError(f"the solver refuses {phrase}, but solve returned a result for it")
+                raise ContractError(
+                    f"the spec of the solver refuses {phrase}, but lavender.solve accepted this problem and "
+                    "returned a result; a refused problem must raise CapabilityError"
+                )
             accepted.add(law)
             solution = solve(problem, spec.name, tol=tol, max_iter=choose_iteration_budget(spec))
             text = f"for {phrase} the result is: {solution}"
@@ -122,7 +125,10 @@ def require_forms_agree(spec: SolverSpec) -> None:
             f"the error for an unknown form does not list the known ones: {error}",
         )
     else:
-        raise ContractError("form='velocities' does not exist and raised no error")
+        raise ContractError(
+            "the solver accepted form='velocities', which is not one of its forms; an unknown form must "
+            "raise an error that lists the known forms"
+        )
 
 
 @register_check("all solvers")

@@ -163,7 +163,8 @@ def make_export_files(path: Path, solver: str | None, max_problems: int) -> dict
             steps[key] = replace(step, iterations=max(count, steps[key].iterations if key in steps else 1))
     if not packed:
         raise InputError(
-            f"no problem of {measured[0].solver} in {path} makes a test vector: {'; '.join(failures[:3])}"
+            f"{path} has no run of {measured[0].solver} whose result the C library can reproduce: "
+            f"{'; '.join(failures[:3])}. Give records of other problems, or another --solver"
         )
     check = (HERE / "capi" / "check.c").read_text(encoding="utf-8")
     lines = ",\n".join(f"  {step.as_c_initialiser()}" for step in steps.values())
@@ -183,8 +184,8 @@ def _select_records(records: Records, solver: str | None) -> list[Record]:
     if solver not in names:
         have = ", ".join(names) or "none"
         raise InputError(
-            f"{solver or 'the recommended solver'} is not in the C library or reached no tolerance in these records; "
-            f"available: {have} (--solver)"
+            f"{solver or 'the recommended solver'} is not in the C library, or reached no tolerance in "
+            f"these records; give --solver with one of: {have}"
         )
     own_runs, tolerances = [r for r in solved if r.solver == solver], statistics.get_tolerances(records)
     usual = tolerances[len(tolerances) // 2]
@@ -209,7 +210,8 @@ def _load_problem(records: Records, record: Record) -> lv.Problem:
     present_hash = hash_problem(problem)
     if present_hash != record.sha:
         raise InputError(
-            f"{source} now holds another problem, with the hash {present_hash}; the measured one has {record.sha}"
+            f"{source} now holds another problem (hash {present_hash}) than the measured one (hash "
+            f"{record.sha}): restore the file, or measure it again with `lavender report`"
         )
     return problem
 
@@ -238,7 +240,10 @@ def make_test_vector(
     if ", then" in form or (
         problem.matrix is None and ("rows of A" in form or (solver == "pgs" and form != "whitened J"))
     ):
-        raise NotSupported(f"{solver} formed A, which the library does not: give it the matrix, problem.csr")
+        raise NotSupported(
+            f"{solver} formed A of J and M, which the C library does not do: export the problem with its "
+            "matrix, problem.csr"
+        )
     steps = [
         s
         for s in split_into_steps(solution, Step(solver, max_iter, tol, options))
@@ -247,7 +252,8 @@ def make_test_vector(
     packed_problem = pack_problem(problem)
     if not steps:
         raise NotSupported(
-            f"{solver} of the library does not accept {problem.name or 'this problem'}: see lav_takes"
+            f"the C library's {solver} does not accept {problem.name or 'this problem'}: choose another "
+            "solver; the function lav_takes tests whether a solver accepts a problem"
         )
     impulse, relative = solution.impulse, solution.residual.relative
     if solver == "newton" and (problem.generalized is None or form == "velocity"):
@@ -276,7 +282,9 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[F
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
     driver, outcome = Driver(problem.metric), OUTCOMES["more"]
     if not driver.fits:
-        raise NotSupported("the compiled driver of newton does not accept this problem")
+        raise NotSupported(
+            "the C library's newton does not accept this problem; choose another solver (--solver)"
+        )
     driver.start(impulse, tol, budget)
     while outcome in (OUTCOMES["more"], OUTCOMES["certificate"]):
         outcome = driver.step(10**6, impulse)

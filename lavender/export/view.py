@@ -85,7 +85,8 @@ def make_problem_view(problem: Problem) -> ProblemView:
         g, form = problem.generalized, 3
         if g.order is not None:
             raise NotSupported(
-                "the generalised velocities were reordered, because M does not have the pattern of a tree"
+                "the C library needs M with the pattern of a tree; the factor of this M needed another "
+                "order of the velocities: give the problem as a matrix, problem.csr"
             )
         arrays |= zip(("index_ptr", "index", "value"), g.operator.jac, strict=True)
         arrays |= zip(("mass_ptr", "mass_index", "mass_value"), g.operator.mass, strict=True)
@@ -136,7 +137,10 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     omega = remaining.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
     if remaining or order not in ORDERS or solver not in METHODS:
         unsupported = ", ".join(remaining) or (f"order={order!r}" if order not in ORDERS else solver)
-        raise NotSupported(f"{unsupported}: not in the library")
+        raise NotSupported(
+            f"{unsupported} is not in the C library; choose a solver and options that the header lavender.h "
+            "lists"
+        )
     return (ORDERS[order], *numbers), float(omega)
 
 

@@ -32,8 +32,8 @@ class ForeignSolver(Solver):
         missing = [m for m in ("prepare", "run") if not callable(getattr(solver, m, None))]
         if missing:
             raise InputError(
-                f"solver {name!r}: its factory made a {type(solver).__name__} without {' and '.join(missing)}; "
-                "prepare and run are needed (lavender.registry.Solver)"
+                f"the factory of solver {name!r} returned a {type(solver).__name__} without the methods "
+                f"{' and '.join(missing)}; prepare and run are needed (lavender.registry.Solver)"
             )
 
     def _call_method(self, method: str, *arguments: Any) -> Any:
@@ -59,7 +59,8 @@ class ForeignSolver(Solver):
             return Cost()
         if not isinstance(estimate, Cost):
             raise InputError(
-                f"cost of solver {self.name!r} is a {type(estimate).__name__}; a lavender.registry.Cost is needed"
+                f"cost of solver {self.name!r} returned a {type(estimate).__name__}; a "
+                "lavender.registry.Cost is needed"
             )
         return Cost(check_float(f"cost of the set-up of solver {self.name!r}", estimate.setup, low=0.0))
 

@@ -97,7 +97,8 @@ def call_backend(
     except (pickle.PicklingError, TypeError, AttributeError) as error:
         idle_processes.append(process)
         raise InputError(
-            f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
+            f"settings cannot be sent to the process that runs the backend ({error}); plain numbers and "
+            "texts are needed, or isolate=False, which runs the backend in this process"
         ) from None
     except ProcessEnded as error:
         raise BackendFailed(f"the process of the backend died ({error})") from None

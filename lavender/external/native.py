@@ -194,7 +194,10 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         settings["time_limit"] = limit.time_limit
     for key, value in {**settings, **extra}.items():
         if solver.setOptionValue(key, value) != highspy.HighsStatus.kOk:
-            raise InputError(f"highs does not accept the setting {key}={value!r}")
+            raise InputError(
+                f"highs rejected the setting {key}={value!r}; a name and a value of the options of HiGHS "
+                "are needed"
+            )
     solver.passModel(model)
     solver.run()
     status = solver.getModelStatus()

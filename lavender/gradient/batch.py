@@ -94,7 +94,8 @@ class Gradients(_LazySequence):
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
                 raise AttributeError(
-                    f"gradients of all problems have no {name!r}; [i] is the gradient of problem i"
+                    f"the gradients of all problems have no attribute {name!r}; gradients[i] is the "
+                    "gradient of problem i"
                 )
             if self._is_complete and name in ("b", "target", "v_free"):
                 of = self._of
@@ -178,7 +179,10 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         the problem's index.
     """
     if isinstance(problems, Problem):
-        raise InputError("problems is one Problem; a list of them is needed, or `derivative`")
+        raise InputError(
+            "problems is one Problem; a list of problems is needed: use [problem], or "
+            "`lavender.derivative`, which takes one problem"
+        )
     problems = check_sequence("problems", problems, "Problems")
     is_batch = isinstance(solutions, Solutions) and not solutions.faults
     impulses: Any = (
@@ -187,7 +191,10 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         else [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
     )
     if len(problems) != len(impulses):
-        raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
+        raise InputError(
+            f"impulses has {len(impulses)} entries for {len(problems)} problems; one solution for each "
+            "problem is needed"
+        )
     linears = Linears(
         [_get_data(p) for p in problems], impulses.flat_impulses if is_batch else impulses, MAX_KERNEL_ROWS
     )

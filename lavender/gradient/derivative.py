@@ -89,14 +89,20 @@ class Tangent:
         """Change of the impulses (m,) [N s]; CapabilityError if they are not unique (linearly dependent rows)."""
         unique = self._derivative.unique
         if not unique.impulse.all():
-            raise CapabilityError(f"impulses are not unique here: {unique}; slack and velocity are")
+            raise CapabilityError(
+                f"the impulses of this problem are not unique ({unique}), so they have no derivative; use "
+                "the change of slack or velocity, which are unique"
+            )
         return self._impulse
 
     @property
     def velocity(self) -> FloatArray:
         """Change of v+ (nv,) or (n, 6) [m/s, rad/s]; CapabilityError for a problem given as a matrix."""
         if self._velocity is None:
-            raise CapabilityError("this problem was given as a matrix; velocities need J and M")
+            raise CapabilityError(
+                "the problem was given as a matrix A, without velocities; build it with Problem.from_rows or "
+                "Problem.from_jacobian"
+            )
         return self._velocity
 
 
@@ -155,7 +161,10 @@ class Derivative:
         if p.generalized is not None:
             return (p.generalized.nv,)
         if p.rows is None:
-            raise CapabilityError("this problem was given as a matrix; velocities need J and M")
+            raise CapabilityError(
+                "the problem was given as a matrix A, without velocities; build it with Problem.from_rows or "
+                "Problem.from_jacobian"
+            )
         return p.rows.n_bodies, 6
 
     # -- products --------------------------------------------------------------------------------
@@ -276,9 +285,10 @@ class Derivative:
         if len(rows):
             names = ", ".join(self.problem.row_name(int(i)) for i in rows[:3])
             raise CapabilityError(
-                f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows and cannot change "
-                "alone, because one of them would open. By v_free and masses there is one, under Coulomb's law by mu; "
-                "with a compliance on these rows by all data"
+                f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows. Data "
+                "of one such row cannot change alone, because another row would then open. Use derivatives "
+                "by v_free and masses, by mu under Coulomb's law, or give these rows compliance, which "
+                "allows derivatives by all data"
             )
 
     def _check_coefficient_changes(self, name: str) -> None:
@@ -332,7 +342,7 @@ class Derivative:
         """
         p = self.problem
         if velocity is None and impulse is None and slack is None:
-            raise InputError("give velocity=, impulse= or slack=, a cotangent of the solution")
+            raise InputError("no cotangent of the solution is given; give velocity=, impulse= or slack=")
         adjoint = self._linear.adjoint(velocity, impulse, slack) if self._uses_kernel else None
         if adjoint is not None:
             return Gradient(self, adjoint)
@@ -368,8 +378,8 @@ class Derivative:
         size = float(np.linalg.norm(c))
         if any(abs(float(x @ c)) > MAX_NULL_ENTRY * size for x in self._null_space):
             raise CapabilityError(
-                f"the requested gradient is not unique: {self.unique}. Use cotangents of velocities, slacks, or sums "
-                "of impulses that are"
+                f"the requested gradient is not unique: {self.unique}. Use cotangents of velocities, of "
+                "slacks, or of sums of impulses, which are unique"
             )
 
     def jvp(self, **changes: Any) -> Tangent:
@@ -481,7 +491,7 @@ class Derivative:
             else:
                 out[name] = as_array(name, value, (p.m,))
         if not out:
-            raise InputError(f"give a change of the data: {', '.join(names)}")
+            raise InputError(f"no change of the data is given; give at least one of {', '.join(names)}")
         return out
 
     # -- existence -------------------------------------------------------------------------------
@@ -638,8 +648,9 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
         error = residual(problem, impulse, "float64")
         if not (error.nothing_to_do and error.rounds):
             raise InputError(
-                f"this is not a solution of this problem: its relative residual is {error.relative:.2e}; a derivative "
-                f"needs {MAX_ACCEPTED_RESIDUAL:g} or the floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or "
-                "give the problem that it solves"
+                "the impulse is not a solution of this problem: its relative residual is "
+                f"{error.relative:.2e}; a derivative needs at most {MAX_ACCEPTED_RESIDUAL:g}, or the "
+                f"round-off floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or give the problem "
+                "that the impulse solves"
             )
     return Derivative(problem, linear)

@@ -124,7 +124,10 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
     shapes = [tuple(x.shape) for x in arrays]
     for name, shape, n in zip(ARGUMENTS, shapes, ARGUMENT_AXES, strict=True):
         if len(shape) < n:
-            raise InputError(f"{name} has shape {shape}; {n} axes are needed, after any number of batch axes")
+            raise InputError(
+                f"{name} has shape {shape}; {n} axes are needed, after any number of batch axes: {n} or "
+                "more axes in total"
+            )
     m, nv = shapes[0][-2:]
     required_shapes = ((m, nv), (nv, nv), (nv,), shapes[3][-1:], (m,), (m,))
     for name, shape, required in zip(ARGUMENTS, shapes, required_shapes, strict=True):
@@ -138,7 +141,7 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
         )
     except ValueError:
         raise InputError(
-            f"shapes {shapes} of {', '.join(ARGUMENTS)} have batch axes that cannot be broadcast together"
+            f"the batch axes of {', '.join(ARGUMENTS)} cannot be broadcast together: the shapes are {shapes}"
         ) from None
     return (*batch, nv), (*batch, m)
 
@@ -149,13 +152,15 @@ def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver:
     if cones is None:
         if (m or k) and (k == 0 or m % k or not 1 <= m // k <= 3):
             raise InputError(
-                f"J has {m} rows for {k} values of mu; without cones= each contact has a normal and up to two tangents"
+                f"J has {m} rows and mu {k} values; without cones= each contact has one value of mu, a "
+                f"normal row and up to two tangent rows: give {k} to {3 * k} rows, or cones="
             )
         cones = Cones.contacts(0.0, m // k - 1 if k else 0, count=k)
     contacts = int(np.count_nonzero(cones.is_contact))
     if cones.n_rows != m or contacts != k:
         raise InputError(
-            f"cones have {cones.n_rows} rows and {contacts} contacts; J has {m} rows and mu {k} values"
+            f"cones have {cones.n_rows} rows and {contacts} contacts; they must have the {m} rows of J, and "
+            f"a contact for each of the {k} values of mu"
         )
     bounds = tuple(np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu")
     step = Step(cones, bounds, friction, solver, tol)

@@ -72,8 +72,9 @@ class System:
             solve = factor(SHIFT_OF_SINGULAR)
         if solve is None:
             raise CapabilityError(
-                f"the equations of this solution's states cannot be factored, even if shifted by {SHIFT_OF_SINGULAR:g} "
-                "of their diagonal: A is indefinite, or the states are wrong"
+                "the derivative cannot be computed, because its linear system is singular even after a "
+                f"shift by {SHIFT_OF_SINGULAR:g} of its diagonal: A is indefinite, or the states of the "
+                "contacts are wrong. Solve with a smaller tol first"
             )
         self._solve_factored = solve
 

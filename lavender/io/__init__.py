@@ -139,7 +139,10 @@ def save(
     suffix = path.suffix.lower()
     if suffix == ".npz":
         if form is not None or drop:
-            raise InputError("form= and drop= are for FCLIB files (.hdf5); an .npz holds everything")
+            raise InputError(
+                "form= and drop= have no effect on an .npz file, which holds everything: leave them out, "
+                "or give a path that ends with .hdf5 (FCLIB)"
+            )
         npz.write(problem, path, impulse=impulse)
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, form=form, drop=drop)

@@ -158,7 +158,9 @@ def _check_no_locked_joints(plant: Any, context: Any) -> None:
     joints = [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
     locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
     if locked:
-        raise CapabilityError(f"locked joints are not supported: {', '.join(locked):.200}; weld them")
+        raise CapabilityError(
+            f"the joints {', '.join(locked):.200} are locked, which is not supported; replace them by welds"
+        )
 
 
 @dataclass(frozen=True)
@@ -227,8 +229,8 @@ def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray
             actuator = plant.get_joint_actuator(JointActuatorIndex(int(i)))
             if actuator.has_controller():
                 raise CapabilityError(
-                    f"actuator {actuator.name()} has a PD controller, which SAP integrates implicitly; that is not "
-                    "known here"
+                    f"actuator {actuator.name()} has a PD controller, which SAP integrates implicitly and "
+                    "this import does not support: remove the controller, and add its torque as an input"
                 )
         force += plant.MakeActuationMatrix() @ plant.get_net_actuation_output_port().Eval(context)
     applied = plant.get_applied_generalized_force_input_port()
@@ -269,8 +271,8 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
     results = plant.get_contact_results_output_port().Eval(context)
     if results.num_hydroelastic_contacts():
         raise CapabilityError(
-            f"{results.num_hydroelastic_contacts()} hydroelastic contacts; only point contacts are supported "
-            "(plant.set_contact_model(ContactModel.kPoint))"
+            f"the plant has {results.num_hydroelastic_contacts()} hydroelastic contacts; only point "
+            "contacts are supported: call plant.set_contact_model(ContactModel.kPoint)"
         )
     inspector = port.Eval(context).inspector()
     world, contacts = plant.world_frame(), []
@@ -372,7 +374,8 @@ def _complete_impulses(
     if not np.linalg.norm(weight * momentum_error) <= MOMENTUM_TOLERANCE * np.linalg.norm(weight * size):
         worst = int(np.argmax(weight * np.abs(momentum_error)))
         raise CapabilityError(
-            f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {momentum_error[worst]:.3g} of "
-            f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; a force "
-            "that this import does not read acts on the plant"
+            "the import does not reproduce Drake's next step: A (v+ - v*) and J^T times the impulses "
+            f"differ by {momentum_error[worst]:.3g}, of terms up to {size[worst]:.3g}, at "
+            f"{plant.GetVelocityNames(always_add_suffix=True)[worst]}. A force that the import does not "
+            "read acts on the plant: remove it"
         )

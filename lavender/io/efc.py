@@ -243,7 +243,10 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     for kind in (mj.mjtState.mjSTATE_FULLPHYSICS, mj.mjtState.mjSTATE_INTEGRATION):
         kinds.setdefault(mj.mj_stateSize(model, kind), kind)
     if size not in kinds:
-        raise InputError(f"states have {size} numbers each; one of {sorted(kinds)} is needed")
+        raise InputError(
+            f"each state has {size} numbers; one of {sorted(kinds)} is needed, the sizes of "
+            "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
+        )
     n, nv, sparse = len(values), model.nv, bool(mj.mj_isSparse(model))
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
@@ -392,7 +395,7 @@ def _check_rows(name: str, numbers: FloatArray, wrong: Any, needed: str) -> None
         at = np.argwhere(wrong)
         i, row = at[0]
         raise InputError(
-            f"{name} of world {i}, row {row} is {numbers[i, row]:g}, {len(at)} in all; {needed} is needed"
+            f"{name} of world {i}, row {row} is {numbers[i, row]:g} ({len(at)} such rows); {needed} is needed"
         )
 
 
@@ -407,7 +410,9 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
             raise InputError(f"M has shape {values.shape}; {(n, nv, nv)} is needed")
         return values
     if values.ndim != 2 or len(values) != n:
-        raise InputError(f"values of M have shape {values.shape}; ({n}, entries) is needed")
+        raise InputError(
+            f"values of M have shape {values.shape}; ({n}, entries) is needed, one row for each world"
+        )
     ptr, col = check_shared_lower_triangles(pattern, np.full(n, nv), values)
     row, full = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
     full[:, row, col] = values
@@ -423,8 +428,9 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
     if len(bad):
         i = bad[0]
         raise CapabilityError(
-            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size; these data "
-            "are not those of M (an integrator that puts damping into it, or arrays of another step)"
+            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size, so "
+            "the step used another mass matrix than M: give the M of this step, and use an integrator that "
+            "does not add damping to M"
         )
 
 
@@ -452,14 +458,16 @@ def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     if len(large):
         k = large[0]
         raise InputError(
-            f"dim of contact {here[k]} is {dim[k]}; at most {MAX_CONTACT_ROWS}, and rows up to {m}, are needed"
+            f"dim of contact {here[k]} is {dim[k]}; at most {MAX_CONTACT_ROWS} is needed, and efc_address + "
+            f"dim must be at most {m}, the number of rows"
         )
     used = np.arange(1, MAX_CONTACT_ROWS) < dim[:, None]
     bad = np.argwhere(used & ~((rub > 0.0) & (rub < np.inf)))
     if len(bad):
         k, j = bad[0]
         raise InputError(
-            f"friction of contact {here[k]} is {rub[k, j]:g} at {j}; a finite number above 0 is needed"
+            f"friction of contact {here[k]} is {rub[k, j]:g} at position {j}; a finite number above 0 is "
+            "needed"
         )
     first = world * np.int64(m) + address
     rows = [first[dim > j] + j for j in range(MAX_CONTACT_ROWS)]
@@ -469,8 +477,9 @@ def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
         i, row = off[0]
         kind = "an" if elliptic[i, row] else "no"
         raise InputError(
-            f"row {row} of world {i} is {kind} elliptic row by efc_type, and {named[i, row]} contacts name it, "
-            f"{len(off)} such rows in all; each elliptic row is needed once"
+            f"row {row} of world {i} belongs to {named[i, row]} of the contacts, and by efc_type it is "
+            f"{kind} elliptic row ({len(off)} such rows); each elliptic row must belong to exactly one "
+            "contact: give contacts and efc_type of the same step"
         )
     return world, address, dim, rub
 

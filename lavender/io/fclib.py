@@ -231,7 +231,8 @@ def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -
         raise InputError(f"{path}: {error}") from None
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(
-            f"{path} cannot be read as HDF5 ({error}); it is damaged, or not an HDF5 file"
+            f"{path} cannot be read as HDF5 ({error}); the file is damaged or not an HDF5 file: write it "
+            "again"
         ) from None
 
 
@@ -251,14 +252,20 @@ class _Reader:
             if link is None:
                 return None
             if not isinstance(link, self.h5py.HardLink):
-                raise InputError(f"{path} is a {type(link).__name__}; links to other places are not followed")
+                raise InputError(
+                    f"{path} is a {type(link).__name__} to another place, and links are not followed: store "
+                    "the data in the file itself"
+                )
             node = node[part]
         if (
             isinstance(node, self.h5py.Dataset)
             and node.fletcher32
             and node.id.chunk_iter(_stop_at_short_chunk)
         ):
-            raise InputError(f"{path}: numbers are missing; their chunk is shorter than its checksum")
+            raise InputError(
+                f"{path} has a chunk that is shorter than its checksum, so numbers are missing; the file is "
+                "damaged: write or copy it again"
+            )
         return node
 
     def has_path(self, path: str) -> bool:
@@ -277,9 +284,14 @@ class _Reader:
         """Return a dataset of `count` numbers (None: any number) without reading it."""
         data = self.find_node(path)
         if not isinstance(data, self.h5py.Dataset):
-            raise InputError(f"{path} is missing or not a dataset")
+            raise InputError(
+                f"{path} {'is a group' if data is not None else 'is missing'}; a dataset is needed"
+            )
         if data.is_virtual or data.external:
-            raise InputError(f"{path} stores its numbers in other files, which are not read")
+            raise InputError(
+                f"{path} stores its numbers in other files, which are not read: store the numbers in the "
+                "file itself"
+            )
         if data.dtype.kind not in kinds or data.shape is None:
             wanted = "whole numbers" if kinds == "iu" else "numbers"
             raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
@@ -323,7 +335,7 @@ class _Reader:
         """Return the numbers of rows and columns that a matrix declares."""
         m, n = (self.read_integer(f"{path}/{name}") for name in ("m", "n"))
         if min(m, n) < 0:
-            raise InputError(f"{path}: m {m}, n {n}; sizes must not be negative")
+            raise InputError(f"{path} declares {m} rows and {n} columns; both must be at least 0")
         return m, n
 
     def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
@@ -338,7 +350,10 @@ class _Reader:
             self.read_integer(f"{path}/nzmax"),
         )
         if nzmax < 0 or nz < -2 or nz > nzmax:
-            raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz must be -2, -1 or 0 to nzmax")
+            raise InputError(
+                f"{path}: nz is {nz} and nzmax is {nzmax}; nz must be -2 (compressed rows), -1 (compressed "
+                "columns), or the number of triplets, from 0 to nzmax"
+            )
         if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
             raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
@@ -375,10 +390,16 @@ def _build_from_triplets(
 ) -> sp.csr_array:
     """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
     if min(len(p), len(i), len(x)) < nz:
-        raise InputError(f"{nz} triplets are announced; p has {len(p)}, i {len(i)}, x {len(x)}")
+        raise InputError(
+            f"nz announces {nz} triplets, but p has {len(p)} entries, i {len(i)} and x {len(x)}; at least "
+            f"{nz} are needed in each"
+        )
     p, i, x = p[:nz], i[:nz], x[:nz]
     if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
-        raise InputError(f"triplets leave the {m} rows (i) and {n} columns (p)")
+        raise InputError(
+            f"the triplets have row indices (i) or column indices (p) outside of the matrix; {m} rows and "
+            f"{n} columns are declared"
+        )
     return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
 
 
@@ -394,7 +415,8 @@ def _read_file(r: _Reader) -> Contents:
     group, rolling = present[0], present[0].endswith(ROLLING)
     if present[-1].endswith(ROLLING) != rolling:
         raise InputError(
-            f"holds {' and '.join(present)}: one problem with rolling friction and one without; keep one of them"
+            f"the file holds the groups {' and '.join(present)}, a problem with rolling friction and one "
+            "without; keep one of the two"
         )
     spacedim = r.read_integer(f"{group}/spacedim")
     if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
@@ -413,7 +435,10 @@ def _read_file(r: _Reader) -> Contents:
     if local and first_shape != (m, m):
         raise InputError(f"{group}/W is {first_shape[0]} x {m}; a square matrix is needed")
     if m % spacedim:
-        raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
+        raise InputError(
+            f"{group} has {m} rows, which is not a multiple of spacedim = {spacedim}; spacedim rows for "
+            "each contact are needed"
+        )
     size = {"m": m, "n": n, "p": p, "c": m // spacedim}
     absent = [*("" if has_equations else "VRG"), *("" if p else "sb"), *([] if rolling else ["mu_r"])]
     parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
@@ -448,7 +473,7 @@ def _read_point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, Flo
         if size and r.has_path(f"{group}/{name}"):
             point[name] = r.read_vector(f"{group}/{name}", size)
     if p and "l" not in point:
-        raise InputError(f"{group} has no l, the multipliers of the {p} equations")
+        raise InputError(f"{group} has no dataset l; the multipliers of the {p} equations are needed in it")
     return point
 
 
@@ -458,7 +483,10 @@ def _list_guess_groups(r: _Reader) -> list[str]:
         return []
     count = r.read_integer("guesses/number_of_guesses")
     if count < 0 or count > len(r.find_node("guesses")):
-        raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.find_node('guesses')) - 1}")
+        raise InputError(
+            f"guesses/number_of_guesses is {count}, but the file holds {len(r.find_node('guesses')) - 1} "
+            "guesses; the number must not be larger"
+        )
     return [f"guesses/{i + 1}" for i in range(count)]
 
 

@@ -374,7 +374,10 @@ class _Worlds:
         begins = ~self.is_contact_row | self.begins_contact
         layout = self.layout
         if (layout.joint_rows != self.joints).any():
-            raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {KAMINO_ADVICE}")
+            raise CapabilityError(
+                "the joint rows of the solver are not its dynamic rows followed by its kinematic rows, "
+                f"which this importer needs. {KAMINO_ADVICE}"
+            )
         start, size = self.row_ptr[layout.joint_world] + layout.joint_begin, layout.joint_size
         begins[np.repeat(start - _cumulate_counts(size)[:-1], size) + np.arange(size.sum())] = False
         begins[start] = True

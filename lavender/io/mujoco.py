@@ -236,13 +236,16 @@ def _check_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
         seen = _MODELS[model] = _ModelCache(mj, model)
     smooth = data.qacc_smooth
     if len(smooth) != seen.n:
-        raise InputError(f"the data has {len(smooth)} degrees of freedom, the model {seen.n}")
+        raise InputError(
+            f"the MjData has {len(smooth)} degrees of freedom and the model {seen.n}; both must belong "
+            "together: create the data with mujoco.MjData(model)"
+        )
     m, contacts, entries = data.nefc, data.ncon, data.nJ
     needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
     if min(m, contacts, entries) < 0 or needed > data.parena:  # The arrays would exceed the allocated memory.
         raise InputError(
-            f"nefc = {m}, ncon = {contacts}, nJ = {entries}: what this MjData has allocated ({data.parena} bytes) does "
-            f"not hold as many. {CHANGED_ADVICE}"
+            f"nefc is {m}, ncon is {contacts} and nJ is {entries}, which do not fit into the {data.parena} "
+            f"bytes that this MjData has allocated. {CHANGED_ADVICE}"
         )
     return seen, m, contacts, smooth
 
@@ -287,7 +290,10 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
         M a0 is not the smooth force: a0 and the problem were computed with a matrix other than M.
     """
     if seen.n and not data.M[0]:  # M was not computed: its first diagonal entry would be positive.
-        raise InputError("M of this MjData is 0: mj_forward(model, data) was not called")
+        raise InputError(
+            "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the "
+            "simulation"
+        )
     result = mujoco_rows.extract_lower_triangle_of_mass(
         *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
     )
@@ -329,14 +335,14 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
     columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
         raise InputError(
-            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED_ADVICE} "
-            f"{LAYOUT_NOTE}"
+            f"efc_J_rownnz has {len(count)} entries and efc_J_rowadr {len(first)}; {m} are needed, one for "
+            f"each constraint row. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
     result = mujoco_rows.scale_sparse_rows(values, count, first, columns, scale, n)
     if isinstance(result, int):  # The number of the first invalid row.
         raise InputError(
-            f"row {result} of efc_J has {count[result]} entries from position {first[result]} of {len(columns)}, in "
-            f"columns of {n}: an index is out of range. {CHANGED_ADVICE} {LAYOUT_NOTE}"
+            f"row {result} of efc_J has {count[result]} entries from position {first[result]}; positions "
+            f"below {len(columns)} and columns below {n} are needed. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
     if result is None:  # Some rows have unsorted or repeated columns.
         indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
@@ -362,8 +368,8 @@ def _compute_compliance(data: Any) -> FloatArray:
     empty = r == 0.0
     if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > COMPLIANCE_TOLERANCE):
         raise CapabilityError(
-            "efc_R and 1 / efc_D disagree: the compliance of these constraints is ambiguous. Run mj_forward on "
-            "this MjData, or copy both from where the step ran"
+            "efc_R and 1 / efc_D differ, so the compliance of these constraints is ambiguous. Run "
+            "mj_forward on this MjData, or copy both arrays from the data in which the step ran"
         )
     return np.where(empty, 1.0 / inverse, r)
 
@@ -423,7 +429,8 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
     """
     if finite != 0.0:
         raise InputError(
-            "qacc holds numbers that are not finite: the simulation has diverged, or was changed"
+            "qacc holds numbers that are not finite: the simulation has diverged, or the data was changed. "
+            "Use data of an earlier step"
         )
     for difference, names in (
         (velocity, "J qvel and efc_vel"),
@@ -456,16 +463,21 @@ def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tupl
     if isinstance(result, int):  # The number of the first invalid row.
         kind, which, known = int(types[result]), int(ids[result]), codes.tolist()
         if kind not in known:
-            raise CapabilityError(f"constraint row {result} is of type {kind}, which is not supported")
+            raise CapabilityError(
+                f"constraint row {result} is of type {kind}, which is not supported: remove this constraint "
+                "from the model"
+            )
         count = type_counts[known.index(kind)]
         dim = f", of condim {dims[which]}" if known.index(kind) > 4 and 0 <= which < count else ""
         raise InputError(
-            f"constraint row {result} of {len(types)} is of type {kind} and names number {which} of {count}{dim}: "
-            f"it does not exist, or has fewer rows. {CHANGED_ADVICE}"
+            f"constraint row {result} of {len(types)} is of type {kind} and belongs to number {which} of "
+            f"{count}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
     blocks, scale, key = result
     if blocks is None:
-        raise InputError(f"efc_frictionloss or a contact's friction is not a valid bound. {CHANGED_ADVICE}")
+        raise InputError(
+            f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
+        )
     return Cones._from_blocks(blocks), scale, key
 
 

@@ -86,7 +86,7 @@ class _Header:
         size = self.n_elements * self.dtype.itemsize
         raw = self.stream.read(size)
         if len(raw) != size or self.stream.read(1):
-            raise EOFError(f"the file holds {len(raw)} of {size} bytes")
+            raise EOFError(f"the entry holds {len(raw)} of {size} bytes: the file is damaged, save it again")
         return np.frombuffer(raw, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
 
 
@@ -112,17 +112,22 @@ class Archive(Mapping[str, np.ndarray]):
         """Read the headers of all entries and subtract their sizes in memory from the budget."""
         entries = self._zip.infolist()
         if len(entries) > MAX_ARCHIVE_ENTRIES:
-            raise InputError(f"{self.path} holds {len(entries)} entries, more than {MAX_ARCHIVE_ENTRIES}")
+            raise InputError(
+                f"{self.path} holds {len(entries)} entries; at most {MAX_ARCHIVE_ENTRIES} are accepted, and "
+                "a problem needs far fewer: give the file of one problem"
+            )
         for entry in entries:
             name = entry.filename.removesuffix(".npy")
             if name == entry.filename or name in self._headers:
                 raise InputError(
-                    f"{self.path} holds {entry.filename!r}; an .npz must hold one .npy for each name"
+                    f"{self.path} holds {entry.filename!r}; an .npz must hold files NAME.npy with different "
+                    "names: save it again with lavender.io.save or numpy.savez"
                 )
             try:
                 if entry.compress_type not in ACCEPTED_COMPRESSION:
                     raise ValueError(
-                        f"it has the compression method {entry.compress_type}; deflate is needed"
+                        f"the entry is compressed by method {entry.compress_type} of zip files; deflate (8) "
+                        "or no compression (0) is needed: use numpy.savez"
                     )
                 self._headers[name] = _read_npy_header(self._zip.open(entry), entry.file_size)
             except READ_ERRORS as error:
@@ -173,15 +178,21 @@ class Archive(Mapping[str, np.ndarray]):
 def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
     """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
     if npy.read_magic(stream) != (1, 0):  # Later versions of the .npy format are only for long headers.
-        raise ValueError("it is a record array or not an array; plain numbers (.npy, version 1.0) are needed")
+        raise ValueError(
+            "the entry is not a plain array (.npy, version 1.0), but a record array or other data; a plain "
+            "array of numbers is needed"
+        )
     shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_NPY_HEADER_BYTES)
     if dtype.kind not in "buifUS":
         raise ValueError(
-            f"it has dtype {dtype}; objects are never read from a file, plain numbers are needed"
+            f"the entry has dtype {dtype}; objects are never read from a file, and plain numbers are needed"
         )
     data = math.prod(shape) * dtype.itemsize
     if min(shape, default=0) < 0 or data + stream.tell() != size:
-        raise ValueError(f"its shape {shape} needs {data} bytes, but the archive declares {size}")
+        raise ValueError(
+            f"its shape {shape} needs {data} bytes, but the archive declares {size} bytes with the header: "
+            "the file is damaged, save it again"
+        )
     return _Header(stream, dtype, shape, fortran)
 
 
@@ -208,7 +219,8 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
         archive.close()
     has = ", ".join(archive) or "nothing"
     raise InputError(
-        f"{path} holds {has}; a problem has 'lavender_format' (lavender.io.save), or b, lo, hi, A"
+        f"{path} holds the entries {has}; a problem has lavender_format (written by lavender.io.save), or "
+        "b, lo, hi and A"
     )
 
 
@@ -321,24 +333,34 @@ def _read_meta(archive: Archive) -> dict[str, Any]:
     try:
         meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
     except (ValueError, TypeError, RecursionError) as error:
-        raise InputError(f"entry 'meta' is not JSON text in bytes ({error})") from None
-    if (
-        not isinstance(meta, dict)
-        or set(meta) - {"dof_names", "precision", "program"} != {"operator", "friction", "name", "names"}
-        or meta["operator"] not in ("dense", "csr", "rows", "generalized")
-        or ("dof_names" in meta) != (meta["operator"] == "generalized")
-        or not _is_name_list(meta.get("dof_names"))
-        or not isinstance(meta["name"], str)
-        or not isinstance(meta["friction"], str)
-        or not _is_name_list(meta["names"])
-        or meta.get("precision", "float64") not in PRECISIONS
-        or type(meta.get("program", 0)) is not int
-        or ("program" in meta and meta["operator"] != "csr")
-    ):
         raise InputError(
-            "entry 'meta' must hold operator (dense, csr, rows or generalized), friction, name and names; a precision "
-            f"in it is {' or '.join(PRECISIONS)}, and program a number of variables, with the operator csr"
-        )
+            f"entry 'meta' cannot be read as JSON ({error}); JSON text in bytes is needed, as "
+            "lavender.io.save writes it: save the problem again"
+        ) from None
+    if not isinstance(meta, dict):
+        raise InputError(f"entry 'meta' holds a {type(meta).__name__}; a JSON object is needed")
+    needed = ("operator", "friction", "name", "names")
+    for name in needed:
+        if name not in meta:
+            raise InputError(f"entry 'meta' has no {name!r}; {', '.join(needed)} are needed")
+    unknown = sorted(set(meta) - {*needed, "dof_names", "precision", "program"})
+    if unknown:
+        raise InputError(f"entry 'meta' has the unknown names {', '.join(unknown)}: remove them")
+    operators = ("dense", "csr", "rows", "generalized")
+    for name, is_valid, requirement in (
+        ("operator", meta["operator"] in operators, " or ".join(operators)),
+        ("dof_names", ("dof_names" in meta) == (meta["operator"] == "generalized"),
+         "a list of names or null with the operator generalized, and nothing with other operators,"),
+        ("dof_names", _is_name_list(meta.get("dof_names")), "a list of names, or null,"),
+        ("name", isinstance(meta["name"], str), "a text"),
+        ("friction", isinstance(meta["friction"], str), "a text"),
+        ("names", _is_name_list(meta["names"]), "a list of names, or null,"),
+        ("precision", meta.get("precision", "float64") in PRECISIONS, " or ".join(PRECISIONS)),
+        ("program", type(meta.get("program", 0)) is int and ("program" not in meta or meta["operator"] == "csr"),
+         "a number of variables, with the operator csr,"),
+    ):  # fmt: skip
+        if not is_valid:
+            raise InputError(f"entry 'meta': {name} is {meta.get(name)!r:.60}; {requirement} is needed")
     return meta
 
 
@@ -367,10 +389,16 @@ def _check_entries(archive: Archive, needed: Collection[str], optional: Collecti
     """Raise InputError if entries are missing or unknown."""
     missing = [name for name in needed if name not in archive]
     if missing:
-        raise InputError(f"entries {', '.join(missing)} are missing; the file is not complete")
+        raise InputError(
+            f"the entries {', '.join(missing)} are missing; all entries of the format are needed: save the "
+            "problem again with lavender.io.save"
+        )
     unknown = [name for name in archive if name not in needed and name not in optional]
     if unknown:
-        raise InputError(f"entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION}")
+        raise InputError(
+            f"the entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION} of this lavender: "
+            "remove them, or install the version that wrote the file"
+        )
 
 
 # -- plain box format and format of a benchmark generator ------------------------------------------
@@ -410,7 +438,9 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
     end = start + size
     if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
         raise InputError(
-            f"cone_start and cone_dim must name cones of 1 to 3 rows that do not overlap, within the {m} rows"
+            "cone_start and cone_dim must describe cones of 1 to 3 rows that do not overlap, within rows 0 "
+            f"to {m - 1}; they have sizes {size.min()} to {size.max()}, from row {start.min()} to "
+            f"{end.max() - 1}"
         )
     inside = np.zeros(m, bool)  # Whether a row belongs to the block of the row before it.
     for s, e in zip(start, end, strict=True):
@@ -479,13 +509,20 @@ def build_checked_csr(
                 f"one dimension of {'whole ' if kinds == 'iu' else ''}numbers is needed"
             )
     if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
-        raise InputError(f"the pointers of a compressed matrix must be {m + 1} numbers from 0 upwards")
+        raise InputError(
+            f"the pointers of a compressed matrix are not {m + 1} numbers that start with 0 and do not "
+            f"decrease; one pointer for each of its {m} rows and one for the end are needed"
+        )
     used = int(indptr[-1])
     if used > len(indices) or used > len(data):
         raise InputError(
-            f"a compressed matrix points to {used} entries; it has {len(indices)} indices, {len(data)} values"
+            f"the pointers of a compressed matrix announce {used} entries, but there are {len(indices)} "
+            f"indices and {len(data)} values; equal numbers are needed"
         )
     if used and (indices[:used].min() < 0 or indices[:used].max() >= n):
-        raise InputError(f"a compressed matrix has indices outside its {n} columns")
+        raise InputError(
+            f"a compressed matrix has column indices from {indices[:used].min()} to {indices[:used].max()}; "
+            f"0 to {n - 1} is needed, because it has {n} columns"
+        )
     parts = (data[:used].astype(np.float64), indices[:used].astype(np.int64), indptr.astype(np.int64))
     return sp.csr_array(parts, shape=(m, n))

@@ -168,7 +168,8 @@ def _compute_mass_and_acceleration(
         (np.abs(mass) @ np.abs(a) + np.abs(force)).max(initial=0.0)
     ):
         raise CapabilityError(
-            "M aba(q, v, tau) differs from tau - nle(q, v): the accelerations were computed with another M"
+            "M times the acceleration of aba(q, v, tau) differs from tau - nle(q, v), so aba used another "
+            "mass matrix than crba: give the model with which the data was made, unchanged"
         )
     return mass, a
 
@@ -201,14 +202,16 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
         )
     if len(model.mimicking_joints):
         raise CapabilityError(
-            f"{len(model.mimicking_joints)} joints mimic others, which Pinocchio's aba does not support"
+            f"the model has {len(model.mimicking_joints)} mimicking joints, which Pinocchio's aba does not "
+            "support: build the model without them"
         )
     n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
     short = [name for name in lists if len(getattr(model, name)) != n]
     if short or n < 1:
         raise InputError(
-            f"the model has {n} joints, but {', '.join(short)} have other lengths. {OTHER_MODEL_ADVICE}"
+            f"the model has {n} joints, but its lists {', '.join(short)} have other lengths; one entry for "
+            f"each joint is needed. {OTHER_MODEL_ADVICE}"
         )
     at_v = at_q = 0
     for i in range(1, n):
@@ -220,16 +223,21 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
             or (joint.idx_v, joint.idx_q) != (at_v, at_q)
         ):
             raise InputError(
-                f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent before it "
-                f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL_ADVICE}"
+                f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent "
+                f"with a smaller number and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. "
+                f"{OTHER_MODEL_ADVICE}"
             )
         if not _is_rotation(model.jointPlacements[i].rotation):
-            raise InputError(f"the placement of joint {i} has a matrix that is not a rotation")
+            raise InputError(
+                f"the placement of joint {i} has a matrix that is not a rotation; an orthogonal matrix with "
+                "determinant 1 is needed"
+            )
         at_v, at_q = at_v + joint.nv, at_q + joint.nq
     sizes = {len(data.oMi), len(data.v), len(data.f)}
     if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv):
         raise InputError(
-            f"the data hold {len(data.oMi)} joints, the model {n} of {nv} velocities. {OTHER_MODEL_ADVICE}"
+            f"the data hold {len(data.oMi)} joints, and the model {n} joints with {nv} velocities; both "
+            f"must belong together: create the data with model.createData(). {OTHER_MODEL_ADVICE}"
         )
     if not model.check(data):
         raise InputError(
@@ -250,12 +258,18 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
     """
     kind = type(constraint).__name__
     if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
-        raise InputError(f"constraint model {i} is a {kind}; one of Pinocchio's is needed")
+        raise InputError(f"constraint model {i} is a {kind}; a constraint model of Pinocchio is needed")
     if type(data).__name__ != kind.replace("Model", "Data"):
-        raise InputError(f"constraint data {i} are {type(data).__name__}; those of a {kind} are needed")
+        raise InputError(
+            f"constraint data {i} are a {type(data).__name__}; the data of a {kind} are needed: create them "
+            "with its createData()"
+        )
     for name in ("joint1_placement", "joint2_placement"):
         if hasattr(constraint, name) and not _is_rotation(getattr(constraint, name).rotation):
-            raise InputError(f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation")
+            raise InputError(
+                f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation; an orthogonal "
+                "matrix with determinant 1 is needed"
+            )
     if kind == "FrameAnchorConstraintModel" and np.any(constraint.desired_constraint_offset):
         raise CapabilityError(
             f"constraint {i}, a {kind}, has a desired offset, which Pinocchio does not read: put it into a placement"
@@ -272,8 +286,8 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
         or n_velocities != model.nv
     ):
         raise InputError(
-            f"constraint {i}, a {kind}, is of joints {joints} and {n_velocities} velocities; the model has "
-            f"{model.njoints} and {model.nv}. {OTHER_MODEL_ADVICE}"
+            f"constraint {i}, a {kind}, refers to joints {joints} and {n_velocities} velocities; the model "
+            f"has {model.njoints} joints and {model.nv} velocities. {OTHER_MODEL_ADVICE}"
         )
 
 

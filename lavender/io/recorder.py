@@ -112,7 +112,10 @@ class Recorder:
         if when is not None and not callable(when):
             raise InputError(f"when is {when!r:.60}; a function of a StepVerdict is needed")
         if self.every is None and not self.keep_worst and when is None:
-            raise InputError("nothing would be recorded: give every=, keep_worst= or when=")
+            raise InputError(
+                "no condition selects steps, so that nothing would be recorded: give every=, keep_worst= "
+                "or when="
+            )
         self.when, self.solver, self.n_steps = when, solver, 0
         self._stack = contextlib.ExitStack()
         self.folder = self._stack.enter_context(lock_step_folder(folder, check_bool("replace", replace)))
@@ -304,6 +307,9 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
     """
     path = Path(folder) / STATES_FOLDER / file
     if not path.is_file():
-        raise InputError(f"{path} does not exist: {file} was recorded without state=")
+        raise InputError(
+            f"{path} does not exist, because {file} was recorded without state=; record the steps again "
+            "with state="
+        )
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)

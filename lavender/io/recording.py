@@ -264,7 +264,10 @@ def _load_controls_npy(path: str) -> Any:
         # A memory map cannot be longer than the file, whatever size the header declares.
         result = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise InputError(f"controls {path}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
+        raise InputError(
+            f"controls {path} cannot be read ({error}); one of {', '.join(CONTROLS)}, or a .npy file of one "
+            "array, is needed"
+        ) from None
     if not isinstance(result, np.ndarray):
         result.close()
         raise InputError(

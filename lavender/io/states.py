@@ -96,13 +96,19 @@ def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -
     valid = tuple(valid)
     for name in names:
         if name not in (*valid, *LABELS):
-            raise InputError(f"{source}: a state has no array {name!r}; its arrays are {', '.join(valid)}")
+            raise InputError(
+                f"{source} has an array {name!r}, which is not part of a state; the arrays of a state are "
+                f"{', '.join(valid)}: remove or rename it"
+            )
 
 
 def _read_keyframes(mj: Any, model: Any) -> StartStates:
     """Return the model's keyframes; raise InputError if it has none."""
     if not model.nkey:
-        raise InputError("states are 'keyframes', and the model has none; an .npz of states is needed")
+        raise InputError(
+            "states are 'keyframes', but the model has no keyframes; give an .npz file of states, or add "
+            "keyframes to the model"
+        )
     data, vectors = mj.MjData(model), []
     for key in range(model.nkey):
         mj.mj_resetDataKeyframe(model, data, key)
@@ -118,7 +124,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         raise InputError(
-            f"{source}: {' and '.join(missing)} missing; {VECTOR!r}, or qpos and qvel, are needed"
+            f"{source} has no {' and no '.join(missing)}; {VECTOR!r}, or qpos and qvel, are needed"
         )
     data = mj.MjData(model)
     parts: dict[str, FloatArray] = {}
@@ -132,7 +138,10 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(f"{source}: {sizes}; all arrays must have equally many entries, at least one")
+        raise InputError(
+            f"{source} holds states of different numbers: {sizes}; all arrays must have the same number of "
+            "entries, at least one"
+        )
     vectors = []
     for i in range(n):
         data = mj.MjData(model)

@@ -107,7 +107,10 @@ def lock_step_folder(
             for file in () if continued else (*old, folder / ENGINE):
                 file.unlink(missing_ok=True)
         except OSError as error:
-            raise InputError(f"cannot clear the folder {str(folder)!r}: {error.strerror}") from None
+            raise InputError(
+                f"the files in {str(folder)!r} cannot be removed ({error.strerror}); give another folder, "
+                "or permit writing to this one"
+            ) from None
         yield folder
 
 
@@ -445,6 +448,6 @@ class Budget:
         self.remaining -= count
         if self.remaining < 0:
             raise InputError(
-                f"{name} would take {self.limit - self.remaining} bytes of memory with what comes before, more than "
-                f"{self.limit}; pass max_bytes= if the file is meant to be that large"
+                f"{name} and the entries before it need {self.limit - self.remaining} bytes of memory, more "
+                f"than the limit of {self.limit}; pass max_bytes= if the file is meant to be that large"
             )

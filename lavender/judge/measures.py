@@ -37,7 +37,8 @@ def natural_map(problem: Problem, impulse: ArrayLike) -> float:
     """
     if problem.law not in ("linear", "lcp"):
         raise InputError(
-            f"natural_map is for bounded rows; this problem is {problem.law!r}: use residual or siconos_error"
+            f"natural_map measures problems of bounded rows, and this problem has the law {problem.law!r}: "
+            "use residual or siconos_error"
         )
     lam = problem.impulse_array(impulse)
     w = problem.slack(lam)
@@ -74,7 +75,10 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     u = problem.slack(lam)
     c = problem.cones
     if (c.separate_rows >= 0).any() or c.has_round or c.has_ellipse:
-        raise InputError("siconos_error has no spin rows, and no boxes or ellipses: its friction is a disk")
+        raise InputError(
+            "siconos_error is defined for disks only, and this problem has spin rows, boxes or ellipses: "
+            "use residual"
+        )
     components_of: dict[int, list[tuple[slice, float]]] = {}
     coefficient, is_contact = c.friction_coefficient, c.is_contact
     for block, rows in c.friction_components():
@@ -163,7 +167,10 @@ def qp_residual(problem: Problem, impulse: ArrayLike, multiplier: ArrayLike) -> 
         The problem has friction.
     """
     if problem.law not in ("linear", "lcp"):
-        raise InputError(f"qp_residual is for bounded rows; this problem is {problem.law!r}")
+        raise InputError(
+            f"qp_residual measures problems of bounded rows, and this problem has the law {problem.law!r}: "
+            "use residual"
+        )
     lam = problem.impulse_array(impulse)
     w = problem.slack(lam)
     c = problem.cones

@@ -150,7 +150,7 @@ class States(Sequence[State]):
             return [self[j] for j in range(*i.indices(len(self)))]
         i = check_int("block", i + len(self) if isinstance(i, int) and i < 0 else i)
         if i >= len(self):
-            raise IndexError(f"block {i}; there are {len(self)}")
+            raise IndexError(f"block {i} does not exist; there are {len(self)} blocks, numbered from 0")
         ptr = self._problem.cones.ptr
         rows = tuple(NAMES[case] for case in self.case[ptr[i] : ptr[i + 1]])
         return State(NAMES[self._code[i]], rows, float(self.margin[i]), float(self.tolerance[i]))

@@ -477,7 +477,10 @@ def audit(
     """
     check_name("engine", engine, ENGINES)
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
-        raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
+        raise InputError(
+            f"precision is {precision!r} and engine is {engine!r}; None is needed, or with engine 'mujoco' "
+            f"{' or '.join(PRECISIONS)}"
+        )
     check_workers(workers)
     judging = precision or "float64", check_float("threshold", threshold, low=0.0)
     expected_time = None

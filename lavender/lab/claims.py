@@ -251,8 +251,8 @@ def compare_claims(
         for step in steps:
             if outcomes and len(step.batch) != len(outcomes[0]):
                 raise InputError(
-                    f"step {len(outcomes)} has {len(step.batch)} worlds, the first one {len(outcomes[0])}; all steps "
-                    "need the same number"
+                    f"step {len(outcomes)} has {len(step.batch)} worlds, and the first step "
+                    f"{len(outcomes[0])}; all steps need the same number of worlds"
                 )
             outcome, velocity = _judge_claims_of_step(step, result)
             outcomes.append(outcome)
@@ -272,7 +272,7 @@ def compare_claims(
             recorder.close()
             _write_states_before_steps(recorder)
     if not outcomes:
-        raise InputError("there are no steps to judge")
+        raise InputError("steps is empty; at least one step is needed")
     result.outcome, result.velocity = np.array(outcomes), np.array(velocities)
     result.iterations = np.array(iterations)
     return result

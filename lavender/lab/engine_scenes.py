@@ -275,8 +275,8 @@ class NewtonScene:
         """Set the state of all worlds, arrays (n, ...), and clear the solver's warm start."""
         if not self._has_equal_worlds:
             raise InputError(
-                "the worlds of this scene have different bodies or joints, so they cannot start from states: "
-                "call without states"
+                "the worlds of this scene have different bodies or joints, so states cannot be set in one "
+                "array for all worlds: leave states out"
             )
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:
@@ -290,8 +290,8 @@ class NewtonScene:
                 target = getattr(self.before, name)
                 if np.size(state[name]) != np.prod(target.numpy().shape):
                     raise InputError(
-                        f"states: {name} has {np.shape(state[name])[1:]} numbers for each world, which are "
-                        f"{np.prod(target.numpy().shape) // self.n} in this scene"
+                        f"states: {name} has shape {np.shape(state[name])[1:]} for each world; "
+                        f"{np.prod(target.numpy().shape) // self.n} numbers are needed, as in this scene"
                     )
                 target.assign(np.asarray(state[name], np.float32).reshape(target.numpy().shape))
         if len(given) < len(NEWTON_GROUPS):
@@ -305,7 +305,10 @@ class NewtonScene:
         values = velocity.numpy().copy()
         by_world = values.reshape(self.n, -1) if self._has_equal_worlds else None
         if by_world is None:
-            raise InputError("worlds of this scene have different bodies or joints: spread must be 0")
+            raise InputError(
+                "the worlds of this scene have different bodies or joints, so noise cannot be added to "
+                "their velocities: give spread=0"
+            )
         for world in range(first, self.n):
             by_world[world] += spread * np.random.default_rng([seed, world]).standard_normal(
                 by_world.shape[1]

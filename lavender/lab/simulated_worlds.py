@@ -491,7 +491,9 @@ class WarpWorlds:
         self.mjw.forward(self.device_model, data)
         if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > self.n * rows:
             raise CapabilityError(
-                f"a world has more rows or contacts than the {rows} for which memory was allocated"
+                f"the worlds have up to {int(data.nefc.numpy().max())} rows, and "
+                f"{int(data.nacon.numpy()[0])} contacts together; memory was allocated for {rows} rows in "
+                f"each of {self.n} worlds: use a model with fewer contacts"
             )
         e, c = data.efc, data.contact
         efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in

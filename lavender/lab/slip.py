@@ -206,7 +206,8 @@ def explain_slip(
     free = measured.velocity(np.zeros(measured.m))
     if len(problem.velocity(answer)) != len(free):
         raise InputError(
-            f"disk has {len(free)} velocities, problem {len(problem.velocity(answer))}: equal ones are needed"
+            f"disk has {len(free)} velocities and problem {len(problem.velocity(answer))}; both must "
+            "describe the same step of the same model"
         )
 
     def slip(velocity: FloatArray) -> tuple[FloatArray, ...]:
@@ -267,12 +268,17 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
             fitting = [k for k in sliding if entry in problem.block_name(k)]
             if not fitting:
                 known = ", ".join(problem.block_name(k) for k in sliding[:8])
-                raise InputError(f"no contact's name contains {entry!r}; contacts are {known}")
+                raise InputError(
+                    f"contacts names {entry!r}, but no contact's name contains it; the contacts are {known}"
+                )
             chosen += fitting
         elif entry in sliding:
             chosen.append(int(entry))
         else:
-            raise InputError(f"block {entry!r} is not a contact with tangents; these are {sliding[:20]}")
+            raise InputError(
+                f"contacts names {entry!r}, which is not a contact with tangents; give one of the blocks "
+                f"{sliding[:20]}"
+            )
     return list(dict.fromkeys(chosen))
 
 

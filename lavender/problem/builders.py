@@ -175,14 +175,15 @@ class Builders(Operators):
         mu = as_array("mu", mu, (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(
-                f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
-                "contact is needed"
+                f"b has {len(b)} rows, which is not a multiple of the {len(mu)} values of mu; every contact "
+                "needs the same number of rows"
             )
         tangents = len(b) // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
         if not 0 <= tangents <= 2:
             raise InputError(
-                f"{len(b)} rows for {len(mu)} contacts; a contact has a normal row, up to two tangent rows, "
-                "a spin row if patch_radius is given, and two rolling rows if rolling is given"
+                f"b has {len(b)} rows for {len(mu)} contacts; each contact needs a normal row, up to two "
+                "tangent rows, a spin row if patch_radius is given, and two rolling rows if rolling is "
+                "given"
             )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
@@ -269,7 +270,8 @@ class Builders(Operators):
         lower, upper, findex = convert_to_findex(self.cones)
         if self.law == "cone":
             raise InputError(
-                "findex means Coulomb friction, not the law 'cone': pass problem.relaxed('coulomb')"
+                "findex describes Coulomb friction, and this problem has the law 'cone': give "
+                "problem.relaxed('coulomb')"
             )
         return self.delassus(), self.b, lower, upper, findex
 
@@ -531,11 +533,20 @@ class Builders(Operators):
         general = self.generalized
         new = (J, M, v_free, target)
         if general is None and any(x is not None for x in new):
-            raise InputError("J, M, v_free and target need a problem in generalised coordinates; give b")
+            raise InputError(
+                "J, M, v_free and target can be changed only in a problem in generalised coordinates, and "
+                f"this problem is given by {self.operator}: give b"
+            )
         if b is not None and target is not None:
-            raise InputError("give b or target, not both")
+            raise InputError(
+                "b and target are both given, and each of them determines the right-hand side: give one of "
+                "the two"
+            )
         if b is None and target is None and (J is not None or v_free is not None):
-            raise InputError("a new J or v_free changes the right-hand side: give target or b")
+            raise InputError(
+                "J or v_free is given without target and without b; the right-hand side target - J v_free "
+                "depends on them: give target or b, too"
+            )
         if general is not None and any(x is not None for x in (J, M, v_free)):
             general = (
                 general.with_jacobian(J, v_free)
@@ -580,7 +591,10 @@ def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rollin
     has_spin, has_rolling, c = patch_radius is not None, rolling is not None, len(mu)
     min_tangents, max_tangents = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
     if min_tangents < 0 or max_tangents > 2:
-        raise InputError("tangents must be 0, 1 or 2 for each contact")
+        raise InputError(
+            f"tangents holds numbers from {min_tangents} to {max_tangents}; 0, 1 or 2 is needed for each "
+            "contact"
+        )
     if has_rolling and min_tangents < 2:
         raise InputError(
             f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling rows rotate about two "
@@ -590,7 +604,8 @@ def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rollin
         bad = np.flatnonzero((mu > 0.0) & (tangents == 0))
         if len(bad):
             raise InputError(
-                f"contact {bad[0]} has mu {mu[bad[0]]:g} but no friction row: give tangents=2, or mu 0"
+                f"contact {bad[0]} has mu {mu[bad[0]]:g} but no friction row; friction needs tangents: give "
+                "tangents=2, or mu 0"
             )
     if min_tangents == max_tangents:
         return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)

@@ -181,7 +181,10 @@ class Cones:
         """Concatenate the blocks of several cones."""
         blocks = kernels.concatenate_blocks([each._blocks for each in cones])
         if blocks is None:
-            raise InputError("the blocks have more than 2^31 - 1 rows together")
+            raise InputError(
+                "the blocks together have more than 2^31 - 1 rows, which 32-bit indices cannot number: "
+                "split the problem"
+            )
         return cls._from_blocks(blocks)
 
     def _convert_fields(self) -> tuple[np.ndarray, ...]:
@@ -189,8 +192,8 @@ class Cones:
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
         if not are_pointers_valid(ptr, 1):
             raise InputError(
-                "cones.ptr must start with 0 and increase: the first row of each block, then the number of "
-                "rows"
+                f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
+                "each block, then the number of rows"
             )
         k, m = len(ptr) - 1, int(ptr[-1])
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
@@ -319,7 +322,10 @@ class Cones:
                 check_nonnegative_magnitudes(
                     SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m"
                 )
-            raise InputError(f"{k} contacts have more than 2^31 - 1 rows: split the problem")
+            raise InputError(
+                f"{k} contacts have more than 2^31 - 1 rows, which 32-bit indices cannot number: split the "
+                "problem"
+            )
         return cls._from_blocks(blocks)
 
     @property
@@ -447,8 +453,8 @@ class Cones:
             bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
                 raise InputError(
-                    f"block {bad[0]} has more rows than a normal and two tangents; a box cannot bound its "
-                    "spin or rolling"
+                    f"block {bad[0]} has more rows than a normal and two tangents, and a box cannot bound "
+                    "spin or rolling rows: leave these rows out, or keep the shape of the contact"
                 )
             kind[has_pair], radius[has_pair & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:

@@ -120,11 +120,14 @@ class ProblemData:
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
-            raise InputError("give exactly one of matrix=, rows= and generalized=")
+            raise InputError(
+                f"{sum(x is not None for x in (self.matrix, self.rows, self.generalized))} of matrix=, "
+                "rows= and generalized= are given; exactly one is needed"
+            )
         if isinstance(self.friction, str) and self.friction in ("box", "pyramid", "pyramidal"):
             raise InputError(
-                f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed: shape='box' bounds each tangent "
-                "separately"
+                f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed (a separate bound for each "
+                "tangent is a shape of the contacts: shape='box')"
             )
         put(self, "friction", check_choice("friction", self.friction, FRICTION_LAWS))
         if self.precision is None or (isinstance(self.precision, str) and not self.precision):
@@ -144,7 +147,10 @@ class ProblemData:
                 # Store the checked arrays separately, because callers can replace the arrays of the matrix object.
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
-                raise InputError("compliance needs rows; a matrix A already contains it on its diagonal")
+                raise InputError(
+                    "compliance is given for a problem with a matrix A; A already contains compliance on "
+                    "its diagonal: add it there, or give rows= or generalized="
+                )
         if self.guess is not None:
             guess = as_array("guess", self.guess, (m,), finite=False, unit="N s", copy=self.copy)
             check_finite("guess [N s]", guess)
@@ -190,11 +196,15 @@ class ProblemData:
         contact = self.cones.is_contact
         if kj + rows.n_contacts != k or contact[:kj].any() or not contact[kj:].all() or self.cones.has_round:
             raise InputError(
-                f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many blocks "
-                f"of bounded rows, then contacts (it has {k} blocks)"
+                f"rows has {kj} joints and {rows.n_contacts} contacts, and cones has {k} blocks; a block of "
+                "bounded rows for each joint is needed, followed by a contact block (not ROUND) for each "
+                "contact"
             )
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
-            raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
+            raise InputError(
+                f"cones.ptr begins with {self.cones.ptr[: kj + 1].tolist()!s:.60} and rows.joint_ptr is "
+                f"{rows.joint_ptr.tolist()!s:.60}; the blocks of joints must have the rows of the joints"
+            )
 
     def _check_generalized(self, generalized: Generalized, m: int) -> None:
         """Raise InputError if J does not have m rows, or the compliance is invalid; set the view for kernels."""
@@ -355,8 +365,8 @@ def _check_rhs(b: FloatArray) -> None:
     if not is_rhs_valid(b):
         max_abs = np.abs(b).max()
         raise InputError(
-            f"b [m/s] is {max_abs:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
-            f"{MIN_MAGNITUDE:g}: another unit of length or time brings it nearer to 1"
+            f"the largest entry of b [m/s] is {max_abs:g}, at [{int(np.argmax(np.abs(b)))}]; it must be 0 "
+            f"or at least {MIN_MAGNITUDE:g}: another unit of length or time brings it nearer to 1"
         )
 
 

@@ -26,11 +26,12 @@ def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
             raise InputError(f"findex[{i}] is {j}; a row below {m} is needed, or -1 for constant bounds")
         if j == i:
             raise InputError(
-                f"findex[{i}] is its own row; give the row of its normal, or -1 for constant bounds"
+                f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1 for constant bounds"
             )
         if findex[j] >= 0:
             raise InputError(
-                f"findex[{i}] is {j}; a normal row is needed, with findex -1, and row {j} has findex {findex[j]}"
+                f"findex[{i}] is {j}, but row {j} is not a normal, because its own findex is {findex[j]}; "
+                "the row of a normal (findex -1) is needed"
             )
     normal = np.where(findex >= 0, findex, np.arange(m))
     # Sort by the normal row, then the normal before its friction rows, then by the original order.
@@ -60,15 +61,17 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
     if len(bad):
         i = int(bad[0])
         raise InputError(
-            f"row {i} is the normal of row {int(np.flatnonzero(findex == i)[0])} with bounds [{low[i]}, {high[i]}]; "
-            "a normal needs [0, inf]: give the friction rows of other rows constant bounds (findex -1)"
+            f"row {i} is the normal of friction row {int(np.flatnonzero(findex == i)[0])} and has the "
+            f"bounds [{low[i]}, {high[i]}]; a normal needs [0, inf]: change its bounds, or give its "
+            "friction rows constant bounds (findex -1)"
         )
     count = np.bincount(findex[is_friction], minlength=m) if m else np.zeros(0, int)
     bad = np.flatnonzero(count > 2)
     if len(bad):
         raise InputError(
-            f"findex of {count[bad[0]]} rows is {bad[0]}; a normal has at most two such rows, its tangents: give the "
-            "others constant bounds, or spin as patch_radius of Cones.contacts"
+            f"{count[bad[0]]} rows have findex {bad[0]}; a normal has at most two friction rows, its "
+            "tangents: give the other rows constant bounds (findex -1), or spin by patch_radius of "
+            "Cones.contacts"
         )
     first = order[~is_friction[order]]  # First row of each block, as an index into the arrays.
     size = 1 + count[first]
@@ -94,8 +97,8 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     disks = np.flatnonzero(cones.n_together > 1)
     if len(disks):
         raise InputError(
-            f"block {disks[0]} bounds the norm of its tangents (a disk); findex bounds each tangent separately: "
-            "give the problem cones.shaped('box'), which is another friction law"
+            f"block {disks[0]} is a disk, which bounds the norm of its tangents, and findex bounds each "
+            "tangent separately: change the friction law by cones.shaped('box') first"
         )
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)

@@ -234,10 +234,12 @@ class Generalized:
             )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"Generalized is frozen; {name} cannot be set (make another)")
+        raise AttributeError(
+            f"{name} of a Generalized cannot be set, because the object is immutable: make another one"
+        )
 
     def __delattr__(self, name: str) -> None:
-        raise AttributeError(f"Generalized is frozen; {name} cannot be deleted")
+        raise AttributeError(f"{name} of a Generalized cannot be deleted, because the object is immutable")
 
     @property
     def m(self) -> int:

@@ -142,7 +142,9 @@ class Operators(ProblemData):
         try:
             view.compute_derived_numbers()
         except OverflowError as error:
-            raise TooLarge(f"the problem is too large: {error}") from None
+            raise TooLarge(
+                f"the problem is too large: {error}. Split it into smaller problems, for example by islands"
+            ) from None
         self._check_diagonal(view)
         return view
 
@@ -195,8 +197,8 @@ class Operators(ProblemData):
             bound = min(bound, self.m**2)  # Pairs of blocks that share both bodies were counted twice.
             if bound >= MAX_INDEXABLE_ENTRIES:
                 raise TooLarge(
-                    f"A would have up to {bound} entries, more than 32-bit indices reach: "
-                    "use a solver that reads rows"
+                    f"A would have up to {bound} entries; at most 2^31 - 1 can be indexed: use a solver "
+                    "that reads rows without forming A, for example a sweep solver"
                 )
             indptr, indices, data = assemble.form_delassus_matrix(self.data, bound, start, blocks)
             return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
@@ -229,8 +231,8 @@ class Operators(ProblemData):
         """
         if self.generalized is None:
             raise CapabilityError(
-                f"this problem was given as {self.operator}; Y is known in generalised coordinates "
-                "(Problem.from_jacobian)"
+                f"Y exists only in generalised coordinates, and this problem was given as {self.operator}: "
+                "build it with Problem.from_jacobian"
             )
         return _mark_matrix_read_only(
             sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv))
@@ -370,5 +372,5 @@ def analyse_matrix_for_factorisation(a: Any) -> tuple[LinearSystem, FloatArray]:
         system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))
         system.analyse()
     except OverflowError as error:
-        raise TooLarge(f"A cannot be factored: {error}") from None
+        raise TooLarge(f"A cannot be factored: {error}. Use a sweep solver, which needs no factor") from None
     return system, a.data

@@ -101,13 +101,21 @@ def compute_block_order(
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
     rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
-        raise InputError(f"seed={seed} needs order='random'; other orders are not random")
+        raise InputError(
+            f"seed={seed} is given for an order that is not random: give order='random', or leave seed out"
+        )
     if not isinstance(order, str):
         if ground is not None:
-            raise InputError("ground= needs order='bottom_up' or 'top_down', not an array of blocks")
+            raise InputError(
+                "ground= is given with an array of blocks as order; it needs order='bottom_up' or "
+                "'top_down': leave one of the two out"
+            )
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
-            raise InputError(f"order must hold every block from 0 to {k - 1} once")
+            raise InputError(
+                f"order is not a permutation of the blocks; every block from 0 to {k - 1} is needed exactly "
+                "once"
+            )
         return Order(blocks, k, GIVEN, rng)
     if order not in SWEEP_ORDERS:
         raise UnknownName("order", order, SWEEP_ORDERS)
@@ -143,16 +151,18 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
     if problem.rows is not None:
         if ground is not None:
             raise InputError(
-                "ground= needs a problem given as a matrix; rows already define the static bodies"
+                "ground= is given for a problem with rows, whose static bodies define the ground: leave it "
+                "out"
             )
         return compute_block_levels(problem.rows.block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
-            "levels of a matrix need ground=: the blocks that touch the ground (rows already define them)"
+            "the levels of a problem given as a matrix cannot be computed without ground=; give the "
+            "numbers of the blocks that touch the ground"
         )
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
-        raise InputError(f"ground names block {ground.max()}; there are {k} blocks")
+        raise InputError(f"ground holds block {ground.max()}; there are {k} blocks, numbered from 0")
     graph = _build_block_graph(problem)
     level = np.full(k, -1, np.int32)
     front = np.unique(ground)

@@ -432,7 +432,10 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
         or abs(matrix[:n, n:] + jac.T).nnz
         or cones != _make_one_sided_cones(n + free, len(b))
     ):
-        raise InputError(f"the problem was not built from a quadratic program of {n} variables")
+        raise InputError(
+            f"the matrix of the problem does not have the form of a quadratic program of {n} variables; a "
+            "problem of Problem.from_qp with a singular P is needed"
+        )
     lower = extract_lower_triangle("P", hessian, "give both triangles")
     rows = convert_to_compressed_rows("J", jac)
     _factor_definite(lower, rows, -b[:n])
@@ -458,7 +461,10 @@ def unpack_qp_arguments(arguments: ProgramArrays) -> ProgramArrays:
             "P and q are needed, or a qpsolvers.Problem alone"
         )
     if any(x is not None for x in arguments[1:]):
-        raise InputError("a qpsolvers.Problem holds all arrays: give it alone")
+        raise InputError(
+            "a qpsolvers.Problem and further arrays are given; the qpsolvers.Problem already holds all "
+            "arrays: give it alone"
+        )
     return tuple(getattr(P, name) for name in names)
 
 
@@ -523,7 +529,10 @@ class _RowStack:
         """
         if (matrix is None) != (rhs is None):
             missing = name if matrix is None else rhs_name
-            raise InputError(f"{missing} is missing: {name} and {rhs_name} go together")
+            raise InputError(
+                f"{missing} is missing; {name} and {rhs_name} describe the same constraints: give both or "
+                "neither"
+            )
         if matrix is None:
             return None, None
         rows = _convert_matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
@@ -537,7 +546,10 @@ class _RowStack:
             finite_rows = np.flatnonzero(h < INFINITE)
             rows, h = _select_rows(rows, finite_rows), h[finite_rows]
             if not all_finite(h):
-                raise InputError(f"h is -inf at [{finite_rows[np.argmin(h)]}]: no x is below it")
+                raise InputError(
+                    f"h is -inf at [{finite_rows[np.argmin(h)]}], which no x satisfies; a finite bound is "
+                    "needed, or inf for no bound"
+                )
         self.add_rows(rows, -h)
         return m, finite_rows
 

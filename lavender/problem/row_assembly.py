@@ -210,7 +210,10 @@ class RowAssembly:
         along = self._check_direction("tangent", tangent)
         across = subtract(along, scale(dot(along, normal), normal))
         if hypot(*across) < NORMAL_LENGTH_TOLERANCE:
-            raise InputError("tangent is parallel to normal; another direction is needed")
+            raise InputError(
+                f"tangent is {tangent!r:.60}, which is parallel to the normal; another direction is needed, "
+                "or None"
+            )
         return normalise("tangent", across)
 
     def _reserve_key(
@@ -218,7 +221,7 @@ class RowAssembly:
     ) -> tuple[int, str]:
         """Return the key and the name of a new block, and reserve the key."""
         if not isinstance(name, str):
-            raise InputError(f"name is {name!r:.60}; a str is needed")
+            raise InputError(f"name is {name!r:.60}; a text is needed")
         if feature is None:
             number = self._next_feature.get((block_type, *pair), 0)
             if number > MAX_FEATURE:
@@ -231,7 +234,8 @@ class RowAssembly:
         bodies = " and ".join("world" if body < 0 else f"body {body}" for body in pair)
         if key in self._keys:
             raise InputError(
-                f"feature is {number}, as of another {block_type} of {bodies}; a different number is needed"
+                f"feature is {number}, which another {block_type} of {bodies} already has; a number that no "
+                f"other {block_type} of them has is needed"
             )
         self._keys.add(key)
         self._next_feature[(block_type, *pair)] = number + 1
@@ -298,11 +302,14 @@ class RowAssembly:
         """Return the row of a motor or limit: of travel at the anchor, or of rotation."""
         if not is_linear:
             if anchor is not None:
-                raise InputError("anchor is given with max_torque; leave it out, or give max_force")
+                raise InputError(
+                    "anchor is given with max_torque, which acts everywhere on the body: leave anchor out, "
+                    "or give max_force"
+                )
             direction = self._check_rotation_axis("axis", axis)
             return self._make_angular_row(pair, direction, direction, 0.0)
         if anchor is None:
-            raise InputError("anchor is None; with max_force the point at which the force acts is needed")
+            raise InputError("anchor is None; a motor with max_force needs the point at which the force acts")
         if axis is None:
             raise InputError(f"axis is None; the direction of travel ({self._dimensions},) is needed")
         point = self._check_vector("anchor", anchor, "m")

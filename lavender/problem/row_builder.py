@@ -352,7 +352,10 @@ class RowBuilder(RowAssembly):
         wanted = check_float("speed", speed)
         if (max_torque is None) == (max_force is None):
             state = "neither is given" if max_torque is None else "both are given"
-            raise InputError(f"max_torque and max_force: {state}; one of the two is needed")
+            raise InputError(
+                f"of max_torque and max_force {state}; exactly one of the two is needed: max_torque for "
+                "rotation, max_force for travel"
+            )
         if max_force is None:
             bound = self._dt * check_float("max_torque", max_torque, low=0.0)
         else:
@@ -392,7 +395,7 @@ class RowBuilder(RowAssembly):
         high = inf if _is_float(upper) and upper == inf else check_float("upper", upper)
         if low > high or (low == -inf and high == inf):
             wanted = "lower must not exceed upper" if low > high else "at least one must be finite"
-            raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}")
+            raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}: change one of the two")
         row, rows = self._make_motor_or_limit_row(pair, axis, anchor, anchor is not None), []
         if low > -inf:
             rows.append(row._replace(target=self._compute_stop_velocity(present - low), lower=0.0))

@@ -142,8 +142,8 @@ class Rows:
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
         if not checks.are_pointers_valid(ptr, 1):
             raise InputError(
-                "joint_ptr must start with 0 and increase: the first row of each joint, then the "
-                "number of joint rows"
+                f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
+                "each joint, then the number of joint rows"
             )
         shapes: dict[str, tuple[int | None, ...]] = {
             "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
@@ -184,9 +184,13 @@ class Rows:
         if kind == "pair":
             body = getattr(self, f"{name}_body")[index, 0]
             if body >= 0:
-                raise InputError(f"{name}_body[{index}] joins body {body} to itself")
+                raise InputError(
+                    f"{name}_body[{index}] is [{body}, {body}]; two different bodies are needed, or -1 for "
+                    "a static one"
+                )
             raise InputError(
-                f"{name}_body[{index}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+                f"{name}_body[{index}] is [-1, -1], two static bodies, which no impulse moves; at least one "
+                f"moving body is needed: leave this {name} out"
             )
         check_nonnegative_magnitudes("inv_mass", self.inv_mass, UNITS["inv_mass"])
         check_nonnegative_magnitudes(

@@ -93,8 +93,8 @@ def solve_qp(
     qp = getattr(problem, "qp", None)
     if qp is None:
         raise InputError(
-            "problem is not a quadratic program: make it with Problem.from_qp; updated() and files contain "
-            "only the constraint problem"
+            "the problem does not contain a quadratic program; a problem of Problem.from_qp is needed "
+            "(results of updated() and problems read from files contain only the constraint problem)"
         )
     begun = perf_counter()
     tol, end = check_float("tol", tol, low=0.0), begun + check_time_limit(time_limit)

@@ -87,7 +87,10 @@ class Accelerated(Sweeping):
         if self.sweep is not None:
             check_name("sweep", self.sweep, SWEEPS)
         if self.sweep == "pgs" and problem.law == "cone":
-            raise InputError("sweep='pgs' has no update for the cone law; sweep='blocks' has")
+            raise InputError(
+                "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give "
+                "sweep='blocks'"
+            )
         if not isinstance(self.convex, int) or self.convex < 0:
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
 

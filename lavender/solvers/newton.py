@@ -197,8 +197,8 @@ class Newton(Solver):
         check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
-                "form='velocity' needs a problem with J and M (Problem.from_rows, Problem.from_jacobian); this one "
-                "was given as a matrix"
+                "form='velocity' needs J and M, and this problem was given as a matrix A: build it with "
+                "Problem.from_rows or Problem.from_jacobian, or give form='impulse'"
             )
         if problem.m == 0:
             return NewtonState(problem, None)
@@ -218,14 +218,15 @@ class Newton(Solver):
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
             raise CapabilityError(
-                f"form='velocity' accepts a matrix of {general.MAX_MATRIX_ENTRIES:.1e} values over the velocities of "
-                "an island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
-                "or sweeps"
+                f"form='velocity' accepts at most {general.MAX_MATRIX_ENTRIES:.1e} values in the matrix "
+                "over the velocities of an island (dense, or with the fill of its factor), and this "
+                "problem needs more: give form='impulse', or use a sweep solver"
             )
         if problem.cones.has_round:
             raise CapabilityError(
-                "round cones of more than two tangents are solved over velocities alone: form='impulse' does not take "
-                f"them, and form='velocity' accepts {general.MAX_MATRIX_ENTRIES:.1e} values of an island's matrix"
+                "round cones of more than two tangents need form='velocity', which accepts at most "
+                f"{general.MAX_MATRIX_ENTRIES:.1e} values in the matrix of an island; this problem needs "
+                "more, and form='impulse' does not support such cones: use fewer tangents"
             )
         form = "impulse" if bodies is None else "velocity"
         system = make_system(problem, form, like, bodies)

@@ -268,7 +268,7 @@ class SolverSpec:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
+            raise InputError(f"the name of a solver is {self.name!r}; a text that is not empty is needed")
         if not isinstance(self.summary, str):
             raise InputError(f"summary of solver {self.name!r} is {self.summary!r:.80}; a text is needed")
         for name, choices in (
@@ -283,7 +283,9 @@ class SolverSpec:
                     f"{name} of solver {self.name!r} are {values!r:.80}; a set of {', '.join(choices)} is needed"
                 )
             if not values and name != "box_friction_laws":
-                raise InputError(f"solver {self.name!r} has no {name}; of {', '.join(choices)} one is needed")
+                raise InputError(
+                    f"solver {self.name!r} has no {name}; at least one of {', '.join(choices)} is needed"
+                )
             object.__setattr__(self, name, frozenset(values))
         if not isinstance(self.requires, (tuple, list)) or not all(isinstance(n, str) for n in self.requires):
             raise InputError(
@@ -291,8 +293,8 @@ class SolverSpec:
             )
         if not isinstance(self.options, Mapping):
             raise InputError(
-                f"options of solver {self.name!r} are {self.options!r:.80}; a table of names, with a line on each, "
-                "is needed"
+                f"options of solver {self.name!r} are {self.options!r:.80}; a mapping from names of options "
+                "to their descriptions is needed"
             )
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
@@ -500,7 +502,7 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
 
 def _add_spec(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
-        raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
+        raise InputError(f"spec is a {type(spec).__name__}; a lavender.SolverSpec is needed")
     if spec.name in registered and not replace:
         raise InputError(
             f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"

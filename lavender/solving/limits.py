@@ -125,11 +125,11 @@ def check_records(spec: SolverSpec, history: bool, callback: Callback | None) ->
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
     if callback is not None and not spec.callback:
         raise CapabilityError(
-            f"solver {spec.name!r} runs in one call and takes no callback: use a solver of "
-            "lavender.available(problem, callback=True)"
+            f"solver {spec.name!r} runs in one call, so it cannot call a callback: leave callback out, or "
+            "use a solver of lavender.available(problem, callback=True)"
         )
     if check_bool("history", history) and not spec.history:
         raise CapabilityError(
-            f"solver {spec.name!r} runs in one call and records no history: use a solver of "
-            "lavender.available(problem, history=True)"
+            f"solver {spec.name!r} runs in one call, so it cannot record a history: leave history out, or "
+            "use a solver of lavender.available(problem, history=True)"
         )

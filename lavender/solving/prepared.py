@@ -135,7 +135,8 @@ class Prepared:
             if name not in spec.accepts:
                 if name in SOLVE_ARGUMENTS:
                     raise CapabilityError(
-                        f"prepare does not take {name}=: give it to the solve of what it returns"
+                        f"prepare does not take {name}=; give it to the method solve of the returned "
+                        f"object: prepare(...).solve({name}=...)"
                     )
                 if name in ("order", "ground", "seed"):
                     raise CapabilityError(

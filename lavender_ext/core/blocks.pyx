@@ -184,7 +184,7 @@ def make_blocks_over_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Return blocks that read these arrays in place; raise ValueError if they do not fit each other or have a fault."""
     cdef Blocks blocks = Blocks.__new__(Blocks)
     if not blocks.bind_arrays(ptr, kind, lower, upper, mu, patch_radius, rolling) or not blocks.validate():
-        raise ValueError("the arrays do not fit each other, or have a fault")
+        raise ValueError("the arrays of the blocks have different lengths or invalid values; arrays of valid blocks are needed")
     blocks._arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
     return blocks
 

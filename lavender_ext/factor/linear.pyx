@@ -402,7 +402,7 @@ cdef class LinearSystem:
             self.indptr, self.indices = pattern
             self.f.kind, self.f.n = ROWS, <int32_t>len(self.indptr) - 1
         if self.f.n < 1:
-            raise ValueError("a matrix of one row or more")
+            raise ValueError(f"the matrix has {self.f.n} rows; at least one row is needed")
         if splu is not None:
             self.calls = fallback_t(<void*>self, call_fallback, solve_by_fallback)
             self.f.fallback = &self.calls
@@ -505,7 +505,7 @@ cdef class LinearSystem:
         cdef int32_t lost, n = self.f.n
         self.allocate_factor_memory(lu)
         if x.shape[0] != (<int64_t>n * n if self.f.kind == DENSE else len(self.indices)):
-            raise ValueError("entries of another matrix")
+            raise ValueError(f"data has {x.shape[0]} entries; the entries of the analysed matrix are needed")
         self.data, self.other = data, None
         if x.shape[0] == 0:
             return n
@@ -513,7 +513,7 @@ cdef class LinearSystem:
         if d is not None:
             metric = np.ascontiguousarray(d)
             if metric.shape[0] != n:
-                raise ValueError("a metric of another matrix")
+                raise ValueError(f"d has {metric.shape[0]} entries; {n} are needed")
             self.f.d = &metric[0]
         self.f.rows.data = self.f.matrix = <double*>&x[0]
         self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
@@ -535,7 +535,7 @@ cdef class LinearSystem:
         cdef double[::1] x = out, scratch
         cdef bint is_good = True
         if x.shape[0] != n or self.numbers is None:
-            raise ValueError("of another size, or before a factor")
+            raise ValueError(f"r has {x.shape[0]} entries; {n} are needed, and `factor` must be called first")
         if checked:
             scratch = np.empty(n)
             with nogil:
@@ -554,7 +554,7 @@ cdef class LinearSystem:
         out = np.empty(self.f.n)
         cdef double[::1] y = out
         if x.shape[0] != self.f.n or self.data is None:
-            raise ValueError("of another size, or before a factor")
+            raise ValueError(f"x has {x.shape[0]} entries; {self.f.n} are needed, and `factor` must be called first")
         multiply_by_system_matrix(&self.f, &x[0], &y[0])
         return out
 
@@ -580,7 +580,7 @@ cdef class LinearSystem:
         cdef int32_t i, k
         cdef int64_t ld
         if self.numbers is None:
-            raise ValueError("before a factor")
+            raise ValueError("there is no factor yet; `factor` must be called first")
         rows = []
         for i in range(f.supernodes):
             ld = panel_width(f, i) + rows_below(f, i)

@@ -482,7 +482,7 @@ cdef class Pivoting:
         cdef double[::1] reals
         cdef int32_t[::1] ints
         if p.factored or p.is_general:
-            raise ValueError("Pivoting reads A in compressed rows")
+            raise ValueError("the problem data has no A in compressed rows; Pivoting needs it: give problem.csr_data")
         if outside is None and not symmetric and (band != m - 1 or order is not None):
             raise ValueError("LU needs a band of m - 1 and rows in their own order")
         self.p, self.judged, self.order, self.outside = p, p if judged is None else judged, order, outside

@@ -231,7 +231,7 @@ cdef class Sweeps:
         c.split, c.mode, c.rng, c.exact = split, mode, &rng[0], exact
         n = sweeps_workspace_size(&self.x, &self.view, first)
         if n < 0:
-            raise MemoryError("the prepared numbers of blocks do not fit 32-bit indices")
+            raise MemoryError("the prepared blocks have 2^31 numbers or more, which 32-bit indices cannot number")
         self.workspace = workspace = np.zeros(n + extra)
         self.references = p, order, rng, start
         start_sweeps(&self.x, &self.view, first, &workspace[0])

@@ -144,7 +144,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("check", "nothing.npz"), "no such file"),
         (("report", "--tolerances", "many"), "not a list of numbers"),
         (("report", "--workers", "1", "--seeds", "9:3"), "whole numbers with A < B"),
-        (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
+        (("report", "--time-budgets", "0"), "time budget 0.0 is not positive"),
         (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
         (
             ("report", "stack(n=4)", "--workers", "1", "--seeds", "3"),
@@ -184,9 +184,12 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),
         (("run", "stack", "--iterations", "3"), "solver_iterations"),
-        (("run", "stack", "--order", "given", "--set", "order=reverse"), "both set order"),
-        (("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"), "both set solver_iterations"),
-        (("run", "stack", "--warm-start", "--set", "warm_start=false"), "both set warm_start"),
+        (("run", "stack", "--order", "given", "--set", "order=reverse"), "set the same parameter, order"),
+        (
+            ("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"),
+            "set the same parameter, solver_iterations",
+        ),
+        (("run", "stack", "--warm-start", "--set", "warm_start=false"), "set the same parameter, warm_start"),
         (("phenomena", "nothing"), "unknown phenomenon"),
         (("phenomena", "stick", "--set", "slope=3"), "0 to 0.99 is needed"),
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
@@ -483,7 +486,7 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     # Without the option the precision is the problem's, and the exit code that of the claims.
     assert lavender("check", tmp_path / "early.npz", *told[:2])[0] == 0
     code, _, err = lavender("check", tmp_path / "none.npz", *told)
-    assert code == cli.EXIT_BAD_INPUT and "no file has a solution" in err
+    assert code == cli.EXIT_BAD_INPUT and "no file has one" in err
     code, _, err = lavender("check", tmp_path / "done.npz", "--precision", "half")
     assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err
 

@@ -40,7 +40,7 @@ def test_lavender_run_takes_a_velocity_error_for_a_named_solver(lavender):
     code, printed, _ = lavender(*words, "--solver", "newton", "--residual")
     assert not code and "newton" in printed
     code, _, said = lavender(*words)
-    assert code == 2 and "name a solver" in said
+    assert code == 2 and "name another solver" in said
     assert lavender(*words[:-1], "-1", "--solver", "newton")[0] == 2
 
 

@@ -149,7 +149,7 @@ def test_mistakes_with_a_builder_name_the_call_to_use():
         builder.velocity_after(problem, solution)
     with pytest.raises(AttributeError, match="no attribute 'contacts'; use contact"):
         builder.contacts  # noqa: B018
-    with pytest.raises(lv.InputError, match="shape='box' bounds each tangent"):
+    with pytest.raises(lv.InputError, match="a separate bound for each tangent is a shape"):
         builder.problem("pyramid")
 
 

@@ -215,7 +215,7 @@ def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
     data.efc_R[:] = 0.0
     np.testing.assert_allclose(lv.io.from_mujoco(model, data).compliance, right.compliance, rtol=1e-14)
     data.efc_R[:] = 3.0
-    with pytest.raises(lv.CapabilityError, match="disagree"):
+    with pytest.raises(lv.CapabilityError, match="efc_R and 1 / efc_D differ"):
         lv.io.from_mujoco(model, data)
 
 
@@ -430,7 +430,7 @@ def test_counts_beyond_the_memory_of_the_data_are_refused(name, value):
         pytest.skip("this MuJoCo does not count so")
     setattr(data, name, value)
     for read in (lv.io.from_mujoco, adapter.impulse, adapter.scaling, adapter.jacobian):
-        with pytest.raises(lv.InputError, match="does not hold as many"):
+        with pytest.raises(lv.InputError, match="do not fit into"):
             read(model, data)
 
 

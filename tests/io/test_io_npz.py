@@ -115,7 +115,7 @@ def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
         lavender.io.save("problem", tmp_path / "p.npz")
     with pytest.raises(lv.InputError, match="impulse"):
         lavender.io.save(problem, tmp_path / "p.npz", impulse=[1.0])
-    with pytest.raises(lv.InputError, match="for FCLIB"):
+    with pytest.raises(lv.InputError, match="have no effect on an"):
         lavender.io.save(problem, tmp_path / "p.npz", form="local")
     assert not list(tmp_path.iterdir())
 
@@ -221,9 +221,9 @@ def test_files_that_are_no_problem_are_refused(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(lv.InputError, match=sign):
             lavender.io.load(tmp_path / name)
-    with pytest.raises(lv.InputError, match="holds x, y; a problem has"):
+    with pytest.raises(lv.InputError, match="holds the entries x, y; a problem has"):
         lavender.io.load(archive(tmp_path / "foreign.npz", {"x": 1, "y": 2}))
-    with pytest.raises(lv.InputError, match="holds nothing"):
+    with pytest.raises(lv.InputError, match="holds the entries nothing"):
         lavender.io.load(archive(tmp_path / "none.npz", {}))
     with zipfile.ZipFile(tmp_path / "office.npz", "w") as out:
         out.writestr("word/document.xml", "<xml/>")
@@ -233,7 +233,7 @@ def test_files_that_are_no_problem_are_refused(tmp_path):
         out.writestr("b.npy", npy("<f8", (0,)))
         with pytest.warns(UserWarning, match="Duplicate"):
             out.writestr("b.npy", npy("<f8", (0,)))
-    with pytest.raises(lv.InputError, match="for each name"):
+    with pytest.raises(lv.InputError, match="with different names"):
         lavender.io.load(tmp_path / "twice.npz")
 
 
@@ -257,15 +257,15 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"),
         ({"meta": np.zeros(3)}, "JSON"),
         ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "JSON"),
-        ({"meta": META | {"operator": "magic"}}, "'meta' must hold"),
-        ({"meta": META | {"names": "abc"}}, "'meta' must hold"),
-        ({"meta": META | {"names": [1]}}, "'meta' must hold"),
-        ({"meta": META | {"more": 1}}, "'meta' must hold"),
+        ({"meta": META | {"operator": "magic"}}, "operator is 'magic'"),
+        ({"meta": META | {"names": "abc"}}, "names is 'abc'"),
+        ({"meta": META | {"names": [1]}}, "a list of names, or null"),
+        ({"meta": META | {"more": 1}}, "unknown names more"),
         ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
-        ({"meta": META | {"precision": "float16"}}, "precision in it is float64 or float32"),
-        ({"meta": META | {"names": ["one"]}}, "names for 12 blocks"),
-        ({"meta": META | {"program": 2}}, "program a number of variables, with the operator csr"),
-        ({"meta": META | {"operator": "csr", "program": True}}, "program a number of variables"),
+        ({"meta": META | {"precision": "float16"}}, "precision is 'float16'; float64 or float32"),
+        ({"meta": META | {"names": ["one"]}}, "entries for 12 blocks"),
+        ({"meta": META | {"program": 2}}, "program is 2; a number of variables, with the operator csr"),
+        ({"meta": META | {"operator": "csr", "program": True}}, "program is True; a number of variables"),
         ({"b": np.full(12, np.nan)}, "finite"),
         ({"b": np.array(["1"] * 12)}, "numbers are needed"),
         ({"b": np.zeros(11)}, "b .*shape"),
@@ -275,10 +275,10 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"impulse": np.zeros(3)}, "impulse"),
         ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"),
         ({"cones_lower": np.full(12, np.nan)}, "NaN"),
-        ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "outside"),
-        ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "outside"),
+        ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "column indices from 0 to 9"),
+        ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "column indices from -1 to 3"),
         ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "points to"),
+        ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "announce 1073741824 entries"),
         ({"A_indptr": np.array([1, 1, 2, 3, 4], np.int32)}, "pointers"),
         ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"),
         ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
@@ -324,7 +324,7 @@ def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tm
         lv.solve(loaded, "newton")
     meta = {"operator": "csr", "friction": "coulomb", "name": "", "names": None}
     for n, sign in (
-        (1, "not built from a quadratic program of 1 "),
+        (1, "form of a quadratic program of 1 "),
         (99, "program is 99"),
         (-1, "program is -1"),
     ):
@@ -392,16 +392,16 @@ def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
         ({"lo": np.zeros(6)}, "'lo'"),
         ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
         ({"b": np.zeros((7, 1))}, "one dimension"),
-        ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within the 7 rows"),
-        ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within the 7 rows"),
+        ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
+        ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
         ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
         ({"cone_start": [0], "cone_dim": [5], "cone_mu": [0.5]}, "1 to 3 rows"),
         ({"cone_start": [0], "cone_dim": [3], "cone_mu": [-0.5]}, "mu"),
         ({"cone_start": [0], "cone_dim": [3, 3], "cone_mu": [0.5]}, "'cone_dim'"),
         ({"cone_start": [0], "cone_mu": [0.5]}, "'cone_dim'"),
-        ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' must hold whole numbers"),
-        ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' must hold whole numbers"),
-        ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' must hold whole numbers"),
+        ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
+        ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' holds"),
+        ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
         ({"l_ref": np.zeros(3)}, "l_ref"),
         ({"A": np.full((7, 7), np.inf)}, "finite"),
     ],

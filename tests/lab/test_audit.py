@@ -337,7 +337,7 @@ def test_worlds_start_from_keyframes(tmp_path):
         ({"qpos": np.zeros((0, 15)), "qvel": np.zeros((0, 13))}, "at least one"),
         (
             {"qpos": np.zeros((1, 15)), "qvel": np.zeros((1, 13)), "speed": np.zeros(1)},
-            "a state has no array 'speed'",
+            "has an array 'speed'",
         ),
         ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"),
     ],

@@ -69,9 +69,9 @@ def test_ctrl_c_keeps_the_steps_so_far():
 
 
 def test_steps_of_other_sizes_and_none_are_rejected():
-    with pytest.raises(lv.InputError, match="no steps"):
+    with pytest.raises(lv.InputError, match="steps is empty"):
         compare_claims([])
-    with pytest.raises(lv.InputError, match="2 worlds, the first one 1"):
+    with pytest.raises(lv.InputError, match="2 worlds, and the first step 1"):
         compare_claims([step_of([0.0], [1]), step_of([0.0, 0.0], [1, 1])])
 
 
@@ -103,7 +103,10 @@ def test_states_before_the_worst_answers_are_written(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ({"qpos": np.zeros((2, 7))}, "a state has no array 'qpos'; its arrays are body_q"),
+        (
+            {"qpos": np.zeros((2, 7))},
+            "has an array 'qpos', which is not part of a state; the arrays of a state are body_q",
+        ),
         ({"joint_q": np.zeros((2, 7)), "joint_qd": np.zeros((3, 6))}, "2 of joint_q, 3 of joint_qd"),
         ({"joint_q": np.zeros((0, 7))}, "0 of joint_q"),
         ({"joint_q": np.full((1, 7), np.nan)}, "joint_q"),

@@ -171,7 +171,7 @@ def test_chosen_contacts_and_summary():
     table = summarize_slip(explanations)
     assert [str(row[0]) for row in table.rows] == ["slope, box"]
     assert table.rows[0][-1] == "load above the friction limit"
-    with pytest.raises(lv.InputError, match="no contact's name contains 'hand'"):
+    with pytest.raises(lv.InputError, match="but no contact's name contains it"):
         explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
 
 

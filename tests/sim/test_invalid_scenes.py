@@ -542,13 +542,13 @@ def test_ctrl_c_stops_a_step_of_very_many_substeps():
     sim = lv.Simulation(lv.Scene("stack", n=2, substeps=10**6))  # whose arrays need not grow
     start, kernel, limits = sim.snapshot(), sim.state.kernel, []
 
-    def substeps(most):
+    def run_substeps(most):
         limits.append(most)
         if len(limits) == 4:
             _thread.interrupt_main()  # the flag of the signal: Python looks at it before its next line
         return kernel.run_substeps(most)
 
-    sim.state.kernel = ReplacedCalls(kernel, substeps=substeps)
+    sim.state.kernel = ReplacedCalls(kernel, run_substeps=run_substeps)
     with pytest.raises(KeyboardInterrupt):
         sim.step()
     assert len(limits) == 4

@@ -152,7 +152,10 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
         elif isinstance(source, Case):
             items.append(_make_item_of_case(source, source.name))
         elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
-            raise InputError(f"case {source!r:.60} is not a file, a name of the suite or a problem")
+            raise InputError(
+                f"case {source!r:.60} is a {type(source).__name__}; the path of a file, a name of the suite "
+                "or a Problem is needed"
+            )
         elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
             steps = _rename_duplicate_sequence(list_steps_in_folder(source), items)
             name, missing = steps[0].sequence, map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
@@ -400,7 +403,10 @@ def _make_item_of_file(path: Path) -> Item:
             # A pipe may never end.
             raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
         if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
-            raise InputError(f"{path}: it could not be recorded: {reason}")
+            raise InputError(
+                f"{path} was not written, because this step could not be recorded ({reason}): choose "
+                "another step"
+            )
         return io.load(path)
 
     return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))

@@ -399,7 +399,9 @@ def from_json(line: Any) -> Entry:
         It is not an entry of a records file: a field is missing, has another type or is out of its range.
     """
     if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
-        raise ValueError("not an entry of a records file")
+        raise ValueError(
+            f"not an entry of a records file; a JSON object with a kind is needed, one of {', '.join(KINDS)}"
+        )
     cls = KINDS[line["kind"]]
     line = _rename_fields(line)
     try:
@@ -409,7 +411,7 @@ def from_json(line: Any) -> Entry:
             values["stored_verdict"] = VERDICTS_OF_OLD[word] + comma + rest
         return cls(**values)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"not an entry of a records file ({error})") from None
+        raise ValueError(f"the line is not a valid entry of kind {line['kind']!r}: {error}") from None
 
 
 def _rename_fields(line: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -451,10 +453,10 @@ def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
             value = tuple(map(_to_float, value) if "float" in kind else value)
         expected, is_valid = _TYPES[kind]
         if not is_valid(value):
-            raise ValueError(f"{f.name} is not {expected}")
+            raise ValueError(f"{f.name} is {value!r:.60}; {expected} is needed")
         rule = _RANGES.get((cls.__name__, f.name)) or (_RANGES[""] if isinstance(value, float) else None)
         if rule and not rule[1](value):
-            raise ValueError(f"{f.name} is not {rule[0]}")
+            raise ValueError(f"{f.name} is {value!r:.60}; {rule[0]} is needed")
         values[f.name] = value
     return values
 

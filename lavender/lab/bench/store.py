@@ -314,12 +314,15 @@ def read_records(path: str | Path) -> Records:
                 continue
             entry = from_json(content)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
+            raise InputError(
+                f"{path}, line {number}: {error}. Give a records.jsonl that `lavender report` wrote, or "
+                "remove this line"
+            ) from None
         if isinstance(entry, Record) and not (entry.case in found.cases and entry.run in found.runs):
             what = "case" if entry.run in found.runs else "run"
             raise InputError(
-                f"{path}, line {number}: a record of a {what} that no earlier line describes; "
-                "a complete records.jsonl is needed"
+                f"{path}, line {number}: the record belongs to a {what} that no earlier line describes; a "
+                "complete records.jsonl is needed: copy the whole file"
             )
         found.add(entry)
     # A repeated measurement takes the place of the earlier one in the list.
@@ -334,7 +337,8 @@ def _read_lines(path: Path) -> Iterator[str]:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise InputError(
-                f"{path} holds {size} bytes, more than {MAX_BYTES}; a records.jsonl of fewer cases is needed"
+                f"{path} holds {size} bytes, more than the limit of {MAX_BYTES}; measure fewer cases in one "
+                "folder"
             )
         with path.open("rb") as f:
             while line := f.readline(MAX_LINE_BYTES):

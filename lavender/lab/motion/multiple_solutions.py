@@ -202,7 +202,10 @@ class SolutionSet:
         """
         choice = check_choice("choice", choice, SELECTION_RULES)
         if not self.motions:
-            raise InputError("no run ended at a solution, so none can be selected")
+            raise InputError(
+                "none of the runs ended at a solution, so no motion can be selected: give more runs, more "
+                "iterations or a larger tol"
+            )
         if choice == "dissipation":
             return max(self.motions, key=lambda motion: motion.dissipation)
         p = self.problem

@@ -220,7 +220,8 @@ class _Velocities(_Factored):
         sizes = np.bincount(trees) if len(trees) else np.zeros(0, np.int64)
         if sizes.max(initial=0) > MAX_TREE_VELOCITIES:
             raise CapabilityError(
-                f"M couples {sizes.max()} velocities; motion errors invert it by trees of up to {MAX_TREE_VELOCITIES}"
+                f"M couples {sizes.max()} velocities of one tree; motion errors invert M tree by tree, for "
+                f"up to {MAX_TREE_VELOCITIES} velocities: use the residual of such a problem"
             )
         blocks, offs, tree_indices = [], [], []
         for tree in range(len(sizes)):

@@ -97,7 +97,8 @@ def get_motion_cache(problem: Problem) -> MotionCache:
     check_problem(problem)
     if problem.cones.has_ellipse:
         raise CapabilityError(
-            "ellipses have the same motions as problem.disk: give that, and impulses as problem.on_disk(impulse)"
+            "the problem has ellipses, for which no reference is computed; its equivalent problem.disk is "
+            "needed, with impulses problem.on_disk(impulse)"
         )
     with problem.derived.lock:
         cache = problem.derived.cache.get(__name__)
@@ -174,7 +175,10 @@ def save_reference(
         get_motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
     best = get_reference(problem.disk)
     if not best.is_accepted:
-        raise InputError(f"{path}: no solver reached the floor ({best}); there is no reference to write")
+        raise InputError(
+            f"{path}: no solver reached the round-off floor ({best}), so no reference was written: give the "
+            "problem in other units, or remove dependent rows"
+        )
     buffer = BytesIO()
     np.savez(buffer, impulse=best.impulse, solver=np.array(best.solver))
     write_bytes(out, buffer.getvalue())

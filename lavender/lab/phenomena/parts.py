@@ -235,7 +235,7 @@ def measure_track(phenomenon: Phenomenon, engine: str, case: dict[str, float], t
     if len(lost):
         return Record(**head, note=f"poses are not finite from {track.time[lost[0]]:.3g} s on")
     if len(track.time) < 2:
-        raise InputError(f"a track of {len(track.time)} samples; two are needed")
+        raise InputError(f"the track has {len(track.time)} samples; at least two are needed")
     values = {name: float(x) for name, x in phenomenon.measure(case, track).items()}
     passed = all(not values[q.name] > q.bound for q in phenomenon.quantities)
     return Record(**head, values=values, passed=passed)

@@ -39,7 +39,8 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     report = Report(source) if isinstance(source, Records) else source
     if not isinstance(report, Report):
         raise InputError(
-            f"source is a {type(source).__name__}; Records, as lavender.lab.bench.run returns them, or a Report"
+            f"source is a {type(source).__name__}; Records (the result of lavender.lab.bench.run) or a "
+            "Report is needed"
         )
     drawn = build_figures(report.ranked_records)
     folder = make_folder(folder)

@@ -107,7 +107,10 @@ def solve_linear(problem: Problem) -> FloatArray:
     operator = ExtendedOperator(problem)
     hi, lo = _solve_rows(problem, operator, np.ones(problem.m, bool), np.zeros(problem.m))
     if np.any(np.abs(operator.compute_slack(hi, lo)) > 2.0**-49 * operator.sum_term_magnitudes(hi)):
-        raise InputError("no solution: A is singular and b is outside its range")
+        raise InputError(
+            "the problem has no solution, because A is singular and b is outside of its range: give "
+            "another b, or compliance"
+        )
     return hi
 
 
@@ -157,7 +160,7 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
     """
     c, rows = problem.cones, problem.rows
     if rows is None or np.any(~c.is_contact):
-        raise InputError("at_rest needs contacts given by rows")
+        raise InputError("at_rest needs a problem with rows (Problem.from_rows) that has contacts")
     normal = c.ptr[:-1]
     weight = np.repeat(np.stack([1.0 / rows.inv_mass, 1.0 / rows.inv_inertia[:, 0, 0]], 1), 3, axis=1)
     momentum = -weight * rows.v_free

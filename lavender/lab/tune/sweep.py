@@ -101,7 +101,7 @@ def tune(
     threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
     check_float("spread", spread, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
-        raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
+        raise InputError(f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon")
     if engine == "kamino":
         if control != "random":
             raise InputError(
@@ -193,7 +193,10 @@ def run_tuning(
         )
         measured += judge(stage, [own])
         if not np.isfinite(measured[0].error).all():
-            raise InputError(f"{model}: these worlds diverge with the model's own setting")
+            raise InputError(
+                f"{model}: worlds diverge with the model's own setting, so other settings cannot be "
+                "compared with it: give other controls, states or fewer steps"
+            )
         last = judge(held_back, [own])
         both = [*measured, *last]
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))

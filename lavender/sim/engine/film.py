@@ -135,7 +135,10 @@ class Film:
             if len(frames) % film._width or not np.isfinite(frames).all():
                 raise ValueError
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            raise InputError(f"{str(path)!r} is not a film that this version reads") from None
+            raise InputError(
+                f"{str(path)!r} is not a film file of this version of lavender; a file that `lavender run "
+                "--film` or Film.save wrote is needed: record it again"
+            ) from None
         film._frames = frames.reshape(-1, film._width)
         film._count = film._seen = len(film._frames)
         film.ended = True

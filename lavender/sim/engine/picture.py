@@ -87,7 +87,7 @@ def save_picture(
     path, suffix = as_path(path), get_picture_suffix(path)
     films = film if isinstance(film, Mapping) else {"": film}
     if not films or not all(len(one) for one in films.values()):
-        raise InputError("the film has no frames; step first")
+        raise InputError("the film has no frames; at least one is needed: step the simulation before writing")
     frames, rate = check_int("frames", frames, 1), check_float("rate [1/s]", rate, above=0.0)
     size = check_float("size [inch]", size, low=0.5, high=50.0)
     turn, tilt = check_float("turn [rad]", turn), check_float("tilt [rad]", tilt)

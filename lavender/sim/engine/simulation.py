@@ -329,7 +329,7 @@ class Simulation(Stepping):
             A step ended between its substeps.
         """
         if self._end_reason == INCOMPLETE_STEP:
-            raise LavenderError(f"{INCOMPLETE_STEP}; reset() or restore a snapshot")
+            raise LavenderError(f"{INCOMPLETE_STEP}; call reset(), or restore a snapshot")
         s = self.state
         return Snapshot(
             fingerprint=self._fingerprint,
@@ -357,14 +357,20 @@ class Simulation(Stepping):
                 f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())"
             )
         if snapshot.fingerprint != self._fingerprint:
-            raise InputError("the snapshot belongs to another scene: bodies, joints or parameters differ")
+            raise InputError(
+                "the snapshot belongs to another scene, because bodies, joints or parameters differ; a "
+                "snapshot of this scene is needed"
+            )
         check_snapshot_fields(snapshot)
         size = snapshot.size.copy()
         check_state_sizes(self.state, size)
         found_lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
         used = compute_buffer_lengths(size)
         if found_lengths != (used[0], used[1], max(used[2], 1)):
-            raise InputError("the snapshot is damaged: its arrays do not fit its sizes")
+            raise InputError(
+                "the snapshot is damaged, because its arrays do not have the sizes that it declares: take "
+                "a new one with sim.snapshot()"
+            )
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         lost = snapshot.lost

@@ -78,7 +78,10 @@ class Snapshot:
         """
         data = read_whole_file(path, "the snapshot")
         if not data.startswith(MAGIC):
-            raise InputError(f"{str(path)!r} is not a lavender snapshot")
+            raise InputError(
+                f"{str(path)!r} does not begin as a snapshot of lavender; a file that Snapshot.save wrote "
+                "is needed"
+            )
         body, checksum = data[:-32], data[-32:]
         if hashlib.sha256(body).digest() != checksum:
             raise InputError(
@@ -90,7 +93,10 @@ class Snapshot:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"the snapshot {str(path)!r} cannot be read: {error}") from None
-            raise InputError(f"the snapshot {str(path)!r} does not match its header") from None
+            raise InputError(
+                f"the snapshot {str(path)!r} is damaged, because its data do not match its header: save or "
+                "copy it again"
+            ) from None
         return snapshot
 
     @classmethod
@@ -98,7 +104,10 @@ class Snapshot:
         """Build a snapshot from the bytes before the checksum; raise an error if they are inconsistent."""
         header, end = unpack_header(body, MAGIC, MAX_SNAPSHOT_HEADER_BYTES)
         if header["version"] != VERSION:
-            raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
+            raise InputError(
+                f"the snapshot has version {str(header['version'])[:40]}, and this lavender reads version "
+                f"{VERSION}: save it again with this lavender"
+            )
         arrays: dict[str, Any] = {}
         for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
             if type(n) is not int or not 0 <= n <= len(body):

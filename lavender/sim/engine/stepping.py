@@ -96,7 +96,10 @@ class Stepping:
         if not isinstance(scene, Scene):
             raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
         if not scene.bodies:
-            raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
+            raise InputError(
+                "the scene has no bodies; at least one is needed: add some with add_box, add_sphere or "
+                "add_plane"
+            )
         if stepper is not None and get_stepper(stepper).name != scene.parameters.stepper:
             scene = scene.with_parameters(stepper=stepper, stepper_options={})
         self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
@@ -211,7 +214,7 @@ class Stepping:
         i = self._find_body_number(body)
         name = self._names[i]
         if self.state.a["dyn"][i] < 0:
-            raise InputError(f"{name} is static; it has no velocity")
+            raise InputError(f"{name} is static, so its velocity cannot be set: choose a dynamic body")
         parts = ((0, "velocity", velocity, "m/s"), (3, "angular_velocity", angular_velocity, "rad/s"))
         values = [
             (first, as_array(f"{quantity} of {name}", x, (3,), unit=unit))
@@ -289,7 +292,7 @@ class Stepping:
             The simulation has terminated (reset it or restore a snapshot), or is closed.
         """
         if action is not None:
-            raise InputError(f"action is {action!r}; this simulation takes none")
+            raise InputError(f"action is {action!r}; this simulation has no actions, and None is needed")
         with self._lock:
             if self._refusal:
                 raise LavenderError(self._refusal)
@@ -435,7 +438,11 @@ class Stepping:
         if solution.success or solution.residual.at_floor:
             return solution.impulse
         if p.on_failure == "raise":
-            raise SolveFailed(f"{self.scene!r}, step {self._steps}: {solution}")
+            raise SolveFailed(
+                f"step {self._steps} of {self.scene!r} failed, because solver {p.solver!r} did not solve "
+                f"its problem and on_failure is 'raise'. The result is: {solution}. Give more "
+                "solver_iterations or another solver, or on_failure='use' to continue"
+            )
         self._failed += 1
         if p.on_failure == "keep" or not np.isfinite(solution.impulse).all():
             return guess
@@ -507,7 +514,10 @@ class Stepping:
     def _rebuild_last_problem(self) -> tuple[Problem, FloatArray]:
         """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""
         if not self.state.head[HEAD["solved"]]:
-            raise InputError("no step has been done yet, or the last one was stopped: call step() first")
+            raise InputError(
+                "the simulation has no complete last step, because none was made or it was stopped: call "
+                "step() first"
+            )
         problem = self._build_problem(self.state)
         return problem, self.state.a["impulse"][: problem.m].copy()
 

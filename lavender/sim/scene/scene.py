@@ -148,8 +148,8 @@ class Parameters:
             # A negative number probably is the z component of gravity; bodies would fall upwards.
             if size < 0.0:
                 raise InputError(
-                    f"gravity is {size:g}; a number points downwards and is at least 0: give {-size:g}, or a vector, "
-                    f"(0, 0, {size:g}) m/s^2"
+                    f"gravity is {size:g}; one number is the downward acceleration, and at least 0 is "
+                    f"needed: give {-size:g}, or a vector, (0, 0, {size:g}) m/s^2"
                 )
             gravity = (0.0, 0.0, -size)
         put(self, "gravity", tuple(check_numbers("gravity", gravity, 3).tolist()))
@@ -173,7 +173,8 @@ class Parameters:
         check_name("order", self.order, SCENE_ORDERS)
         if self.order != "given" and not own:
             raise InputError(
-                f"order={self.order!r} needs sequential_impulses; give {self.solver} its order in solver_options"
+                f"order={self.order!r} is used only by sequential_impulses, and the solver is "
+                f"{self.solver!r}: leave order out, or give solver_options of {self.solver!r}"
             )
         if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
             raise InputError(
@@ -186,7 +187,8 @@ class Parameters:
         put(self, "position_iterations", check_int("position_iterations", projections, 0, 1000))
         if self.position_iterations and not stepper.position_iterations:
             raise InputError(
-                f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
+                f"position_iterations is {projections}, but stepper {stepper.name!r} does not project "
+                "positions: leave position_iterations out, or give another stepper"
             )
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
@@ -203,8 +205,8 @@ class Parameters:
             return check_int("solver_iterations", spec.max_iter if sweeps is None else sweeps, 1)
         if self.solver_options:
             raise InputError(
-                f"solver_options {sorted(self.solver_options)} need another solver; sequential_impulses "
-                "takes order= and seed= of the scene"
+                f"solver_options are {sorted(self.solver_options)}, but the solver is sequential_impulses, "
+                "which has no options: give order= and seed= of the scene, or another solver="
             )
         return 16 if sweeps is None else check_int("solver_iterations", sweeps, *stepper.sweeps)
 
@@ -276,8 +278,9 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
         for p in own:
             if p.name in COMMON_PARAMETERS or p.default is p.empty or p.kind is p.VAR_KEYWORD:
                 raise InputError(
-                    f"parameter {p.name!r} of the scene {name!r}: a name that no other scene parameter has, with a "
-                    f"default, is needed after {first.name!r}"
+                    f"parameter {p.name!r} of the scene builder {name!r} has no default, or has the name of "
+                    f"a common parameter of scenes; after {first.name!r}, only parameters with a default "
+                    "and another name are possible"
                 )
         SCENES[name], DEFAULTS[name] = build, defaults
         return build
@@ -361,8 +364,9 @@ class Scene:
         bodies, joints = self._built
         if scene._built != self._built and self.n_joints > joints:
             raise InputError(
-                f"scene {self.name!r} would have {scene.n_bodies} bodies for {bodies}, and the joints added to it name "
-                "bodies by number; build it with these parameters, then add"
+                f"scene {self.name!r} would have {scene.n_bodies} bodies instead of {bodies}, but joints "
+                "that were added to it refer to bodies by number: build the scene with the new parameters "
+                "first, then add the joints"
             )
         scene.bodies += self.bodies[bodies:]
         scene.joints += self.joints[joints:]
@@ -422,7 +426,10 @@ class Scene:
         number_ = len(self.bodies)
         label = name or f"{type(shape).__name__.lower() if shape is not None else 'body'} {number_}"
         if number_ >= MAX_BODIES:
-            raise InputError(f"a scene has at most {MAX_BODIES} bodies")
+            raise InputError(
+                f"the scene would have more than {MAX_BODIES} bodies; at most {MAX_BODIES} are possible: "
+                "use fewer bodies"
+            )
         if not isinstance(label, str):
             raise InputError(f"name is {name!r}; a string is needed")
         if shape is not None and not isinstance(shape, (Plane, Sphere, Box)):
@@ -537,14 +544,21 @@ class Scene:
             else _check_common_point(label, *ends)
         )
         if (axis is None) == (kind == HINGE):
-            raise InputError(f"{label}: axis= is needed for a hinge, and for no other joint")
+            raise InputError(
+                f"{label}: axis= is missing for a hinge, or given for another joint; only a hinge needs it"
+            )
         world_axis = (
             check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
         )
         if (motor_speed is not None or motor_torque is not None) and kind != HINGE:
-            raise InputError(f"{label}: only a hinge has a motor")
+            raise InputError(
+                f"{label}: motor_speed and motor_torque are given, but only a hinge has a motor: leave them "
+                "out, or make it a hinge"
+            )
         if (motor_speed is None) != (motor_torque is None):
-            raise InputError(f"{label}: a motor needs both motor_speed and motor_torque")
+            raise InputError(
+                f"{label}: only one of motor_speed and motor_torque is given; a motor needs both"
+            )
         joint = Joint(
             kind=kind,
             name=label,
@@ -590,7 +604,10 @@ class Scene:
             distance = arithmetic.compute_norm(pb - pa)
         length = check_float(f"length of {label} [m]", distance if length is None else length, low=0.0)
         if length == 0.0:
-            raise InputError(f"{label} has length 0; use a ball joint")
+            raise InputError(
+                f"{label} has length 0, given or because its anchors coincide; a positive length is needed: "
+                "use a ball joint instead"
+            )
         return pa, pb, length
 
     def _check_anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
@@ -651,6 +668,9 @@ def _check_common_point(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return (anchor, anchor, 0.0) for the common world point (3,) [m] of a ball or hinge joint."""
     if anchor is None or a is not None or b is not None or length is not None:
-        raise InputError(f"{label} takes anchor=, one world point, and no length")
+        raise InputError(
+            f"{label} connects the bodies at one point; anchor= is needed, a point (3,) in world "
+            "coordinates [m], and anchor_a, anchor_b and length must be left out"
+        )
     point = check_numbers(f"anchor of {label} [m]", anchor, 3)
     return point, point, 0.0

@@ -117,12 +117,14 @@ class StepperSpec:
     def check_scene_properties(self, spin: bool, restitution: bool, rolling: bool) -> None:
         """Raise `InputError` if the stepper does not support a scene with these properties."""
         for needed, supported, feature, alternative in (
-            (spin, self.spin, "spin friction; leave patch_radius", "'impulses'"),
-            (rolling, self.rolling, "rolling friction; leave rolling_radius", "'impulses'"),
-            (restitution, self.restitution, "restitution; leave it", "another stepper"),
+            (spin, self.spin, "spin friction: set patch_radius", "stepper='impulses'"),
+            (rolling, self.rolling, "rolling friction: set rolling_radius", "stepper='impulses'"),
+            (restitution, self.restitution, "restitution: set it", "another stepper"),
         ):
             if needed and not supported:
-                raise InputError(f"stepper {self.name!r} has no {feature} at 0, or take {alternative}")
+                raise InputError(
+                    f"stepper {self.name!r} does not support {feature} to 0, or give {alternative}"
+                )
 
 
 #: Velocities are computed by sweeps over speculative contacts. Penetration is corrected by a projection of positions,

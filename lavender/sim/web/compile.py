@@ -274,8 +274,8 @@ def _check_module(module: bytes, max_bytes: int) -> None:
         position += size
     if len(module) >= max_bytes:
         raise BuildFailed(
-            f"the module has {len(module)} bytes; below {max_bytes} are allowed: take kernels out "
-            "of its list, or raise MAX_MODULE_BYTES"
+            f"the module has {len(module)} bytes; below {max_bytes} bytes are allowed: remove kernels from "
+            "its list, or raise MAX_MODULE_BYTES"
         )
 
 

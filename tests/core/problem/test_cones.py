@@ -150,7 +150,7 @@ def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
         ("patch_radius", 1, -1.0, "patch_radius"),
         ("rolling", 0, -1.0, "rolling"),
         ("kind", 1, 4, "block 1 is a box"),
-        ("ptr", 1, 0, "cones.ptr must start with 0 and increase"),
+        ("ptr", 1, 0, "must start with 0 and increase"),
     ],
 )
 def test_faults_of_blocks_have_one_message_for_arrays_and_lists(name, at, value, words):

@@ -116,7 +116,7 @@ def test_m_is_refused_where_it_is_no_mass_matrix():
         lv.Generalized(np.ones((1, 3)), good, np.zeros(2))
     with pytest.raises(lv.InputError, match="a square matrix"):
         lv.Generalized(jac, np.ones((2, 3)), np.zeros(2))
-    with pytest.raises(lv.InputError, match="1 names for 2"):
+    with pytest.raises(lv.InputError, match="1 entries for 2"):
         lv.Generalized(jac, good, np.zeros(2), ["hip"])
     with pytest.raises(lv.InputError, match="J has 1 rows; 2 are needed"):
         lv.Problem.from_jacobian(jac, good, np.zeros(2), cones=lv.Cones.free(2))
@@ -370,7 +370,7 @@ def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
     solver, impulse = Newton(), problem.start().copy()  # behind the small call, which has room of its own
     claim = solver.run(solver.prepare(problem), impulse, 100, 1e-8)
     assert claim.form == "impulse" and lv.residual(problem, impulse).relative <= 1e-8
-    with pytest.raises(lv.CapabilityError, match="accepts a matrix of"):
+    with pytest.raises(lv.CapabilityError, match="accepts at most"):
         lv.solve(random_generalized_problem(6, "cone"), "newton", form="velocity")
     small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
     assert [s.success for s in lv.solve_many([random_generalized_problem(6, "cone"), small])] == [True, True]

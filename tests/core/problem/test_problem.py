@@ -95,7 +95,7 @@ def test_rows_have_names():
         random_lcp(1).row_name(99)
     with pytest.raises(lv.InputError, match="row is -1"):
         random_lcp(1).block_of(-1)
-    with pytest.raises(lv.InputError, match="key is not an array"):
+    with pytest.raises(lv.InputError, match="key cannot be converted to an array"):
         replace(random_lcp(1), key=[[1, 2], [3]])
 
 
@@ -154,7 +154,10 @@ BAD_PROBLEMS = {
         r"\(2, 2\) is needed",
     ),
     "lower > upper": (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
-    "rows per contact": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows for 2"),
+    "rows per contact": (
+        lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]),
+        "5 rows, which is not a multiple",
+    ),
     "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangent rows"),
     "law": (
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
@@ -164,23 +167,23 @@ BAD_PROBLEMS = {
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction=np.array([0.5, 0.5])),
         "'coulomb' or 'cone'",
     ),
-    "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
+    "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 entries for 2 blocks"),
     "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
     "compliance": (
         lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]),
-        "already contains it on its diagonal",
+        "already contains compliance on its diagonal",
     ),
     "both forms": (
         lambda: lv.Problem(
             np.ones(2), lv.Cones.free(2), I2, rows=random_bodies_and_contacts(np.random.default_rng(0))
         ),
-        "exactly one of",
+        "exactly one is needed",
     ),
     "round cones under Coulomb's law": (
         lambda: lv.Problem(np.ones(4), lv.Cones.contacts(0.5, 3), np.eye(4)),
         "law is not supported for a round cone",
     ),
-    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "exactly one of"),
+    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "exactly one is needed"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
     "sparse J of one dimension": (lambda: lv.Generalized(ONE, I2, [0, 0]), r"J has shape \(2,\)"),
     "sparse M of one dimension": (lambda: lv.Generalized(I2, ONE, [0, 0]), r"M has shape \(2,\)"),
@@ -220,7 +223,7 @@ def rows_with(**changes):
 BAD_ROWS = {
     "missing body": ({"contact_body": np.full((8, 2), [0, 9])}, "body 9; there are 5 bodies"),
     "body -2": ({"contact_body": np.full((8, 2), [0, -2])}, "body -2"),
-    "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
+    "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "is \\[3, 3\\]; two different"),
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
     "axes whose product is inf - inf": (

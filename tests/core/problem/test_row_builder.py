@@ -300,7 +300,7 @@ def test_a_tangent_can_be_chosen():
             lambda b: b.spring(-1, 0, (0, 0), (1, 0), 1.0, stiffness=0.0),
             "stiffness is 0 N/m and damping is 0",
         ),
-        (lambda b: b.motor(-1, 0, speed=1.0), "max_torque and max_force: neither is given"),
+        (lambda b: b.motor(-1, 0, speed=1.0), "of max_torque and max_force neither is given"),
         (lambda b: b.motor(-1, 0, speed=1.0, max_torque=1.0, max_force=1.0), "both are given"),
         (lambda b: b.motor(-1, 0, (1, 0), speed=1.0, max_force=1.0), "anchor is None"),
         (lambda b: b.motor(-1, 0, speed=1.0, max_force=1.0, anchor=(0, 0)), "axis is None"),
@@ -311,10 +311,10 @@ def test_a_tangent_can_be_chosen():
         (lambda b: b.limit(-1, 0, value=0.0), "lower is -inf and upper is inf; at least one must be finite"),
         (lambda b: b.limit(-1, 0, value=0.0, lower=1.0, upper=0.0), "lower must not exceed upper"),
         (lambda b: b.gear(-1, 0, ratio=0.0), "ratio is 0"),
-        (lambda b: [b.ball(-1, 0, (0, 0), feature=3) for _ in "ab"], "feature is 3, as of another ball"),
+        (lambda b: [b.ball(-1, 0, (0, 0), feature=3) for _ in "ab"], "feature is 3, which another ball"),
         (lambda b: b.rows_of(5), "key is 5; a key that a method"),
         (lambda b: b.velocity_after(None, [0.0]), "problem is None; the result of RowBuilder.problem"),
-        (lambda b: b.ball(-1, 0, (0, 0), name=3), "name is 3; a str is needed"),
+        (lambda b: b.ball(-1, 0, (0, 0), name=3), "name is 3; a text is needed"),
     ],
 )
 def test_errors_name_the_argument(call, message):
@@ -330,5 +330,5 @@ def test_errors_of_the_builder_and_of_three_dimensions():
     builder = partial(spatial, np.zeros((1, 6)), np.zeros((1, 3)))
     with pytest.raises(lv.InputError, match=r"axis is None; a vector \(3,\)"):
         builder().hinge(-1, 0, np.zeros(3))
-    with pytest.raises(lv.InputError, match="tangent is parallel to normal"):
+    with pytest.raises(lv.InputError, match="parallel to the normal"):
         builder().contact(-1, 0, np.zeros(3), (0.0, 0.0, 1.0), tangent=(0.0, 0.0, 1.0))

@@ -629,8 +629,8 @@ INVALID_PROBLEM = [
     ({"P": sp.csc_matrix([[np.nan, 0.0], [0.0, 1.0]])}, r"P must be finite"),
     ({"q": [1.0, np.nan]}, r"q must be finite; entry \[1\]"),
     ({"q": None}, r"P and q are needed, or a qpsolvers.Problem alone"),
-    ({"G": EYE}, r"h is missing: G and h go together"),
-    ({"b": TWO}, r"A is missing: A and b go together"),
+    ({"G": EYE}, r"h is missing; G and h describe"),
+    ({"b": TWO}, r"A is missing; A and b describe"),
     ({"G": np.eye(3), "h": np.zeros(3)}, r"G has shape \(3, 3\); \(any, 2\) is needed"),
     ({"G": EYE, "h": np.zeros(3)}, r"h has shape \(3,\); \(2,\) is needed"),
     ({"G": EYE, "h": [0.0, np.nan]}, r"h must not be NaN; entry \[1\]"),
@@ -651,7 +651,7 @@ def test_what_is_no_convex_program_is_refused_with_its_figure(given, words):
 
 
 def test_a_problem_that_is_no_program_is_refused():
-    with pytest.raises(lv.InputError, match=r"make it with Problem\.from_qp"):
+    with pytest.raises(lv.InputError, match=r"a problem of Problem\.from_qp"):
         lv.solve_qp(lv.Problem.lcp(np.eye(1), [1.0]))
     problem = lv.Problem.from_qp(EYE, TWO, G=EYE, h=TWO)
     assert problem.updated(b=[1.0, 1.0]).qp is None  # other numbers than the program's

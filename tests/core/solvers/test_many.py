@@ -359,7 +359,7 @@ def test_worlds_are_chosen_as_entries_of_an_array_are():
             many[wrong]
     with pytest.raises(lv.InputError, match="a sequence of whole numbers, or a mask"):
         many["a"]
-    with pytest.raises(IndexError, match="world 5; there are 5"):
+    with pytest.raises(IndexError, match="world 5 does not exist; there are 5"):
         batch[5]
 
 
@@ -400,9 +400,9 @@ def test_lists_start_from_their_impulses_and_refuse_what_is_none():
     assert warm[0].iterations == 0 < warm[1].iterations
     with pytest.raises(lv.InputError, match="impulses of world 1"):
         lv.residual_many(given, [np.zeros(12), np.zeros(3), np.zeros(2)])
-    with pytest.raises(lv.InputError, match="impulses: None; a sequence of"):
+    with pytest.raises(lv.InputError, match="impulses is None; a sequence of"):
         lv.residual_many(given, None)
-    with pytest.raises(lv.InputError, match="problems: 3; a sequence of Problems, or a Batch"):
+    with pytest.raises(lv.InputError, match="problems is 3; a sequence of Problems, or a Batch"):
         lv.solve_many(3)
 
 
@@ -457,7 +457,8 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     with pytest.raises(lv.InputError, match="friction is 'wet'"):
         lv.Batch.of_bodies(ball, friction="wet")
     with pytest.raises(
-        lv.InputError, match="world 1: this world has 1 rows, the first world 3: give tangents="
+        lv.InputError,
+        match=r"world 1: this world has 1 rows, the first world 3; .* give tangents=",
     ):
         lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
@@ -470,16 +471,16 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
         ({"M": np.zeros((4, 3, 3))}, "M has shape"),
         ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
         ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),
-        ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"M has values of shape \(4, 17\)"),
-        ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "must hold lower triangles"),
-        ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "must hold lower triangles"),
-        ({"cones": lv.Cones.contacts(0.5, count=5)}, "48 of all worlds are needed"),
-        ({"count": [12, 9, 0, 3]}, "24 of all worlds are needed, without padding rows; .* give a list"),
+        ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"values of M have shape \(4, 17\)"),
+        ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "do not describe a lower triangle"),
+        ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "do not describe a lower triangle"),
+        ({"cones": lv.Cones.contacts(0.5, count=5)}, "48 are needed, the rows of all worlds"),
+        ({"count": [12, 9, 0, 3]}, "24 are needed, the rows of all worlds without padding rows; .* give a list"),
         ({"cones": [DISKS] * 3}, "one for each of 4 worlds"),
         ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
         ({"friction": "wet"}, "friction is 'wet'"),
         ({"J": np.zeros((47, 18)), "row_ptr": [0, 12, 24, 36, 48]}, "J has shape"),
-        ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, "row_ptr must start with 0"),
+        ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, r"row_ptr is \[1, 12, 24, .*must start with 0"),
         ({"cones": None}, "one for each of 4 worlds"),
     ],
 )  # fmt: skip

@@ -82,7 +82,7 @@ def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_p
         lv.solve(TINY, "absent")
     half = type("Half", (), {"prepare": lambda self, problem: problem})
     register(lv.SolverSpec("half", half, {"lcp"}, summary="of a test"))
-    with pytest.raises(lv.InputError, match="made a Half without run"):
+    with pytest.raises(lv.InputError, match="returned a Half without the methods run"):
         lv.solve(TINY, "half")
 
 

@@ -133,7 +133,7 @@ def test_what_rounding_hides_is_no_matter_of_time(limit):
 
 def test_round_cones_are_never_solved_over_rows_of_a():
     problem = random_generalized_problem(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
-    with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
+    with pytest.raises(lv.errors.CapabilityError, match="need form='velocity'"):
         lv.solve(problem, "newton", form="impulse")
     assert "newton over rows" not in {stage.solver for stage in lv.explain(problem).stages}
     # What it cannot take further ends as a result, not in a solver that reads past such a block.

@@ -35,7 +35,7 @@ INVALID_PROBLEM = {
     "a start too few": (
         lambda: lv.solve_many([TINY] * 2, impulses=[None]),
         lv.InputError,
-        "1 impulses for 2",
+        "1 entries for 2",
     ),
     "one for many": (lambda: lv.solve_many(TINY), lv.InputError, "one Problem; a list"),
     "many of a name": (lambda: lv.solve_many([TINY], "pgss"), lv.UnknownName, "pgs"),
@@ -66,7 +66,7 @@ INVALID_PROBLEM = {
         "cone law",
     ),
     "no convex iterations": (lambda: lv.solve(TINY, "nncg", convex=-1), lv.InputError, "convex"),
-    "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
+    "cannot call a callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
 }
 
 

@@ -100,7 +100,10 @@ class Plan:
             for value in values:
                 check_float(name, value, above=0.0)
         if not self.tolerances and not self.budgets:
-            raise InputError("nothing to run: give tolerances, budgets or both")
+            raise InputError(
+                "the plan has no tolerances and no budgets, so there is nothing to run: give at least one "
+                "of the two"
+            )
         check_int("repeats", self.repeats, 1)
         check_float("time_limit", self.time_limit, above=0.0)
         check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
@@ -111,7 +114,10 @@ class Plan:
             if name not in SWEEP_ORDERS:
                 raise UnknownName("order", name, SWEEP_ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
-                raise InputError(f"order {word!r}: only random has a seed, an integer: random:3")
+                raise InputError(
+                    f"order {word!r} has an invalid seed {seed!r}; only the order random has a seed, an "
+                    "integer: random:3"
+                )
         # Remove duplicates: a value given twice would be run twice and change the middle value.
         for name in ("tolerances", "velocity_tolerances"):
             object.__setattr__(

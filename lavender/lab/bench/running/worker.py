@@ -209,9 +209,14 @@ def parse_outcome(
     """
     values = parse_fields(Outcome, answer)
     if values.get("status") not in Status.__members__:
-        raise ValueError("no status")
+        raise ValueError(
+            f"the status is {values.get('status')!r:.60}; one of {', '.join(Status.__members__)} is needed"
+        )
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
-        raise ValueError("impulses of another length")
+        raise ValueError(
+            f"the worker returned {len(arrays)} arrays, or impulses that do not have {m} entries; two "
+            f"arrays are needed, the first one with {m} impulses"
+        )
     try:
         outcome = Outcome(*arrays, **values)
     except TypeError as error:
@@ -225,7 +230,9 @@ def parse_outcome(
     times = [t - lead for t in outcome.times]
     valid = all(t >= 0.0 for t in (*parts, *times))
     if not valid or not max(math.fsum(parts), math.fsum(times)) <= elapsed:
-        raise ValueError("times longer than the call")
+        raise ValueError(
+            f"the worker returned negative times, or times longer than the call of {elapsed:.3g} s"
+        )
     if not all(t is None or t <= elapsed for t in (outcome.calibration_time, outcome.backend_time)):
-        raise ValueError("calibration_time or backend_time is longer than the call")
+        raise ValueError(f"calibration_time or backend_time is longer than the call of {elapsed:.3g} s")
     return outcome

@@ -53,7 +53,10 @@ class Engine(Stepping):
                 self._add_single_body(i)
         roots = [i for i, joint in self.up.items() if joint.a < 0]
         if len(roots) + (len(self.up) > 0) > 2:
-            raise CapabilityError("pybullet accepts one tree of joints")
+            raise CapabilityError(
+                f"the scene has {len(roots)} joints to the world, so several trees of joints; pybullet "
+                "accepts one tree"
+            )
         if self.up:
             self._add_tree()
         for body, link in self.ids.values():
@@ -117,7 +120,10 @@ class Engine(Stepping):
             anchor_in_parent = np.zeros(3) if joint.a < 0 else self.up[joint.a].anchor_b
             _, q = compute_relative_pose(parent, self.scene.bodies[i])
             if abs(abs(q[0]) - 1.0) > 1e-12 and joint.a >= 0:
-                raise CapabilityError("pybullet accepts trees whose bodies have the same orientation")
+                raise CapabilityError(
+                    "bodies of the tree start in different orientations; pybullet needs equal orientations "
+                    "of all bodies in a tree"
+                )
             link_positions.append((joint.anchor_a - anchor_in_parent).tolist())
             orientation.append(reorder_to_xyzw(q))
             inertial_positions.append((-joint.anchor_b).tolist())

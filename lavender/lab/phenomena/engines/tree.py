@@ -21,12 +21,21 @@ def map_bodies_to_parent_joints(scene: Scene, engine: str) -> dict[int, Joint]:
     joint_of: dict[int, Joint] = {}
     for joint in scene.joints:
         if joint.b in joint_of or joint.b <= joint.a:
-            raise CapabilityError(f"{joint.name} closes a loop; {engine} accepts joints of a tree")
+            raise CapabilityError(
+                f"{joint.name} closes a loop, or its body b does not have a larger number than body a; "
+                f"{engine} accepts only joints of a tree"
+            )
         if joint.kind == "distance" or joint.hertz or joint.motor_speed is not None:
-            raise CapabilityError(f"{joint.name}: {engine} accepts rigid balls and hinges without a motor")
+            raise CapabilityError(
+                f"{joint.name} is a distance joint, a soft joint or has a motor; {engine} accepts only "
+                "rigid ball joints and hinges without a motor"
+            )
         joint_of[joint.b] = joint
     if scene.parameters.restitution or any(b.friction is not None or b.restitution for b in scene.bodies):
-        raise CapabilityError(f"{engine} accepts one friction for all bodies, and no restitution")
+        raise CapabilityError(
+            f"the scene has restitution, or friction of single bodies; {engine} accepts only one friction "
+            "for all bodies, and no restitution"
+        )
     return joint_of
 
 
@@ -38,7 +47,10 @@ def get_collision_shape(body: Body, engine: str, static: bool = True) -> Plane |
     """
     shape = body.shape
     if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
-        raise CapabilityError(f"{body.name} has no shape that {engine} supports")
+        raise CapabilityError(
+            f"{body.name} has no collision shape, or a static one that is not a plane; {engine} needs "
+            "another shape of this body"
+        )
     return shape
 
 
