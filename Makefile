@@ -29,9 +29,10 @@ lint:  ## run ruff, import-linter and cython-lint
 format:  ## format Python files as CI requires
 	$(BIN)ruff format .
 
-types:  ## run mypy
+types:  ## run mypy and pyright
 	$(BIN)mypy
 	$(BIN)mypy --config-file .ci/mypy_scripts.ini
+	$(BIN)python .ci/pyright
 
 coverage:  ## measure the tests' line coverage of the Python files, in build/coverage/index.html
 	test -x $(PYTHON) || python3 -m venv .venv

@@ -1,8 +1,9 @@
-"""mypy, which checks this file as a user's, finds mistyped names; at run time each of them raises an error.
+"""mypy and pyright, which check this file as a user's, find mistyped names; at run time each of them raises an error.
 
-`mypy --strict` reports an unused `type: ignore`, so each of these comments proves that mypy finds the mistake.
+Both report an unused `type: ignore` here, so each of these comments proves that they find the mistake.
 """
 
+# pyright: reportUnnecessaryTypeIgnoreComment=true
 from typing import Any
 
 import pytest

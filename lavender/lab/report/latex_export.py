@@ -150,13 +150,14 @@ def escape_tex(text: str) -> str:
 
 
 def format_latex(table: Table, caption: str, label: str) -> str:
-    """Return a floating table (booktabs)."""
+    """Return a floating table (booktabs), scaled down if it is wider than the line."""
     line = " & ".join
     body = "".join(f"{line(map(escape_tex, row))} \\\\\n" for row in table.cell_texts)
     return (
         f"\\begin{{table}}\n\\centering\n\\caption{{{escape_tex(caption)}}}\n\\label{{tab:{label}}}\n"
+        f"\\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n"
         f"\\begin{{tabular}}{{l{'r' * (len(table.heads) - 1)}}}\n\\toprule\n{line(map(escape_tex, table.heads))} \\\\\n"
-        f"\\midrule\n{body}\\bottomrule\n\\end{{tabular}}\n\\end{{table}}\n"
+        f"\\midrule\n{body}\\bottomrule\n\\end{{tabular}}}}\n\\end{{table}}\n"
     )
 
 
@@ -261,7 +262,7 @@ def _write_tables(report: Report) -> str:
     )
     caption += _describe_unloaded_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
-    return "% \\usepackage{booktabs}\n" + "\n".join(parts)
+    return "% \\usepackage{booktabs}\n% \\usepackage{graphicx}\n" + "\n".join(parts)
 
 
 def _describe_method(report: Report) -> str:
