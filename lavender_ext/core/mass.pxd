@@ -86,7 +86,8 @@ cdef inline bint ordering_pays_off(const generalized_t* g, int32_t entries) noex
 
     `entries` is the number of entries of the lower triangle of M. A factorisation without fill-in takes the least work if all
     rows have the same number of entries; this lower bound excludes matrices that are nearly full. Times [ns] were measured on
-    trees of 9 to 800 velocities in the wrong order: the search and the factorisation in the new order take 0.2 ms and 0.13 us for each entry; a multiply-add takes 2 ns. (For
+    trees of 9 to 800 velocities in the wrong order: the search and the factorisation in the new order take 0.2 ms and 0.13 us
+    for each entry; a multiply-add takes 2 ns. (For
     example, a robot of 9 velocities whose root slides in two directions has a fill-in of one entry.)
     """
     cdef double off_diagonal = entries - g.n, work

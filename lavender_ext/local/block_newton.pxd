@@ -26,13 +26,13 @@ from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, solve_by_el
 
 cdef enum:
     MAX_NEWTON_STEPS = 40
-    MAX_STEP_HALVINGS = 6       # After so many halvings the step is used even if the residual does not fall.
+    MAX_STEP_HALVINGS = 6       # After this many halvings the step is taken even if |F| does not fall.
     # Newton's method stops after this many steps that reduce the residual by less than 10 %; all 40 steps cost as much as a
     # hundred updates of the block.
     MAX_SLOW_STEPS = 4
-    N_SCALES = 11               # values of t for contacts: 1, 0.1, 10, 0.01, 100, ...
-    N_ROW_SCALES = 4            # values of t for bounded rows; all of them fail if rows contradict each other
-    N_PROJECTED_STEPS = 20      # between two values of t
+    N_SCALES = 11               # number of values of t that are tried for contacts: 1, 0.1, 10, 0.01, 100, ...
+    N_ROW_SCALES = 4            # number of values of t for bounded rows; all values fail if rows contradict each other
+    N_PROJECTED_STEPS = 20      # number of projected steps before the next value of t
 
 
 cdef struct scaled_block_t:
@@ -72,7 +72,7 @@ cdef inline void prepare_block_newton(int32_t n, const double* W, const double* 
 
 
 cdef inline double evaluate_natural_residual(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
-    """Return |F| at z and compute Pi(y), F, P and `size`."""
+    """Compute Pi(y), F, P and `size` of x at its z, for the scale t of (1), and return |F|."""
     cdef double ts[MAX_ROWS]
     cdef double change[MAX_ROWS]
     cdef double total = 0.0, size = 0.0, s
@@ -103,7 +103,7 @@ cdef inline double evaluate_natural_residual(scaled_block_t* x, const int32_t n,
 
 
 cdef inline bint run_damped_newton_iterations(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
-    """Solve (1) from z; return whether |F| is 0 within rounding."""
+    """Take damped Newton steps (1) from the z of x; return whether |F| is then 0 within rounding."""
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef double f[MAX_ROWS]
     cdef double z[MAX_ROWS]
@@ -142,7 +142,7 @@ cdef inline bint run_damped_newton_iterations(scaled_block_t* x, const int32_t n
 
 
 cdef inline bint run_newton_from_start(scaled_block_t* x, double t) noexcept nogil:
-    """Solve (1) from `start`; small blocks are compiled with constant sizes."""
+    """Take damped Newton steps (1) from the `start` of x; return whether |F| is then 0 within rounding."""
     cdef int32_t i
     for i in range(x.n):
         x.z[i] = x.start[i]
@@ -172,7 +172,7 @@ cdef inline bint solve_scaled_block(scaled_block_t* x, double t) noexcept nogil:
 
 
 cdef inline void take_projected_steps(scaled_block_t* x) noexcept nogil:
-    """Repeat z = Pi(z - s / trace H) from `start`, which becomes the result."""
+    """Replace the `start` of x by the result of N_PROJECTED_STEPS steps z = Pi(z - s / trace H) from it."""
     cdef double trace = 0.0
     cdef int32_t i, _step
     for i in range(x.n):
@@ -200,7 +200,7 @@ cdef inline bint is_contact_open(const scaled_block_t* x) noexcept nogil:
 
 
 cdef inline void store_block_impulse(const scaled_block_t* x, const double* inverse, double* lam) noexcept nogil:
-    """Write the impulse of Pi(y) to lam (n)."""
+    """Write the impulse of Pi(y) to lam (n) [N s]; `inverse` (n) is 1 / sqrt(d)."""
     cdef int32_t i
     for i in range(x.n):
         lam[i] = x.projected[i] * inverse[i]

@@ -18,7 +18,10 @@ from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, safeguard_newto
 
 cdef inline int32_t minimize_energy_on_cone_ray(const double* W, const double* q, double mu, double s0, double s1,
                            double* lam) noexcept nogil:
-    """Minimise the energy on the ray lam = l (1, mu s), l > 0, where lam.w = 0; FAILED if that is not a solution."""
+    """Minimise the energy on the ray lam = l (1, mu s0, mu s1), l > 0; return FAILED if the result is not a solution.
+
+    At the minimum lam.w = 0.
+    """
     cdef double x0 = mu * s0, x1 = mu * s1
     cdef double n = (W[0] + (W[1] + W[3]) * x0 + (W[2] + W[6]) * x1 + W[4] * x0 * x0 + (W[5] + W[7]) * x0 * x1
                      + W[8] * x1 * x1)
@@ -38,7 +41,7 @@ cdef inline int32_t minimize_energy_on_cone_ray(const double* W, const double* q
 
 
 cdef inline int32_t solve_cone_disk(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """Solve for lam (3); FAILED keeps lam."""
+    """Solve a contact under the cone law for lam (3) [N s]; return FAILED and leave lam unchanged if that fails."""
     cdef double m2 = mu * mu, d1, d2, beta, top, f, df, step, lo, hi, side, P, U, d0
     cdef double v0[3]
     cdef double v1[3]

@@ -26,7 +26,10 @@ cdef enum:
 
 
 cdef inline void prepare_coulomb_disk(const double* W, double* g) noexcept nogil:
-    """Compute g (25): W, 1 / W_nn (0 if not positive), S, det S (0 if singular), 0, and W^-1 if det S > 0; row by row."""
+    """Compute the prepared numbers g (25) of a disk from its diagonal block W (3, 3).
+
+    g holds, matrices row by row: W, 1 / W_nn (0 if W_nn is not positive), S, det S (0 if S is singular), 0, W^-1 if det S > 0.
+    """
     cdef double h0, h1, k0, k1, inv, det, size, t00, t01, t10, t11
     cdef int32_t i
     for i in range(9):
@@ -80,7 +83,10 @@ cdef inline int32_t opposes_friction(const double* W, const double* q, double x0
 
 
 cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double mu, double beta, double* lam) noexcept nogil:
-    """Solve (1)-(4) for lam (3), with a guess `beta` for slip (0: none); FAILED keeps lam."""
+    """Solve (1)-(4) for lam (3) [N s]; return FAILED and leave lam unchanged if that fails.
+
+    `beta` is a first guess of beta in (3), 0 without a guess.
+    """
     cdef double a, h0, h1, r0, r1, u0, u1, x0, x1, det, tr, hr, delta, n, P, U, U2, f, step, lo = 0.0, hi = -1.0
     cdef double hu, size
     cdef double y[3]

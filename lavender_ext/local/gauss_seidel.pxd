@@ -1,4 +1,4 @@
-"""Sweeps of block Gauss-Seidel, which are compiled once, in `gauss_seidel.pyx`."""
+"""Declarations of `gauss_seidel.pyx`: sweeps of block Gauss-Seidel."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t

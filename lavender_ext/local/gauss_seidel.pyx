@@ -59,7 +59,7 @@ cdef inline void prepare_exact_block(const blocks_t* p, int32_t i, double* W, in
             if W[0] != p.d[j]:
                 g[9] = 0.0
             return
-        if W[0] != p.d[j]:                              # d of the normal is a fallback value: W_nn is too small to divide by
+        if W[0] != p.d[j]:                              # d of the normal replaces a W_nn that is too small to divide by.
             W[0] = 0.0
         g[0] = one_pattern and n == 3
         prepare_block_newton(n, W, p.d + j, &components, g + 1)
@@ -85,7 +85,7 @@ cdef inline void prepare_exact_block(const blocks_t* p, int32_t i, double* W, in
 
 cdef int32_t solve_block_without_closed_form(const blocks_t* p, int32_t i, const double* g, const double* w,
                                              double* lam) noexcept nogil:
-    """Solve block i without a closed form; return 1 if the fallback was used."""
+    """Solve block i by Newton's method; return 1 if this failed and projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i]
     cdef scaled_block_t x
     x.law, x.n, x.bounded = p.law, p.ptr[i + 1] - j, has_independent_rows(p, i)
@@ -94,7 +94,10 @@ cdef int32_t solve_block_without_closed_form(const blocks_t* p, int32_t i, const
 
 
 cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    """Solve disk i, which its closed form rejects, with the numbers of `prepare_coulomb_disk`; return 1 if it used the fallback."""
+    """Solve disk i, for which the closed form failed, by Newton's method; return 1 if projected steps were used, otherwise 0.
+
+    g has the numbers of `prepare_coulomb_disk`.
+    """
     cdef double h[15]
     cdef friction_components_t components
     get_friction_components(p, i, &components)
@@ -106,7 +109,7 @@ cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, 
 
 cdef inline int32_t solve_block_exactly(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
-    """Solve block i exactly from its slack w; lam points at its first row. Return 1 if the fallback was used."""
+    """Solve block i exactly from its slack w (n) [m/s] into lam (n) [N s]; return 1 if projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t
     cdef double x[MAX_ROWS]
     cdef double s
@@ -189,11 +192,11 @@ cdef inline void compute_block_slack(const blocks_t* p, const row_form_t* form, 
 
 cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
-    """Update block i over A by (1), or over J and M by (3) with v = Y^T lam; return 1 if the fallback was used."""
+    """Update block i over A by (1), or over J and M by (3) with v = Y^T lam; return 1 if projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, panel = find_panel(form, i), k, fallback
     cdef double w[MAX_ROWS]
     cdef double impulse[MAX_ROWS]
-    if n > MAX_ROWS:                                    # bounded rows, one by one
+    if n > MAX_ROWS:                                    # Update so many bounded rows one by one.
         for k in range(j, j + n):
             w[0] = compute_row_slack(form, p, panel, k, lam, v)
             set_row_impulse(form, panel, k, project_row_update(lam[k], w[0], p.step[k], p.lower[k], p.upper[k]), lam, v)
@@ -243,7 +246,7 @@ cdef inline int32_t update_disk_contact(const blocks_t* p, const rows_t* r, int3
 
 cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
-    """Update block i by (2); return 1 if the fallback was used."""
+    """Update block i over bodies by (2); return 1 if projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, fallbacks
     cdef double w[MAX_ROWS]
     cdef double previous[MAX_ROWS]
@@ -390,7 +393,7 @@ ctypedef fused exact_form_t:
 
 cdef inline int32_t sweep_exact_blocks_of_form(const blocks_t* p, const exact_form_t* form, const int32_t* start, const double* g,
                                    const int32_t* order, double* lam, double* v) noexcept nogil:
-    """Sweep once over one form of A; return the number of fallbacks."""
+    """Sweep once over one form of A; return the number of blocks for which projected steps were used."""
     cdef int32_t k, i, fallbacks = 0
     for k in range(p.n_blocks):
         i = order[k]
@@ -403,7 +406,10 @@ cdef inline int32_t sweep_exact_blocks_of_form(const blocks_t* p, const exact_fo
 
 cdef int32_t sweep_exact_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
-    """Sweep once over A (`a`), J and M (`o`) or bodies (`r`), with velocities v; return the number of fallbacks."""
+    """Sweep once over A (`a`), J and M (`o`) or bodies (`r`), with velocities v, in `order` (k).
+
+    Return the number of blocks for which projected steps were used instead of an exact solution.
+    """
     if o != NULL:
         return sweep_exact_blocks_of_form(p, o, start, g, order, lam, v)
     if a != NULL:

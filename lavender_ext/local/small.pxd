@@ -28,9 +28,9 @@ cdef inline double safeguard_newton_step(double x, double step, double lo, doubl
 
 
 cdef inline int32_t solve_by_elimination(int32_t n, double* a, double* x) noexcept nogil:
-    """Overwrite x (n) with a^-1 x by elimination with row pivoting; return the rank of a (n, n), which is overwritten.
+    """Overwrite x (n) with a^-1 x by elimination with row exchanges; return the rank of a (n, n), which is overwritten.
 
-    The entries of x of dependent columns are 0.
+    If columns of a depend linearly on others, their entries of x are 0.
     """
     cdef int32_t col[MAX_ROWS]
     cdef int32_t i, j, k, p, rank = 0
@@ -70,7 +70,7 @@ cdef inline int32_t solve_by_elimination(int32_t n, double* a, double* x) noexce
         col[rank] = k
         rank += 1
     if rank == n:
-        return n                                        # the columns are in order
+        return n                                        # The rank is complete, so the entries of x are in their places.
     k = n - 1
     p = rank - 1
     while k >= 0:                                       # scatter to the columns, from the end to avoid overwriting

@@ -1,7 +1,7 @@
 """Build the elimination order and the panel K of Newton's method over bodies, in workspace that the caller provides.
 
 `order_bodies` needs `index_workspace_size`. The pattern of the factor then needs `factor_index_size`, its values
-`body_workspace_size`, with six columns for each body. A host that allocates in between may bind fewer columns.
+`body_workspace_size`, with six columns for each body. A caller that allocates after the ordering may bind fewer columns.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -35,7 +35,7 @@ cdef inline int64_t factor_index_size(int64_t n, int64_t blocks, int64_t below) 
 
 
 cdef inline int64_t order_index_size(int64_t n, int64_t k) noexcept nogil:
-    """Return the number of these int32 that the elimination order of n bodies and k elements uses."""
+    """Return the number of int32 of `index_workspace_size` that the elimination order of n bodies and k elements uses."""
     # Scratch of the elimination order, four vectors over the bodies, the pattern of N, and the elements.
     return pattern_workspace_size(n, k) + 4 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 

@@ -69,7 +69,7 @@ cdef inline double tangent_factor(double a) noexcept nogil:
 
 
 cdef inline void load_cone_variable(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
-    """Compute x = G z."""
+    """Compute x = G z for component g of contact i."""
     cdef int32_t q = e.first[g] - 1, k
     cdef double a = e.reach[g]
     x[0] = normal_factor(a) * z[e.ptr[i]]
@@ -78,7 +78,7 @@ cdef inline void load_cone_variable(const elements_t* e, int32_t i, int32_t g, c
 
 
 cdef inline void add_cone_transpose(const elements_t* e, int32_t i, int32_t g, const double* x, double* z) noexcept nogil:
-    """Compute z += G^T x."""
+    """Add G^T x of component g of contact i to z."""
     cdef int32_t q = e.first[g] - 1, k
     cdef double a = e.reach[g]
     z[e.ptr[i]] += normal_factor(a) * x[0]
@@ -89,13 +89,13 @@ cdef inline void add_cone_transpose(const elements_t* e, int32_t i, int32_t g, c
 # Storage of duals. u1 (m): of the lower bound, or of the first component's cone. u2 (m): of the upper bound, or of the
 # other cones; their first numbers use the places of the normal and of the row after it, which u2 leaves free.
 cdef inline double* dual_normal(const elements_t* e, int32_t i, int32_t g, double* u1, double* u2) noexcept nogil:
-    """Return the address of the first number of a cone's dual."""
+    """Return the address of the first number of the dual of cone g of element i."""
     return u1 + e.ptr[i] if g == e.part[i] else u2 + e.ptr[i] + (g - e.part[i] - 1)
 
 
 cdef inline void load_cone_dual(const elements_t* e, int32_t i, int32_t g, const double* u1, const double* u2,
                            double* x) noexcept nogil:
-    """Load the dual of a cone."""
+    """Copy the dual of cone g of element i from u1 and u2 to x."""
     cdef const double* u = u1 if g == e.part[i] else u2
     cdef int32_t q = e.first[g] - 1, k
     x[0] = dual_normal(e, i, g, <double*>u1, <double*>u2)[0]
@@ -104,7 +104,7 @@ cdef inline void load_cone_dual(const elements_t* e, int32_t i, int32_t g, const
 
 
 cdef inline void store_cone_dual(const elements_t* e, int32_t i, int32_t g, const double* x, double* u1, double* u2) noexcept nogil:
-    """Store the dual of a cone."""
+    """Copy x to the dual of cone g of element i in u1 and u2."""
     cdef double* u = u1 if g == e.part[i] else u2
     cdef int32_t q = e.first[g] - 1, k
     dual_normal(e, i, g, u1, u2)[0] = x[0]
@@ -130,7 +130,7 @@ cdef inline void compute_nt_scaling(const double* s, const double* u, int32_t n,
 
 
 cdef inline void apply_scaling(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
-    """Compute T x."""
+    """Compute out = T x with the scaling T that w holds."""
     cdef double t = 0.0
     cdef int32_t k
     for k in range(1, n):
@@ -142,7 +142,7 @@ cdef inline void apply_scaling(const double* w, int32_t n, const double* x, doub
 
 
 cdef inline void apply_inv_scaling(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
-    """Compute T^-1 x."""
+    """Compute out = T^-1 x with the scaling T that w holds."""
     cdef double t = 0.0
     cdef int32_t k
     for k in range(1, n):

@@ -70,7 +70,7 @@ def list_coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32
 
 def copy_coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
                     const int32_t[::1] indices):
-    """Return the entries of A, whose columns ascend, in the pattern of `list_coupled_rows`, which includes its own."""
+    """Return the entries of A in the pattern of `list_coupled_rows`, with 0 where A has no entry; columns of A must ascend."""
     out_array = np.zeros(indices.shape[0])
     cdef double[::1] out = out_array
     cdef int32_t i, p, q

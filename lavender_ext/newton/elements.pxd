@@ -54,7 +54,10 @@ cdef inline void load_components(const elements_t* e, int32_t i, friction_compon
 
 
 cdef inline void invert_small_matrix(double* a, double* inv, int32_t n) noexcept nogil:
-    """Invert a by Gauss-Jordan elimination with row exchanges; a is lost. A zero pivot leaves zeros in its column."""
+    """Write the inverse of a (n, n) to inv, by Gauss-Jordan elimination with row exchanges; a is overwritten.
+
+    A pivot of 0 leaves zeros in its column.
+    """
     cdef int32_t i, j, k, best
     cdef double x
     for i in range(n * n):

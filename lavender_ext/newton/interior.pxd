@@ -184,7 +184,7 @@ cdef inline void compute_scaling(const elements_t* e, const interior_t* p, doubl
         a[0] = 1.0
         for g in range(e.part[i], e.part[i + 1]):
             n = cone_size(e, g)
-            # The cones of a contact share its normal, where their weights add in parallel.
+            # The cones of a contact have its normal in common; their weights on it are added.
             load_cone_variable(e, i, g, z, s)
             load_cone_dual(e, i, g, u1, u2, u)
             y = 0.0 if more else total
@@ -264,7 +264,7 @@ cdef inline double limit_affine_step(const elements_t* e, const interior_t* p, c
 
 cdef inline void form_combined_rhs(const elements_t* e, const interior_t* p, const double* da, double sigma_mu,
                                    double* rhs) noexcept nogil:
-    """Form the right-hand side of (4)."""
+    """Write the right-hand side of the combined step (4) to rhs (m), from the affine step da (m)."""
     cdef int32_t i, j, k, g, n
     cdef const double* z = p.z
     cdef const double* u1 = p.u1

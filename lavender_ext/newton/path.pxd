@@ -123,7 +123,7 @@ cdef enum:                      # coordinates: 4 i + FIRST_COORDINATE is the nor
 
 cdef inline double friction_ratio_of(int32_t k) noexcept nogil:
     """Return c of the k-th path."""
-    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # The comparisons are not ==, of which compilers would make a table.
+    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # Compilers would turn comparisons by == into a table.
 
 
 cdef inline double curve_tolerance() noexcept nogil:
@@ -260,7 +260,7 @@ cdef inline void evaluate_smoothed_map(newton_t* n, const double* z, double tau,
 
 
 cdef inline void compute_change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
-    """Compute dy = dz - (H + eps) dz."""
+    """Compute the change dy = dz - (H + eps) dz (m) of y by a change dz (m)."""
     cdef int32_t j
     multiply_system_matrix(&n.s, dz, dy)
     for j in range(n.s.e.m):
@@ -269,7 +269,7 @@ cdef inline void compute_change_of_y(newton_t* n, const double* dz, double* dy) 
 
 cdef inline double compute_coordinate_rate(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
                            double* turned) noexcept nogil:
-    """Return the rate of a coordinate along (dy, dl) at the last evaluated y; write that of the direction of y_t."""
+    """Return the rate of coordinate `which` along (dy, dl) at the last evaluated y; write the rate of y_t's direction."""
     cdef const elements_t* e = n.s.e
     cdef int32_t i = (which - FIRST_COORDINATE) // COORDINATES_PER_ELEMENT
     cdef int32_t part = (which - FIRST_COORDINATE) % COORDINATES_PER_ELEMENT, j, k, first, size
@@ -306,7 +306,7 @@ cdef inline double compute_coordinate_rate(const newton_t* n, int32_t which, con
 
 cdef inline double find_fastest_coordinate(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
                            double* turned) noexcept nogil:
-    """Return the largest rate of a coordinate; write the coordinate, and the largest rate of a direction."""
+    """Return the largest rate of a coordinate along (dy, dl); write this coordinate, and the largest rate of a direction y_t."""
     cdef const elements_t* e = n.s.e
     cdef int32_t i, part
     cdef double worst = fabs(dl), x, turn
@@ -338,7 +338,7 @@ cdef inline double find_largest_coordinate_change(const newton_t* n, const doubl
 
 
 cdef inline void begin_path(newton_t* n) noexcept nogil:
-    """Begin the next path from z = 0. Its vectors are those of interior points and exchanges, which have ended."""
+    """Begin the next path from z = 0. It uses the memory of interior points and exchanges, which have ended."""
     cdef path_t* x = &n.path
     cdef int32_t j, m = n.s.e.m
     x.z, x.t, x.b = n.ip.z, n.ip.u1, n.ip.hz

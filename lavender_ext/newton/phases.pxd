@@ -51,7 +51,7 @@ cdef enum:                      # interior points
     MAX_HYBRID_STEPS = 60           # Limit of an interior point with Newton trials; more steps rarely help.
     MAX_SHORT_STEPS = 4             # Such an interior point ends after this many short steps in a row: the path has turned back.
     TRIAL_INNER_STEPS = 2           # Newton steps of one attempt to end De Saxce's interior point.
-    AUGMENTED_TRIAL_STEPS = 4       # Augmented Newton steps of one attempt.
+    AUGMENTED_TRIAL_STEPS = 4       # Newton steps on the augmented system in one attempt.
     MAX_FAILED_AUGMENTED_STEPS = 2  # An attempt ends if this many steps in a row do not halve the residual.
 
 cdef enum:                      # damped Newton
@@ -125,7 +125,7 @@ cdef inline void begin_active_set(newton_t* n, const double* z) noexcept nogil:
 
 
 cdef inline bint exchange_rows(newton_t* n) noexcept nogil:
-    """Make one exchange; return False if it is not finite."""
+    """Make one exchange of the active set; return False if the new z is not finite."""
     cdef active_set_t* x = &n.active
     cdef int32_t j
     cdef bint finite
@@ -212,7 +212,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
 
 
 cdef inline void reset_interior_progress(newton_t* n, double trial_residual) noexcept nogil:
-    """Reset the progress of an interior point."""
+    """Reset the progress of an interior point; trials begin below the relative residual `trial_residual`."""
     cdef progress_t* k = &n.progress
     k.lowest = 1.0 / 0.0
     k.trial_residual = trial_residual
@@ -221,7 +221,7 @@ cdef inline void reset_interior_progress(newton_t* n, double trial_residual) noe
 
 
 cdef inline void begin_interior_steps(newton_t* n, bint bounded_rows) noexcept nogil:
-    """Begin interior point steps from `begin_interior_point`."""
+    """Begin steps from the point of `begin_interior_point`; bounded_rows: all elements of the problem are bounded rows."""
     reset_interior_progress(n, 1e-2)
     n.progress.bounded_rows = bounded_rows
     push_phase(n, INTERIOR_POINT)
@@ -356,7 +356,7 @@ cdef inline void begin_damped_newton(newton_t* n, const double* z, int32_t law, 
 
 
 cdef inline void push_damped_newton(newton_t* n, int32_t limit) noexcept nogil:
-    """Start or continue damped Newton for `limit` factorisations."""
+    """Put damped Newton on the stack of phases, for at most `limit` further factorisations."""
     cdef damped_newton_t* x = &n.damped
     x.last = n.s.factorisations + limit if limit < UNLIMITED - n.s.factorisations else UNLIMITED
     x.free_iterations = x.stage = 0

@@ -15,7 +15,7 @@
                     FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     MORE_PATHS
+                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
                                               rigid
                     MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
@@ -95,7 +95,10 @@ cdef inline double first_derivative_fraction() noexcept nogil:
 
 
 cdef inline double second_derivative_fraction() noexcept nogil:
-    """Return the fraction after a failure, and first on the augmented system, which no damped Newton phase follows."""
+    """Return the part of phi's derivative after a failure of the first part.
+
+    On the augmented system this part comes first, since no damped Newton phase follows there.
+    """
     return 0.7
 
 
@@ -110,14 +113,17 @@ cdef inline double max_start_gain() noexcept nogil:
 
 
 cdef inline double start_alpha() noexcept nogil:
-    """Return the first proximal weight of damped Newton from the start; 1e-4 to 1e-7 take 2,030 to 2,530 factors of 68."""
+    """Return the first proximal weight of damped Newton from the start, relative to d.
+
+    With weights from 1e-4 to 1e-7, 68 test problems take 2,030 to 2,530 factorisations in all.
+    """
     return 1e-5
 
 
 cdef inline double first_cone_weight() noexcept nogil:
     """Return the first proximal weight on cones, with a wider scaling than rows; N loses 2^-53 / weight to rounding.
 
-    On a redundant pyramid 1e-10 ends at 3e-8 and 1e-8 at 4e-10; 1e-6 takes a step more.
+    On a pyramid of redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8 at 4e-10; 1e-6 takes one more step.
     """
     return 1e-8
 
@@ -290,8 +296,8 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
-    # Loops of rigid joints have nearly dependent rows; the answer must not depend on whether a host can factor their
-    # augmented system.
+    # Loops of rigid joints have nearly dependent rows. Whether the caller can factor the augmented system must not change the
+    # result.
     cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
     n.stage = state + 1
     if state != START_DAMPED_NEWTON and is_over(n):

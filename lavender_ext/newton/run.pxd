@@ -307,7 +307,7 @@ cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* wo
 
 
 cdef inline void push_phase(newton_t* n, int32_t phase) noexcept nogil:
-    """Put a phase on the stack, unless it is disabled, which counts as ended."""
+    """Put a phase on the stack. A disabled phase is not put there and counts as ended."""
     if n.disabled_phases >> phase & 1:
         return
     n.stack[n.depth] = phase
@@ -344,7 +344,7 @@ cdef inline void write_impulse(const newton_t* n, const double* z, double* lam) 
 
 
 cdef inline void write_unknown(const newton_t* n, const double* lam, double* z) noexcept nogil:
-    """Write z of lambda (rows)."""
+    """Write the unknown z (m) that belongs to the impulse lam (rows) [N s]."""
     cdef int32_t j
     for j in range(n.s.e.m):
         z[j] = lam[n.sc.keep[j]] / n.sc.scale[j]
@@ -460,13 +460,16 @@ cdef inline void store_earlier_best(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
-    """Begin a phase with a best point that is recorded separately from earlier points."""
+    """Begin a phase with a best point of its own, which is compared with earlier points only at its end."""
     store_earlier_best(n)
     n.best = 1.0 / 0.0
 
 
 cdef inline double end_separate_best(newton_t* n, double* z) noexcept nogil:
-    """End such a phase: return its lowest residual, copy its z unless NULL, and keep the better of both points as the best."""
+    """End a phase of `begin_separate_best`, and keep the better of its best point and the earlier best point.
+
+    Return the lowest residual of the phase; z (m), unless NULL, receives its best point.
+    """
     cdef double best = n.best
     if z != NULL:
         copy_vector(n, z, n.best_z)

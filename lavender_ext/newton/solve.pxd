@@ -1,4 +1,4 @@
-"""Newton's method over rows and bodies as workspace, start and step (`core/method.pxd`), compiled once, in `solve.pyx`."""
+"""Declarations of `solve.pyx`: Newton's method over rows and bodies as workspace, start and step (`core/method.pxd`)."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.method cimport options_t, workspace_t, info_t

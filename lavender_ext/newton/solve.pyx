@@ -185,7 +185,7 @@ cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, works
 # -- for Python ------------------------------------------------------------------------------------------------
 
 
-cdef class Solve(Method)        # defined below
+cdef class Solve(Method)        # The class is defined below.
 
 
 cdef int32_t call_linear_factor(void* at, int32_t what, double eps) noexcept with gil:
@@ -265,7 +265,7 @@ cdef class Solve(Method):
     Parameters
     ----------
     data : Data
-        With d and nu, and the error of the zero impulse.
+        The problem, with d, nu and the residual of the zero impulse.
     matrix : Data or None
         A in compressed rows; None: over the bodies of `data`, or over the bodies that `graph.find_bodies_of_velocities` finds.
     """
@@ -329,7 +329,7 @@ cdef class Solve(Method):
         self.others, self.n.s.others = others, &self.calls
 
     def use_dense_matrix(self, double[:, ::1] h, bint symmetric, bint wide):
-        """Use H (m, m), dense."""
+        """Use the dense matrix h (m, m) = H."""
         cdef double[::1] whole = np.empty(self.m * self.m + 1)
         cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
         self.held += [h, whole, lower]
@@ -426,7 +426,7 @@ cdef class Solve(Method):
     # -- single operations, for tests --------------------------------------------------------------
 
     def multiply_matrix(self, const double[::1] x):
-        """Return H x."""
+        """Return H x (m,) for x (m,)."""
         out_array = np.empty(self.m)
         cdef double[::1] out = out_array
         multiply_system_matrix(&self.n.s, &x[0], &out[0])
@@ -464,7 +464,7 @@ cdef class Solve(Method):
         return determinant_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):
-        """Solve with the last factor."""
+        """Return the solution dz (m,) for the right-hand side r (m,) of the system `what`, with its last factor."""
         out_array = np.empty(self.m)
         cdef double[::1] out = out_array
         if what != "natural":
@@ -488,7 +488,7 @@ cdef class Solve(Method):
         return finite, z_array, residual, changed
 
     def begin_interior(self, double delta, double fraction=0.0):
-        """Compute the first point of an interior point."""
+        """Compute the first point of an interior point with proximal weight `delta` and this fraction of De Saxce's term."""
         begin_interior_point(self.n, delta, fraction)
 
     def step_interior(self):

@@ -55,7 +55,7 @@ cdef inline double unreachable_fraction() noexcept nogil:
 
 
 cdef inline double first_dual_fraction() noexcept nogil:
-    """Return the first duals as a fraction of the first impulses; fractions of 0.001 to 1 take about the same number of steps."""
+    """Return the first duals as a fraction of the first impulses; all fractions from 0.001 to 1 take about as many steps."""
     return 0.01
 
 
@@ -116,7 +116,7 @@ cdef inline void begin_interior_point(newton_t* n, double delta, double derivati
 
 
 cdef inline void multiply_cone_duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
-    """Compute G^T u on every row."""
+    """Compute u (m) = G^T u of the duals of the interior point p."""
     cdef int32_t i, j, g
     cdef double x[4]
     for i in range(e.n):

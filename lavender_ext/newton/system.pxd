@@ -221,7 +221,7 @@ cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept
 
 
 cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
-    """Solve with the last dense factor, in place; infinite if the matrix is singular, so that the caller rejects the step."""
+    """Overwrite x with the solution by the last dense factor. It is infinite for a singular matrix: the caller rejects it."""
     cdef int32_t j
     if s.n_free < 0:
         solve_linear_system(s.linear, x)
@@ -339,7 +339,7 @@ cdef inline void solve_natural_map_system(system_t* s, const double* r, double* 
 
 
 cdef inline void multiply_by_natural_map_derivative(system_t* s, const double* dz, double* out) noexcept nogil:
-    """Compute (I - P) dz + P H dz."""
+    """Compute out (m) = (I - P) dz + P H dz, the derivative of the natural map times dz (m)."""
     cdef int32_t j
     multiply_system_matrix(s, dz, s.q)
     for j in range(s.e.m):

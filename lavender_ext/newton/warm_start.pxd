@@ -16,7 +16,8 @@ from lavender_ext.core.view cimport rows_t
 
 
 cpdef enum:
-    FIRST_SWEEP_CHECK = 4       # First check of (2). Earlier ones leave a residual just below tol: the next step starts above it.
+    # Number of sweeps before the first check of (2). After fewer sweeps the residual is just below tol: the next step starts above.
+    FIRST_SWEEP_CHECK = 4
     MIN_SWEEPS_TO_GIVE_UP = 16  # From this many sweeps on, the prediction of (2) is reliable.
     MAX_WARM_SWEEPS = 64        # If more sweeps are needed, Newton's method is faster.
     MAX_WARM_ROWS = 200000      # With more rows, the sweeps may take more than a fraction of a second.

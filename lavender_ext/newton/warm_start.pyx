@@ -148,14 +148,14 @@ cdef inline void form_joint_band(const blocks_t* p, const rows_t* r, warm_t* s) 
 
 cdef double judge_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
                           double v0) noexcept nogil:
-    """Return the judge's relative residual of lam, with v computed from lam."""
+    """Compute v = M^-1 J^T lam and return the judge's relative residual of lam (m) [N s]."""
     compute_velocity_change(p, r, lam, v)
     return score_impulse(p, r, s, lam, v, e0, v0)
 
 
 cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                  double* lam, double* v) noexcept nogil:
-    """Solve the joints by (3)."""
+    """Solve joints without bounds by (3) into lam (m) [N s]; return the result code."""
     cdef linear_t band
     cdef int32_t j, attempt
     form_joint_band(p, r, s)
@@ -181,7 +181,7 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
 
 cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                    double* lam, double* v) noexcept nogil:
-    """Sweep the contacts as in (2)."""
+    """Sweep over the contacts by (2), lam (m) [N s] in place; return the result code."""
     cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEP_CHECK
     cdef double before, now = s.relative, predicted
     while n < MAX_WARM_SWEEPS:
@@ -210,7 +210,10 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
 
 cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
-    """Solve from lam (m), not zero, to tol in place; v (n_bodies, 6) becomes M^-1 J^T lam, and is so before with `has_velocity`."""
+    """Solve in place from lam (m) [N s], which is not zero, to the relative residual tol; return the result code.
+
+    v (n_bodies, 6) receives M^-1 J^T lam; with has_velocity it holds this product of the start on entry.
+    """
     cdef double e0, v0
     cdef int32_t j, result
     s.sweeps = 0
@@ -238,7 +241,10 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
 
 
 def solve_from_guess(Data data, double[::1] impulse, double tol):
-    """Solve impulse (m,) of a factored problem to tol in place; return (result, sweeps, factorisations). 0: it is unchanged."""
+    """Solve a problem over bodies in place from `impulse` (m,) [N s] to the relative residual tol.
+
+    Return (result code, sweeps, factorisations); with the result code 0 the impulse is unchanged.
+    """
     cdef int32_t m = data.blocks.n_rows, result
     cdef warm_t s
     if m == 0 or not data.factored:

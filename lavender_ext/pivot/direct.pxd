@@ -1,4 +1,4 @@
-"""The method of `direct`, step by step, for hosts with or without Python (states in direct.pyx).
+"""The method of the solver `direct`, step by step, without Python (states in direct.pyx).
 
     t.v, t.e0, t.v0, t.least, t.sweeps, t.linear, t.symmetric, and a, p, band, order, linear.tiny of t.s are set
     bind_direct_workspace(&t, real, integers)       arrays of as many numbers as the two counts below

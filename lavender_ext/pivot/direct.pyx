@@ -10,8 +10,8 @@
 
 (Bertsekas 1982.) (3) is monotone, so no set of free rows returns, which pivoting cannot guarantee on a nearly singular A.
 
-`step_direct_solve` does at most a number of rounds of one state, so that hosts can check their clock between steps. States, and the
-results that change them; ROUNDS_USED keeps the state:
+`step_direct_solve` does at most a given number of rounds of one state, so that the caller can check a clock between steps. The
+states, and the results of a step that change the state (ROUNDS_USED does not):
 
     GUESS     sweeps guess the free rows, or all rows are free; then as EXCHANGE
     EXCHANGE  -> over      SOLVED; INDEFINITE; of an A that is not symmetric also CYCLING, and PASSES_USED of a linear system
@@ -172,7 +172,7 @@ cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexce
 # -- linear systems and exchanges --------------------------------------------------------------------------------
 
 cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
-    """Factor A with all rows free: SOLVED, SMALL_PIVOT, INDEFINITE, or ROUNDS_USED if an outside factor is not started."""
+    """Factor A with all rows free; return SOLVED, SMALL_PIVOT, INDEFINITE, or ROUNDS_USED if an outside factor is not started."""
     if not t.s.is_factored:
         factor_all_rows(&t.s)
     if t.s.late:
@@ -186,7 +186,7 @@ cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t step_linear_solve(direct_t* t) noexcept nogil:
-    """Factor and solve with all rows free."""
+    """Factor A and solve with all rows free, in the state of a linear system; return the result of the step."""
     cdef int32_t code = factor_linear_system(t)
     if code != SOLVED:
         return code
@@ -196,13 +196,13 @@ cdef inline int32_t step_linear_solve(direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t step_guess_and_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Guess the free rows, then do at most `max_rounds` rounds."""
+    """Guess the free rows, then do at most `max_rounds` rounds of exchanges; return the result of the step."""
     t.swept = not guess_free_rows_by_sweeps(&t.s, t.start, t.sweeps, max_rounds)
     return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds) if t.swept else SOLVED)
 
 
 cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do up to `max_rounds` rounds."""
+    """Do at most `max_rounds` rounds of exchanges; return the result of the step."""
     return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds))
 
 
@@ -260,7 +260,7 @@ cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t step_proximal_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do up to `max_rounds` rounds of a pass; the header has its results."""
+    """Do at most `max_rounds` rounds of a pass; return the result of the step (table of the module)."""
     cdef int32_t code, i
     if t.is_pass_over and t.passes == MAX_PASSES:
         return PASSES_USED
@@ -358,7 +358,7 @@ cdef inline bint is_descent_minimum(const direct_t* t) noexcept nogil:
 
 
 cdef inline int32_t run_descent_steps(direct_t* t, int32_t max_steps) noexcept nogil:
-    """Do at most `max_steps` steps (3) and judge the result: SOLVED, ROUNDS_USED, SMALL_PIVOT or INDEFINITE."""
+    """Do at most `max_steps` steps (3) and judge x; return SOLVED, ROUNDS_USED, SMALL_PIVOT or INDEFINITE."""
     cdef pivoting_t* s = &t.s
     cdef int32_t i, _, code = ROUNDS_USED
     cdef double length
@@ -407,7 +407,7 @@ cdef inline int32_t choose_state_after_exchanges(direct_t* t, int32_t code) noex
 
 
 cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Do up to `max_rounds` rounds of the present state; the header has states and results."""
+    """Do at most `max_rounds` rounds of the present state; return the result of the step (table of the module)."""
     cdef int32_t code
     if t.state == GUESS or t.state == EXCHANGE:
         if t.linear:
@@ -427,7 +427,7 @@ cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil:
 # -- for Python --------------------------------------------------------------------------------------------------
 
 cdef int32_t call_python_factor(void* owner, const int32_t* _place, int32_t n_free, double shift) noexcept with gil:
-    """Call the factor of Python; return -1 if it was not started or has raised."""
+    """Call `outside.factor` of Python; return its number of small pivots, -1 if it was not started or has raised."""
     cdef Pivoting rows = <Pivoting>owner
     cdef Py_ssize_t m = rows.t.s.n
     if rows.error is not None:
@@ -440,7 +440,7 @@ cdef int32_t call_python_factor(void* owner, const int32_t* _place, int32_t n_fr
 
 
 cdef void call_python_solve(void* owner, int32_t n_free, double* y) noexcept with gil:
-    """Solve with the factor of Python."""
+    """Overwrite y (n_free) with the result of `outside.solve` of Python."""
     cdef Pivoting rows = <Pivoting>owner
     cdef const double[::1] solution
     if rows.error is not None or n_free == 0:
@@ -453,7 +453,7 @@ cdef void call_python_solve(void* owner, int32_t n_free, double* y) noexcept wit
 
 
 cdef class Pivoting:
-    """The rows of one problem, for one solve.
+    """The method of `direct` for one solve of a problem with bounded rows.
 
     Parameters
     ----------
@@ -509,14 +509,14 @@ cdef class Pivoting:
             self.t.s.solve_outside = call_python_solve
 
     cdef int raise_error(self, int32_t code) except -1:
-        """Raise the error of the factor of Python, if any; else return `code`."""
+        """Raise the error of `outside` if it has raised one; otherwise return `code`."""
         error, self.error = self.error, None
         if error is not None:
             raise error
         return code
 
     def factor_all(self):
-        """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
+        """Factor A with all rows free; return SOLVED, SMALL_PIVOT or INDEFINITE."""
         cdef int32_t code
         with nogil:
             code = factor_linear_system(&self.t)

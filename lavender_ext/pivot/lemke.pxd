@@ -1,4 +1,4 @@
-"""Lemke's method for other kernels: bind a workspace, then call `follow_lemke_paths` until it returns DONE.
+"""Declarations of Lemke's method: bind a workspace, then call `follow_lemke_paths` until it returns DONE.
 
 The states are in lemke.pyx.
 """

@@ -185,7 +185,7 @@ cdef inline double impulse_at_zero_variable(const blocks_t* p, int32_t i) noexce
 
 
 cdef inline double impulse_per_variable(const blocks_t* p, int32_t i) noexcept nogil:
-    """Return (lambda_i - base) / s."""
+    """Return the change of lambda_i per unit of s: (lambda_i - `impulse_at_zero_variable`) / s."""
     cdef double size = 1.0 / sqrt(p.d[i])
     return size if p.lower[i] > -INFINITY or p.upper[i] == INFINITY else -size
 
@@ -229,7 +229,7 @@ cdef inline void build_dictionary_without_cover(lemke_t* l) noexcept nogil:
     """Build (1) as a dictionary in which every w is basic; z has no column yet."""
     cdef dictionary_t* d = &l.d
     cdef const blocks_t* p = l.t.s.p
-    cdef int32_t* pair_of = l.t.s.place                 # scratch here
+    cdef int32_t* pair_of = l.t.s.place                 # `place` is free until the exchanges, and is used as scratch.
     cdef int32_t i, j, k, q
     cdef double w
     cdef double* row
@@ -520,12 +520,12 @@ cdef void judge_unfinished_path(lemke_t* l) noexcept nogil:
 
 
 cdef class Lemke:
-    """The paths of one problem.
+    """Lemke's method on one problem with bounded rows.
 
     Parameters
     ----------
     rows : Pivoting
-        Rows of the problem: judges impulses, has the best one, and exchanges at the end of a path.
+        The problem's rows; the object judges impulses, keeps the best impulse, and makes the exchanges at the end of a path.
     """
 
     cdef lemke_t l

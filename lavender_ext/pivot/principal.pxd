@@ -1,4 +1,4 @@
-"""Principal pivoting for other kernels: its state, results and operations."""
+"""Declarations of principal pivoting (`principal.pyx`): its state, results and operations."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t

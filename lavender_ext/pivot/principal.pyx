@@ -27,7 +27,7 @@ cdef enum:
 
 
 cdef inline void call_outside_factor(pivoting_t* s) noexcept nogil:
-    """Call the outside factor."""
+    """Factor the free rows by the outside factor, and store its number of small pivots."""
     cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.linear.shift)
     s.late = small < 0
     if s.late:
@@ -187,7 +187,10 @@ cdef inline int32_t choose_bound_after_exchange(const pivoting_t* s, int32_t i) 
 
 
 cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
-    """Exchange (4); return the number of infeasible rows (3) before it, negated if patience is used up and none is exchanged."""
+    """Make an exchange (4); return the number of rows that were infeasible (3) before.
+
+    The number is negative if no row is exchanged because patience is used up.
+    """
     cdef int32_t i, n_infeasible = 0
     for i in range(s.n):
         n_infeasible += choose_bound_after_exchange(s, i) != s.at[i]
@@ -218,7 +221,7 @@ cdef inline void set_bound_rows_to_bounds(pivoting_t* s) noexcept nogil:
 
 
 cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
-    """Decide from x - w / d which rows are free and which are at a bound; w belongs to this x."""
+    """Decide from x - w / d, with the slack w of x, which rows are free and which are at a bound."""
     cdef int32_t i
     cdef double y
     for i in range(s.n):
@@ -235,8 +238,8 @@ cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
 cdef inline void run_symmetric_sweeps(pivoting_t* s, int32_t n) noexcept nogil:
     """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first sweep and 1 in the others.
 
-    Along a stack, each contact gets 0.85 of the change of the previous one with omega = 1.7, so that a change passes through
-    4000 contacts before it underflows; with omega = 1 each gets 0.5, which is enough for 1000.
+    Along a stack, with omega = 1.7, the impulse of a contact changes by 0.85 times the change of the contact before. A change
+    passes through 4000 contacts before it underflows, and with omega = 1 and a factor of 0.5 through 1000.
     """
     cdef int32_t i, k
     cdef double* x = s.x

@@ -1,4 +1,4 @@
-"""Solver call for small problems: `derive_small_problem` once, then `solve_small` from any start, in any thread on its own copy."""
+"""Solver call for small problems: `derive_small_problem` once, then `solve_small` from any start, on a copy for each thread."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport workspace_t
@@ -11,7 +11,7 @@ cdef enum:
     N_COUNTS = 8                # counters of one call
 
 cdef enum:                      # result code of a call
-    RESULT_FAILED = 0           # not below tol: no result
+    RESULT_FAILED = 0           # The relative residual is above tol: there is no result.
     RESULT_SOLVED = 1
     RESULT_IS_START = 2         # the start is a solution and was not changed
 

@@ -143,7 +143,7 @@ cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint t
 
 
 cdef inline int32_t count_remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
-    """Return the number of rounds of the next step: up to MAX_PASS_EXCHANGES, and up to `max_rounds` in total."""
+    """Return the largest number of rounds of the next step: MAX_PASS_EXCHANGES, or fewer if `max_rounds` in total are reached."""
     cdef double remaining = max_rounds - t.s.n_rounds
     return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
 
@@ -395,7 +395,7 @@ cdef inline int32_t number_island_bodies(const rows_t* r, const int32_t* block, 
 
 
 cdef inline void copy_entry_numbers(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
-    """Copy the n numbers of entry i."""
+    """Copy entry i of x, which has n numbers for each entry, to `to` (n)."""
     memcpy(<void*>to, x + n * i, n * sizeof(double))
 
 
@@ -580,7 +580,7 @@ cdef class Islands(Small):
         two[1].n_numbers = -1
         with nogil:
             for i in range(self.count):
-                # Copy the island's data.
+                # Copy the data of island i.
                 x, last = &two[i % 2], &two[1 - i % 2]
                 m, k = size[i, 0], size[i, 1]
                 if over_bodies:

@@ -109,7 +109,7 @@ cdef inline double estimate_cost_so_far(const alternation_t* t) noexcept nogil:
 
 
 cdef inline double judge_subproblem_impulse(alternation_t* t, const double* lam) noexcept nogil:
-    """Return the relative residual of lam."""
+    """Return the relative residual of lam (m) [N s], relative to the subproblem's zero impulse."""
     cdef const view_t* v = &t.s.v
     cdef score_t score = make_empty_score()
     judge_view(v, lam, t.w, t.error, t.scratch, False, &score)
@@ -128,7 +128,7 @@ cdef inline bint predicts_convergence(double before, double now, double tol, int
 
 
 cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_sweeps, bint extrapolate) noexcept nogil:
-    """Continue the sweeps of `swept` from the residual `now`, up to `max_sweeps` in total, and return its relative residual.
+    """Continue the sweeps of `swept` from its relative residual `now`, up to `max_sweeps` in total; return its new residual.
 
     `extrapolate`: stop early if the extrapolated residual does not reach tol.
     """

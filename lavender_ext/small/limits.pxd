@@ -14,7 +14,7 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.py
-    double entry                # number of factorisations if some row is not free
+    double entry                # ns, rate of the term 2 Y + 4 m of (1)
     double work                 # ns per multiply-add of a factorisation
     double count                # factorisations, if some row is not free
     double row                  # ns per independent row of a step
@@ -26,10 +26,10 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double sweeps               # number of such sweeps
     double values               # largest number of entries of one island's N
     double max_cost             # ns, largest cost that may be permitted
-    double coulomb_rows         # largest number of rows of an island under Coulomb's law
-    double cone_rows            # the same under the cone law with a rigid contact; both limits apply only if
-    double dense                # there are fewer than this many rows per velocity
-    double columns              # and no row has more than this many entries: velocities may then belong to bodies
+    double coulomb_rows         # largest number of rows per island under Coulomb's law
+    double cone_rows            # largest number of rows per island under the cone law with a rigid contact
+    double dense                # coulomb_rows and cone_rows apply only with fewer than this many rows per velocity,
+    double columns              # and if no row has more than this many entries: velocities may then belong to bodies.
     double steps                # largest number of steps of all islands together
 
 

@@ -1,4 +1,4 @@
-"""Sweeps over blocks packed in pairs, compiled once in `packed.pyx`, where the order of the blocks is described."""
+"""Declarations of `packed.pyx`: sweeps over blocks that are packed in pairs."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t

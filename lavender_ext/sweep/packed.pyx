@@ -80,7 +80,7 @@ cdef int64_t packed_workspace_size(int64_t joints, int64_t joint_rows, int64_t c
 
 
 cdef int64_t packed_workspace_size_of_blocks(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the number of doubles of workspace for these blocks."""
+    """Return the number of doubles of workspace of `pack_blocks_in_order` for the blocks p between the bodies r."""
     cdef int32_t joint_rows = p.ptr[r.n_joints]
     return packed_workspace_size(r.n_joints, joint_rows, r.n_contacts, p.n_rows - joint_rows, r.n_bodies)
 
@@ -178,9 +178,10 @@ cdef inline bint have_common_moving_body(const int32_t* x, const int32_t* y) noe
 
 cdef inline int32_t find_block_for_same_record(const rows_t* r, const int32_t* order, const plan_t* x, const int32_t* unpaired,
                                  int32_t n_unpaired, int32_t begin, int32_t end) noexcept nogil:
-    """Return a block of the next slot, by_slot[begin:end], that may be paired with unpaired[0], or -1.
+    """Return a block of the next slot, by_slot[begin:end], that may be paired with the block unpaired[0], or -1.
 
-    It has the same kind, and shares no body with any block of unpaired (n_unpaired), which come before it in the order.
+    The returned block has the kind of unpaired[0], and no body of any block in unpaired (n_unpaired). All of these come before
+    it in the order.
     """
     cdef int32_t i, k, candidate
     for i in range(begin, end):

@@ -1,4 +1,4 @@
-"""One sweep of projected Gauss-Seidel over the blocks order (k), in each form of A; compiled once, in `pgs.pyx`."""
+"""Declarations of `pgs.pyx`: one sweep of projected Gauss-Seidel over the blocks order (k), in each form of A."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t

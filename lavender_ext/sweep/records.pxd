@@ -205,7 +205,10 @@ cdef inline void bind_contact_record(const pair_t* record, int32_t kind, contact
 
 cdef inline void relax_contact_record(const contact_kind_t* contacts, const int64_t* read_offset, const int64_t* write_offset,
                                 pair_t* lam, double* v) noexcept nogil:
-    """Update two contacts; offsets are those of both bodies of both, v: velocities of all bodies."""
+    """Update two contacts; lam (n) are their impulses in pairs, v the velocities of all bodies.
+
+    The offsets locate the velocities of both bodies of each contact in v.
+    """
     cdef pair_t va[6]
     cdef pair_t vb[6]
     load_six(byte_offset(v, read_offset[0]), byte_offset(v, read_offset[LANES - 1]), va)

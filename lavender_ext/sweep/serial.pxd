@@ -1,6 +1,6 @@
-"""Runs of sweeps, accelerated or not, as workspace size, start and step on plain structs, for any host.
+"""Runs of sweeps, accelerated or not, as workspace size, start and step on plain structs, usable without Python.
 
-    sweep_run_t x                         the host sets order, split, mode, rng, exact, method, omega and packing.single
+    sweep_run_t x                         the caller sets order, split, mode, rng, exact, method, omega and packing.single
     sweeps_workspace_size(&x, &v, start)  number of doubles of workspace of a run over v
     start_sweeps(&x, &v, start, workspace)
     run_sweeps(&x, &test, &v, ...)        sweeps up to a number, or until the stopping test ends them

@@ -1,7 +1,7 @@
 """Sweeps of Gauss-Seidel and Jacobi type over the rows of A, over bodies, or over J and M.
 
     pgs                   block after block, each with w = A lam - b of the current lam                (1)
-    sequential impulses   the same over v = M^-1 J^T lam: w = J v + c lam - b, A is never formed       (2)
+    sequential impulses   (1) with w = J v + c lam - b, v = M^-1 J^T lam; A is never formed            (2)
     block gauss seidel    (1) or (2) with each block solved exactly (local/gauss_seidel.pyx)
     jacobi                all blocks with the w of before the sweep, and steps multiplied by omega     (3)
     sor                   lam_i <- lam_i - omega w_i / d_i on free rows                                (4)
@@ -142,7 +142,7 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
 
 
 cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
-    """Run one sweep over blocks p, which are those of `c` or differ in their law; `first`: no sweep was before."""
+    """Run one sweep over the blocks p, which are the blocks of `c`, possibly with another law; first: no sweep was made before."""
     cdef int32_t i
     # Compute all slacks before the sweep (3).
     if c.method == JACOBI:
@@ -183,7 +183,7 @@ cdef void run_sweep_chunk(void* context, double* lam, int32_t first_sweep, int32
 
 
 def jacobi_damping_of_matrix(Data p):
-    """Return the omega of Jacobi over the rows of A."""
+    """Return the relaxation factor omega [-] of Jacobi's method over the rows of A, from `compute_jacobi_damping`."""
     cdef double[::1] scratch = np.empty(p.blocks.n_rows + 1)
     return compute_jacobi_damping(&p.blocks, &p.csr, &scratch[0])
 
@@ -199,7 +199,7 @@ cdef class Sweeps:
     split, mode, rng
         As in `lavender.ordering.Order`.
     method, omega
-        SWEEPS, or SOR or JACOBI with their relaxation factor.
+        SWEEPS, SOR or JACOBI, and the relaxation factor [-] of SOR and JACOBI.
     exact : bool
         Solve blocks exactly.
     before : Sweeps, optional

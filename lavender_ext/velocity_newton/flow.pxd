@@ -40,7 +40,7 @@ cdef struct descent_t:          # state of the Newton steps under one law
 
 cdef struct paused_t:           # an island with an ended step budget; the next call continues it
     int32_t island              # -1: no island is paused
-    int32_t worst               # worst outcome of the islands before the paused one
+    int32_t worst               # worst outcome of the islands that were solved before the paused island
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)
     int32_t stage               # CONVEX_STAGE, COULOMB_STAGE or NEXT_ROUND, under Coulomb's law
     int32_t rounds              # completed rounds of Coulomb friction

@@ -333,7 +333,7 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
 
 
 cdef inline void solve_step(flow_t* f, int32_t island, bint square) noexcept nogil:
-    """Solve for p of (1), and compute q = Y p."""
+    """Solve the island's system for the step p of (1) in newton.pxd, and compute q = Y p."""
     cdef int32_t a, c0 = f.cptr[island], size = f.cptr[island + 1] - c0
     if f.is_over_rows:
         solve_row_step(f)

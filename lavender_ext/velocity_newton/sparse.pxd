@@ -33,7 +33,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
                                  const int32_t* cptr, const int32_t* local, int32_t per, int32_t* w) noexcept nogil:
     """Write the rows of L of all islands, columns numbered within the island; return the entries, or -1 if w is too small.
 
-    w (`pattern_index_size`) receives the row pointers (n + 1) and the columns; the rest is scratch.
+    w (`pattern_index_size`) receives the row pointers (n + 1) and the columns; its other entries are scratch.
     """
     cdef int32_t n = cptr[n_islands], workspace = per * g.n, i, a, b, q, k, base, first, end, most, count
     cdef int32_t* lptr = w
