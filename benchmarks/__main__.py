@@ -15,6 +15,7 @@ NAMES = (
     "derivatives",
     "engine_claims",
     "kernels",
+    "limit_overhead",
     "limits",
     "page",
     "peers",

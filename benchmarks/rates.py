@@ -27,14 +27,15 @@ from benchmarks.core_problems import forms, fresh, stacks
 from benchmarks.limits import CASES, least, problem_of
 from benchmarks.output import markdown
 from lavender import suite
+from lavender.base import rates
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.judge import residuals
+from lavender.judge import certificates, residuals
 from lavender.problem import Problem
 from lavender.solvers import costs
 from lavender.solvers._accelerated import estimate_sweep_work
 from lavender.solvers.registry import get
 
-RATES_PATH = Path(costs.__file__).with_name("rates.json")
+RATES_PATH = Path(rates.RATES_PATH)
 SETUP_MARGIN = 1.5
 STORED_WEIGHT = 0.5  # Weight of a stored rate, compared with 1 for each measured time.
 SETUP_CASES = (*CASES[1:-1], "granularF(n=5) as matrix", "granularF(n=5) as J and M", "matrix 1200")
@@ -171,6 +172,23 @@ def sweep_lines() -> Iterator[Line]:
             yield label, {"sweep row": p.m, rate: estimate_sweep_work(p)}, time
 
 
+def measure_kernels() -> Fit:
+    """Return the times [ns] of a multiply-add of Newton's method with sparse factors and of dense least squares."""
+    chain = forms(suite.chain(n=200).problem)["J and M"]
+    state = get("newton").load()(form="velocity").prepare(fresh(chain))
+
+    def run(p: Problem) -> lv.Solution:
+        return lv.prepare(p, "newton", form="velocity").solve(tol=1e-9)
+
+    steps = run(fresh(chain)).work["factorisations"]
+    sparse = least(lambda: fresh(chain), run) / (steps * state.general.work)
+    rng = np.random.default_rng(0)
+    matrix, rhs = rng.normal(size=(150, 250)), rng.normal(size=150)
+    dense = least(lambda: chain, lambda _: certificates.solve_least_squares(matrix, rhs)) / (150**2 * 250)
+    times = {"sparse velocities": 1e9 * sparse, "least squares": 1e9 * dense}
+    return {name: SETUP_MARGIN * time for name, time in times.items()}  # Both decide under a time limit.
+
+
 def with_ellipses(problem: Problem) -> Problem:
     """Return the problem with an ellipse for each contact of two tangents, mu_2 = mu_1 / 2."""
     c = problem.cones
@@ -237,7 +255,7 @@ def measure_rates() -> dict[str, Any]:
     setup = {name: SETUP_MARGIN * x for name, x in fit_rates(SETUP_RATES, list(setup_lines())).items()}
     sweep.pop("sweep entry", None)
     work = {form: newton.pop(form) for form in costs.RATES["work"] if form in newton}
-    measured: dict[str, Any] = {**costs.RATES, **newton, **pivot, **sweep, **setup}
+    measured: dict[str, Any] = {**costs.RATES, **newton, **pivot, **sweep, **setup, **measure_kernels()}
     return measured | {"work": costs.RATES["work"] | work}
 
 

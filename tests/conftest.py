@@ -126,7 +126,7 @@ def clock(monkeypatch):
 
     made = Clock()
     monkeypatch.setattr(deadline, "perf_counter", made)
-    for name in ("solve", "compiled_call"):
+    for name in ("solve", "prepared", "compiled_call"):
         monkeypatch.setattr(sys.modules[f"lavender.solving.{name}"], "perf_counter", made)
     return made
 

@@ -41,6 +41,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, TooLate
+from lavender.base.rates import RATES
 from lavender.judge.residuals import divide_by_reference, get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender_ext.factor.linear import LinearSystem
@@ -66,8 +67,6 @@ MIN_NAMED_SHARE = 1e-6  # A message names only rows above this fraction of the l
 MAX_NAMED_BLOCKS = 6  # Number of blocks of each kind that a message names.
 # Certificates with more rows are not polished: the dense least squares would be too large.
 MAX_POLISHED_ROWS = 1000
-# [s] Measured time of the dense least squares, per product of rows, columns and the smaller of these two numbers.
-LEAST_SQUARES_TIME = 6e-10
 # [-] Shift s of the normal equations, relative to their trace. It is above the rounding of their factor.
 LEAST_SQUARES_SHIFT = 1e-14
 # Number of proximal iterations. Each divides the error of a component by 1 + (singular value)^2 / shift.
@@ -406,17 +405,18 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
         columns = np.flatnonzero((z != 0.0) & (np.abs(z) <= max_z))
         if np.any(np.abs(z[required]) > max_z) or len(columns) * len(rows) > MAX_POLISHED_ROWS**2:
             return
-        seconds = LEAST_SQUARES_TIME * len(columns) * len(rows) * min(len(columns), len(rows))
+        work = len(columns) * len(rows) * min(len(columns), len(rows))
+        seconds = 1e-9 * RATES["least squares"] * work
         if deadline.has_passed(seconds):
             raise TooLate(seconds)
         system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
-        y[rows] -= _solve_least_squares(system, z[columns]) / length[rows]
+        y[rows] -= solve_least_squares(system, z[columns]) / length[rows]
     spacing = 2.0**-25 * _round_down_to_power_of_two(y)
     yield np.rint(y / spacing) * spacing
     yield y
 
 
-def _solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
+def solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     """Return the shortest x (n,) that minimises |S x - z|, for S (k, n) and z (k,).
 
     Components with relative singular values below about 1e-7 are left out. The method is the proximal iteration

@@ -339,6 +339,10 @@ class Solution:
         attributes["_rest"] = rest
         return solution
 
+    def with_fields(self, **values: Any) -> Solution:
+        """Return a copy with other values of these fields. Postponed fields of the copy stay postponed."""
+        return Solution.from_fields(self.__dict__ | values)
+
     if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
@@ -347,8 +351,8 @@ class Solution:
             rest = attributes.get("_rest")
             if rest is not None:
                 function, arguments = rest
-                # Two threads may compute these fields at once; they get equal values.
-                attributes.update(function(*arguments))
+                # Two threads may compute these fields at once; they get equal values. `with_fields` may have set some.
+                attributes.update(function(*arguments) | attributes)
                 attributes.pop("_rest", None)
             if name in attributes:
                 return attributes[name]

@@ -9,6 +9,7 @@ not reach tol in this way for a positive definite P, the backend for a singular 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 from time import perf_counter
 from types import MappingProxyType
@@ -106,25 +107,27 @@ def solve_qp(
         answer = _solve_to_error(problem, solver, tol, end, start, options)
     if qp.is_singular:
         answer = _add_ray_if_unbounded(problem, answer, end)
-    _set_time_and_status(answer, perf_counter() - begun)
-    return answer
+    return _accept_program(answer, perf_counter() - begun)
 
 
-def _set_time_and_status(answer: QPSolution, seconds: float) -> None:
-    """Set the time of the whole call [s], and the status, in the answer's solution.
+def _accept_program(answer: QPSolution, seconds: float) -> QPSolution:
+    """Return the answer with the time of the whole call, as CONVERGED if the program's error is within `tol`.
 
     The status is CONVERGED if the program's error is within `tol`, whatever the residual of the constraint problem is.
     """
     solution: Solution = answer.solution
-    values = solution.__dict__
-    values["solve_time"] = seconds - solution.setup_time
-    if solution.status in FINAL_STATUSES or (solution.status is CONVERGED and not solution.is_contradicted):
-        return
-    if answer.ray is None and answer.error <= answer.tol:
+    values: dict[str, Any] = {"solve_time": seconds - solution.setup_time}
+    is_final = solution.status in FINAL_STATUSES or (
+        solution.status is CONVERGED and not solution.is_contradicted
+    )
+    if not is_final and answer.ray is None and answer.error <= answer.tol:
         relative = solution.residual.relative
         if solution.certificate is None and relative < math.inf:
             values |= {"status": CONVERGED, "tol": max(solution.tol, relative)}
             values |= {"claim_check": CONFIRMED, "status_conflict": ""}
+    accepted = copy(answer)  # It keeps the errors that have been computed.
+    object.__setattr__(accepted, "solution", solution.with_fields(**values))
+    return accepted
 
 
 def _solve_to_error(

@@ -59,8 +59,6 @@ _START_RHO = 0.1  # [-] First penalty rho, relative to the unit diagonal of B; f
 _ADMM_PATIENCE = 5000
 
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# `prepare` scales the problem if the estimated cost of scaling does not exceed this [ns]; otherwise `run` does.
-MAX_SETUP_SCALING_COST = 5e6
 # Estimated number of entries of J and J^T together per row between two bodies, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
 
@@ -81,15 +79,13 @@ class AdmmState:
         self.watch: Any = None
         self.factor: Any = None
         self.is_scaled = self.is_analysed = False
-        self.next_cost = _estimate_scaling_cost(
-            problem
-        )  # Cost [ns] of the next step: scaling, analysis, or a factor.
-        if self.next_cost <= MAX_SETUP_SCALING_COST:
-            self._scale_problem()
+        self.next_cost = 0.0  # Cost [ns] of the next step: scaling, analysis, or a factor.
 
     def scale_and_factor(self) -> None:
         """Scale, analyse and factor; raise TooLate before a step that is expected to end after the deadline."""
         if not self.is_scaled:
+            if self.deadline.is_set:
+                self.next_cost = _estimate_scaling_cost(self.problem)
             self._check_deadline()
             self._scale_problem()
         if not self.is_analysed:
@@ -224,12 +220,6 @@ def _estimate_scaling_cost(problem: Problem) -> float:
     return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + rates["scaling entry"] * entries)
 
 
-def _estimate_setup_cost(problem: Problem) -> float:
-    """Estimate the cost of `ADMM.prepare` [ns]."""
-    scaling = _estimate_scaling_cost(problem)
-    return (scaling if scaling <= MAX_SETUP_SCALING_COST else 0.0) + estimate_import_cost(*SCIPY_MODULES)
-
-
 def _analyse_panels(system: LinearSystem) -> LinearSystem:
     try:
         system.analyse()
@@ -274,11 +264,11 @@ class ADMM(Solver):
     needs_scipy = True
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the cost of `prepare`; the remaining set-up runs in `set_deadline` if it fits, else in `run`."""
-        return Cost(partial(_estimate_setup_cost, problem))
+        """Estimate the cost of `prepare`; all other set-up runs in `set_deadline` if it fits, else in `run`."""
+        return Cost(partial(estimate_import_cost, *SCIPY_MODULES))
 
     def prepare(self, problem: Problem) -> AdmmState:
-        """Build the state, and scale the problem unless scaling costs more than `MAX_SETUP_SCALING_COST`."""
+        """Build the state. The problem is scaled, analysed and factored later, with the clock at hand."""
         import_numerical_modules()
         return AdmmState(problem, self.memory, self.relaxation)
 

@@ -15,12 +15,12 @@
                      `total_ratio` times the cost of the cheapest
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
-Linear problems given by a matrix start with `direct`. A program with a singular P is solved by `PROGRAM_BACKENDS`, one
-after the other. The result is the best impulse of all stages. Costs are estimated, never measured, so the same problem
-is solved in the same way on every machine. Under a time limit, a factorising solver starts only if its estimated
-cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of the time, or all of it if no
-factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain` the stages that
-would run. The decisions depend on these numbers (`decisions.py`):
+Linear problems given by a matrix, and others whose A is a narrow band, start with `direct`. A program with a singular P
+is solved by `PROGRAM_BACKENDS`, one after the other. The result is the best impulse of all stages. Costs are estimated,
+never measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
+starts only if its estimated cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of
+the time, or all of it if no factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain`
+the stages that would run. The decisions depend on these numbers (`decisions.py`):
 
 """
 
@@ -182,10 +182,14 @@ class DecisionTree:
 
     @cached_property
     def can_pivot(self) -> bool:
-        """Whether `direct` is considered: for bounded rows, if A is given or costs less to form than first sweeps."""
-        if self.law != "lcp":
+        """Whether `direct` is considered: for bounded rows, or linear ones of bodies, if A is given or cheap."""
+        if self.law == "linear" and self.problem.rows is not None:
+            max_cost = self.min_newton_cost
+        elif self.law == "lcp":
+            max_cost = DECISIONS.first_sweeps * self.sweep
+        else:
             return False
-        if self.formation > DECISIONS.first_sweeps * self.sweep:
+        if self.formation > max_cost:
             return False
         return not (
             self.deadline.is_set and self.deadline.has_passed(1e-9 * self.formation / DECISIONS.time_share)
@@ -209,7 +213,14 @@ class DecisionTree:
     @property
     def is_late(self) -> bool:
         """Whether no factorising solver can return a result before the deadline."""
-        return not self.has_time("newton", self.min_newton_cost)
+        return not self.has_time_for_newton()
+
+    def has_time_for_newton(self, before: float = 0.0) -> bool:
+        """Return whether the least cost of Newton's method fits after `before` [ns]."""
+        needed = before + 2.0 * get_loose_limit(self.problem)
+        if self.problem.generalized is None and not self.deadline.has_passed(1e-9 * needed):
+            return True  # The least cost of bodies and matrices is below the loose limit.
+        return self.has_time("newton", self.min_newton_cost, before)
 
     def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
@@ -246,7 +257,9 @@ class DecisionTree:
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
         first = DECISIONS.first_sweeps * self.sweep
-        if self.factorises_first and self.can_pivot and self.direct < first:
+        max_cost = self.min_newton_cost if self.law == "linear" else first
+        pivots_first = self.factorises_first and self.can_pivot and self.direct < max_cost
+        if pivots_first:
             cost = ratio * self.direct
             yield Stage(
                 "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
@@ -263,7 +276,9 @@ class DecisionTree:
             state = self.states.get("newton")
             cost = self.newton if state is None else state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        yield from self.iterate_factorising_stages(ratio)
+        for stage in self.iterate_factorising_stages(ratio):
+            if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
+                yield stage
         self.analyse_row_form_if_cheaper(ratio * self.newton)
         if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
             yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
@@ -301,6 +316,12 @@ class DecisionTree:
         """Return the stage of a factorising solver with the budget `cost` [ns]."""
         steps = self.states[name].steps if name in self.states else DECISIONS.pivot_factorisations
         return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
+
+    def get_stage_cost(self, stage: Stage) -> float:
+        """Return the estimated cost [ns] of a factorising solver that a stage starts, without any new analysis."""
+        if stage.solver == "direct":
+            return self.direct if self.can_pivot else stage.cost
+        return self.states[stage.solver].cost
 
     def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
         """Return a stage of sweeps with the budget `cost` [ns].
@@ -517,7 +538,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                     return
             elif step.name == "direct" or isinstance(step, Newton):
                 step.over = step.late = not tree.has_time(
-                    METHODS[stage.solver][0], tree.solver_costs.get(stage.solver, stage.cost)
+                    METHODS[stage.solver][0], tree.get_stage_cost(stage)
                 )
             elif step.state is None:
                 setup = estimate_cost(stage.solver, log.problem).setup
@@ -540,7 +561,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
 def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
     """Return whether work of this cost [ns] leaves time for a factorising solver, or whether all of them have ended."""
     if "states" not in vars(tree):
-        return tree.has_time("newton", tree.min_newton_cost, cost)
+        return tree.has_time_for_newton(cost)
     unfinished = [name for name in tree.states if name not in steps or not steps[name].over]
     if tree.states and not unfinished and not any(steps[name].late for name in tree.states):
         return True

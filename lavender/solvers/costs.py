@@ -1,4 +1,4 @@
-"""Estimate costs [ns]: operations, counted from the data, times the rates of `rates.json`. No clock is read.
+"""Estimate costs [ns]: operations, counted from the data, times the rates of `lavender.base.rates`. No clock is read.
 
 `Solver.cost(problem)` returns a `Cost`; `auto`, deadlines and `explain` read it. There are two kinds of costs.
 
@@ -22,14 +22,12 @@ problem has the same cost on all machines with the same file.
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, nan
-from typing import Any
 
+from lavender.base.rates import RATES
 from lavender.problem import Problem
 from lavender.solvers.decisions import DECISIONS
 from lavender_ext.factor.sparse import bandwidth
@@ -66,10 +64,6 @@ __all__ = [
     "get_sweep_rate_name",
     "is_formed",
 ]
-
-# Use os.path, because importing pathlib would take 4 % of the time of `import lavender`.
-with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
-    RATES: dict[str, Any] = json.load(_file)
 
 SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factorisations need.
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
@@ -174,7 +168,7 @@ def estimate_direct_cost(problem: Problem) -> float:
     work = (
         m * (1.0 + max(problem.bandwidth)) ** 2 if problem.is_symmetric else 2.0 * count_dense_work(problem.m)
     )
-    return DECISIONS.pivot_factorisations * (RATES["pivot row"] * m + RATES["pivot work"] * work)
+    return estimate_factorisation_count(problem) * (RATES["pivot row"] * m + RATES["pivot work"] * work)
 
 
 def estimate_sweep_cost(problem: Problem, work: float) -> float:

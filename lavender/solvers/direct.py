@@ -106,11 +106,8 @@ class Direct(Solver):
 
     def cost(self, problem: Problem, state: Any = None) -> Cost:
         """Estimate the cost of `prepare`, which includes the factor of a linear problem, and of exchanges."""
-        if problem.law == "linear":
-            return Cost(partial(_estimate_linear_cost, problem))
-        return Cost(
-            partial(estimate_matrix_setup_cost, problem), total=partial(estimate_direct_cost, problem)
-        )
+        setup = _estimate_linear_cost if problem.law == "linear" else estimate_matrix_setup_cost
+        return Cost(partial(setup, problem), total=partial(estimate_direct_cost, problem))
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"

@@ -33,8 +33,6 @@ from lavender.problem.cones import project_impulse
 from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
 
-ROWS_RATIO = 3.0  # Cost estimates assume this number of rows of (1) or (2) per row of the problem.
-
 
 @dataclass(frozen=True)
 class BoundedRowForm:
@@ -175,7 +173,10 @@ class BoundedRowSolver(Solver):
         own = self.solver.cost(problem)
         if problem.law in ("linear", "lcp"):
             return own
-        return Cost(lambda: ROWS_RATIO * own.setup + RATES["rows of contact"] * problem.m)
+        ratio = bound_converted_row_count(problem) / max(
+            problem.m, 1
+        )  # Rows of (1) or (2) per row of the problem.
+        return Cost(lambda: ratio * own.setup + RATES["rows of contact"] * problem.m)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""

@@ -14,7 +14,7 @@ from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import build_state_in_given_form
-from lavender.solvers.costs import Cost, estimate_formation_cost
+from lavender.solvers.costs import Cost, estimate_formation_cost, get_loose_limit
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
@@ -202,8 +202,8 @@ class Sweeps(Iterations):
 
     def prepare_and_set_start(self) -> None:
         """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
-        p = self.log.problem
-        too_late = self.log.deadline.is_set and self.log.deadline.has_passed(
+        p, deadline = self.log.problem, self.log.deadline
+        too_late = deadline.has_passed(1e-9 * get_loose_limit(p)) and deadline.has_passed(
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
         self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)

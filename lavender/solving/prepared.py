@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from threading import Lock
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
@@ -205,13 +206,33 @@ class Prepared:
         for name in unknown:
             successor = suggest_argument_name(name, SOLVE_ARGUMENTS)
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS, successor)
-        deadline = make_deadline(self.spec, check_time_limit(time_limit))
-        if velocity_tol is None:
-            return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
-        check_problem(self._original if problem is None else problem)
-        tol = relative_tolerance(self._original if problem is None else problem, velocity_tol)
-        solution = self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
-        return accept_velocity(solution, velocity_tol)
+        begun = 0.0 if time_limit is None else perf_counter()
+        limit = math.inf if time_limit is None else check_time_limit(time_limit)
+        original = self._original if problem is None else problem
+        if velocity_tol is not None:
+            check_problem(original)
+            tol = relative_tolerance(original, velocity_tol)
+        if not self._lock.acquire(False):
+            raise InUse(
+                f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
+                "make one for each thread (lavender.prepare)"
+            )
+        try:
+            solution: Solution | None = None
+            failed_call: tuple[int, ...] | None = None
+            is_default = max_iter is None and callback is None and history is False
+            if is_default and self.spec.delegates and not self.options:
+                solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
+            if solution is not None:
+                self._replace_problem(problem)
+            else:
+                deadline = make_deadline(self.spec, limit, begun)
+                solution = self._solve(
+                    problem, impulse, tol, max_iter, deadline, history, callback, failed_call
+                )
+        finally:
+            self._lock.release()
+        return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
     def _solve(
         self,
@@ -220,34 +241,23 @@ class Prepared:
         tol: float,
         max_iter: int | None,
         deadline: Deadline,
-        history: bool,
-        callback: Callback | None,
+        history: bool = False,
+        callback: Callback | None = None,
         failed_call: tuple[int, ...] | None = None,
     ) -> Solution:
-        """Solve as `solve`; `failed_call` holds the counts if the compiled call has been made for this solve."""
-        if not self._lock.acquire(False):
-            raise InUse(
-                f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
-                "make one for each thread (lavender.prepare)"
-            )
+        """Solve as `solve`, without the compiled call; `failed_call` holds its counts if it has been made."""
         try:
             original = self._original if problem is None else problem
-            is_default = max_iter is None and callback is None and history is False
-            if failed_call is None and is_default and self.spec.delegates and not self.options:
-                limit = deadline.get_remaining_seconds(MIN_TIME_LIMIT) or math.inf
-                solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
-                if solution is not None:
-                    self._replace_problem(problem)
-                    return solution
             tol, max_iter = check_budget(self.spec, tol, max_iter)
             check_records(self.spec, history, callback)
             check_problem(original)
-            if is_too_late(original, self.spec, deadline):
+            tight = is_tight(original, deadline)
+            if tight and is_too_late(original, self.spec, deadline):
                 self._replace_problem(problem, deadline)
                 return create_unjudged(original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE)
             disk = original.disk
             start = None if impulse is None else original.on_disk(disk.impulse_array(impulse))
-            if is_tight(original, deadline):
+            if tight:
                 # The judge makes one pass for the result, and one for a start that is not zero.
                 passes = 2 if start is not None or disk.guess is not None else 1
                 judge_time = 1e-9 * passes * estimate_result_cost(disk)
@@ -272,7 +282,6 @@ class Prepared:
         finally:
             if self._is_late:
                 self.solver, self._is_late = None, False  # Makes the next call try again.
-            self._lock.release()
 
     def _loop(
         self,
@@ -289,7 +298,8 @@ class Prepared:
         if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         left = deadline.get_remaining_seconds()
-        if left is not None and not self._is_late and not self._failure:
+        has_workers = self.spec.external or not self.spec.builtin or problem.has_singular_program
+        if left is not None and has_workers and not self._is_late and not self._failure:
             watch = Stopwatch()
             self.solver.start_workers(self.state, left)
             deadline.reserve_seconds(-watch.elapsed_seconds)
@@ -426,7 +436,7 @@ class Prepared:
                 problem
             )  # Compute the judge's reference before a solver gets the problem.
         is_new, self._failure = is_new or bool(self._failure), ""
-        if deadline.is_set:
+        if deadline.is_set and not self.spec.delegates:  # `auto` prepares nothing.
             self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
             if self._is_late and self.solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES):
                 # Import SciPy without counting the time, like the start of processes; otherwise no call with this

@@ -97,20 +97,16 @@ def solve(
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if velocity_tol is not None:
         tol = relative_tolerance(problem, velocity_tol)
-        judged = solve_prepared(
-            problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter, make_deadline(spec, limit, begun),
-            history, callback,
-        )  # fmt: skip
-        return accept_velocity(judged, velocity_tol)
-    failed_call = None
+    solution: Solution | None = None
+    failed_call: tuple[int, ...] | None = None
     if max_iter is None and callback is None and history is False and not options:
         solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
-        if solution is not None:
-            return solution
-    return solve_prepared(
-        problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter, make_deadline(spec, limit, begun),
-        history, callback, failed_call,
-    )  # fmt: skip
+    if solution is None:
+        solution = solve_prepared(
+            problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter,
+            make_deadline(spec, limit, begun), history, callback, failed_call,
+        )  # fmt: skip
+    return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
 
 def solve_prepared(

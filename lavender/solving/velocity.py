@@ -11,7 +11,7 @@ V <= velocity_tol, because (1) limits E, too, which was not requested.
 
 from __future__ import annotations
 
-from dataclasses import fields
+from typing import Any
 
 from lavender.base.arrays import check_float
 from lavender.judge.residuals import residual
@@ -47,8 +47,8 @@ def relative_tolerance(problem: Problem, velocity_tol: float) -> float:
 
 def accept_velocity(solution: Solution, velocity_tol: float) -> Solution:
     """Return the solution with the requested velocity error, as CONVERGED if the judge measures no larger one."""
-    values = {f.name: getattr(solution, f.name) for f in fields(solution)} | {"velocity_tol": velocity_tol}
+    values: dict[str, Any] = {"velocity_tol": velocity_tol}
     if solution.status in UNFINISHED and solution.residual.velocity <= velocity_tol:
         values["status"] = Status.CONVERGED
         values["message"] = f"the velocity error of every row is at most {velocity_tol:g} m/s"
-    return Solution.from_fields(values)
+    return solution.with_fields(**values)

@@ -4,7 +4,8 @@
 
 m: rows, m_c of which belong to contacts with friction and m_1 do not; Y: entries of J L^-1; w: multiply-adds to
 factorise N of every island; count: number of factorisations. Python
-calls this estimate, too (`estimate_velocity_newton_cost` of `lavender/solvers/small.py`); the rates are in `rates.json` there.
+calls this estimate, too (`estimate_velocity_newton_cost` of `lavender/solvers/small.py`); the rates are
+in `lavender/base/rates.json`.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t

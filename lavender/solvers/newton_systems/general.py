@@ -19,15 +19,14 @@ from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
 FORM = "generalized velocities"
-# Between two checks of the clock and Ctrl-C, an island does at most MAX_STEPS_PER_CHECK steps, and at most as many as
-# are estimated to take CHECK_INTERVAL [s]. The estimate is FLOP_TIME per multiply-add, times SPARSE_TIME_RATIO for
-# sparse factors. With a time limit, the steps between two checks may use the fraction CALL_TIME_FRACTION of the
-# remaining time, estimated by the slower of FLOP_TIME and the measured speed, because the first steps may be cheap.
+# Between two checks of the clock and Ctrl-C, an island does at most this many steps, and at most as many as are
+# estimated for CHECK_INTERVAL [s] with SPARSE_FLOP_TIME. With a time limit, the steps use at most CALL_TIME_FRACTION of
+# the remaining time, at the measured speed or at FLOP_TIME, whichever is slower, because the first steps may be cheap.
 MAX_STEPS_PER_CHECK = 64
 CHECK_INTERVAL = 4.0
 CALL_TIME_FRACTION = 0.5
-SPARSE_TIME_RATIO = 20.0
 FLOP_TIME = 1e-9 * RATES["work"]["velocities"]  # Time [s] per multiply-add of a dense factor.
+SPARSE_FLOP_TIME = 1e-9 * RATES["sparse velocities"]  # Time [s] per multiply-add of a sparse factor.
 # If the judge does not confirm the kernel's result, the kernel runs again with a smaller tolerance, down to this
 # fraction of tol.
 MIN_TOLERANCE_RATIO = 1e-2
@@ -79,7 +78,7 @@ def run_newton_steps(
     now = 0.0
     islands = max(1, kernel.islands)
     step = counted = FLOP_TIME * kernel.work
-    slow = max(SPARSE_TIME_RATIO * step, 1e-9)
+    slow = max(SPARSE_FLOP_TIME * kernel.work, 1e-9)
     steps = clock = max(
         1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow))
     )  # The kernel applies the step limit to each island separately.

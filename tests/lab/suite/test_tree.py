@@ -40,7 +40,7 @@ SWEPT = ["anderson", "anderson"]
 # The first stages of `auto` for a problem of each kind.
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
-    "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
+    "linear, bodies": (lambda: suite.hang(n=24).problem, ["direct", "newton"]),
     "linear, J and M": (lambda: over_velocities(30, 60, cones=lv.Cones.free(30), compliance=0.1), ["newton"]),
     "J and M": (lambda: over_velocities(120, 60, compliance=0.1), [*SWEPT, "newton"]),
     "bounded rows of a narrow band": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
@@ -394,3 +394,22 @@ def test_sweeps_go_on_from_a_stale_guess_that_doing_nothing_is_better_than():
             found = lv.solve(problem, impulse=guess, tol=1e-6, max_iter=20)
         assert np.array_equal(begun[-1], guess) == kept
         assert found.residual.relative <= 1.0
+
+
+def test_direct_gets_its_budget_on_a_narrow_band_once():
+    stages = [stage for stage in lv.explain(suite.stack(n=200).problem).stages if "in turn" not in stage.why]
+    assert [stage.solver for stage in stages] == ["direct", "newton"]
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: suite.stack(n=200).problem, lambda: as_matrix(suite.stack(n=200).problem)]
+)
+def test_a_limit_that_does_not_bind_adds_no_analysis(make, monkeypatch):
+    """Newton's method was analysed before `direct` ran, to look up the cost of `direct`."""
+    newton, prepared = registry.get("newton").load(), []
+    prepare = newton.prepare
+    monkeypatch.setattr(newton, "prepare", lambda self, problem: prepared.append(1) or prepare(self, problem))
+    solution = lv.solve(make(), time_limit=10.0)
+    assert solution.success and [stage.solver for stage in solution.stages] == ["direct"]
+    assert not prepared
+    assert solution.impulse.tobytes() == lv.solve(make()).impulse.tobytes()
