@@ -271,7 +271,7 @@ def test_what_a_stepper_cannot_do_is_refused_before_the_first_step(name):
     spec = STEPPERS[name]
     for can, more, word in (
         (spec.spin, {"patch_radius": 0.1}, "spin"),
-        (spec.rolling, {"rolling_radius": 0.02}, "no rolling friction"),
+        (spec.rolling, {"rolling_radius": 0.02}, "rolling friction"),
         (name not in ("xpbd", "avbd"), {"friction_shape": "box"}, "by a disk"),
         (spec.restitution, {"restitution": 0.5}, "restitution"),
         (spec.solvers, {"solver": "newton"}, "newton"),
