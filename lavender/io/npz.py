@@ -510,8 +510,8 @@ def build_checked_csr(
             )
     if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
         raise InputError(
-            f"the pointers of a compressed matrix are not {m + 1} numbers that start with 0 and do not "
-            f"decrease; one pointer for each of its {m} rows and one for the end are needed"
+            f"the pointers of a compressed matrix are {indptr.tolist()!s:.60}; {m + 1} numbers that start with 0 and "
+            f"do not decrease are needed: the first entry of each of its {m} rows, and the number of entries"
         )
     used = int(indptr[-1])
     if used > len(indices) or used > len(data):

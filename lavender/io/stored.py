@@ -131,7 +131,7 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
 
     path = check_writable(path, folder)
     target = (
-        _resolve_links(path) if folder else resolve_destination(path)
+        _resolve_symlinks(path) if folder else resolve_destination(path)
     )  # All names of an output share one lock.
     is_new = folder and not target.exists()
     if folder:
@@ -164,7 +164,7 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
                 target.rmdir()
 
 
-def _resolve_links(path: Path) -> Path:
+def _resolve_symlinks(path: Path) -> Path:
     """Return the path without symbolic links; raise InputError if it cannot be resolved."""
     try:
         return Path(os.path.realpath(path))
@@ -182,7 +182,7 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
         The path is a folder, a pipe, a socket or a device, which are never replaced, or its links form a cycle.
     """
     path = as_path(path)
-    target = _resolve_links(path)
+    target = _resolve_symlinks(path)
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -208,7 +208,7 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
         The file or folder cannot be written.
     """
     path = as_path(path)
-    parent = _resolve_links(path) if folder else resolve_destination(path).parent
+    parent = _resolve_symlinks(path) if folder else resolve_destination(path).parent
     try:
         while folder and parent != parent.parent and not parent.exists():
             parent = parent.parent

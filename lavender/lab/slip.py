@@ -219,7 +219,9 @@ def explain_slip(
     ]
     variants = [SlipVariant("engine", slip(problem.velocity(answer)), residual(problem, answer).relative)]
 
-    def add(name: str, changed: Problem, start: FloatArray | None, note: str = "") -> FloatArray:
+    def solve_and_add_variant(
+        name: str, changed: Problem, start: FloatArray | None, note: str = ""
+    ) -> FloatArray:
         if note:
             last = variants[-1]
             variants.append(replace(last, name=name, note=note, speed_range=None))
@@ -232,22 +234,22 @@ def explain_slip(
         variants.append(SlipVariant(name, velocity, solution.residual.relative, failed))
         return solution.impulse
 
-    start = add("solved", problem, answer)
+    start = solve_and_add_variant("solved", problem, answer)
     own_disk = measured if disk is not None else _as_disk(problem)
     is_same_shape = own_disk is problem
-    start = add(
+    start = solve_and_add_variant(
         "disk",
         own_disk,
         start if own_disk.m == problem.m else None,
         "cones are round" if is_same_shape else "",
     )
     hard, has_soft_friction = _replace_soft_friction(own_disk)
-    start = add("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
+    start = solve_and_add_variant("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
         UNDEFINED_LAW if hard.cones.has_round else ""
     )  # fmt: skip
     rigid = hard if law_note else hard.relaxed("coulomb")
-    start = add("coulomb", rigid, start, law_note)
+    start = solve_and_add_variant("coulomb", rigid, start, law_note)
     variants[-1] = replace(variants[-1], speed_range=_find_speed_ranges_over_solutions(rigid, slip))
     names = tuple(measured.block_name(k) for k in blocks)
     return SlipExplanation(names, tuple(variants))

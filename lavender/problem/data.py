@@ -203,7 +203,8 @@ class ProblemData:
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
             raise InputError(
                 f"cones.ptr begins with {self.cones.ptr[: kj + 1].tolist()!s:.60} and rows.joint_ptr is "
-                f"{rows.joint_ptr.tolist()!s:.60}; the blocks of joints must have the rows of the joints"
+                f"{rows.joint_ptr.tolist()!s:.60}; cones.ptr must begin with rows.joint_ptr: one block for each "
+                "joint, with the same number of rows"
             )
 
     def _check_generalized(self, generalized: Generalized, m: int) -> None:

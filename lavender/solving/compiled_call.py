@@ -34,15 +34,17 @@ def solve_small(
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
     """Solve and judge a small problem by one compiled call.
 
-    With at most SMALL_ROWS rows, a call that reaches the time limit [s], by its estimated cost, returns the better of
-    its iterate and the start. The fields of claim, counts and residual are computed when they are first accessed.
+    A call ends when its estimated cost reaches the time limit [s]. It then returns the better of its iterate and the
+    start if the problem has at most SMALL_ROWS rows, and otherwise None, because time may remain for other solvers. The
+    fields of claim, counts and residual are computed when they are first accessed.
 
     Returns
     -------
     Solution or None
         None if `Prepared` has to solve the problem.
     tuple of int or None
-        Counts of a call that has failed; None if no call was made.
+        Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
+        made; empty if the time limit leaves no time for a call.
     """
     small = spec.small
     if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):

@@ -232,7 +232,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     j.solved = j.relative <= tol
 
 
-cdef inline bint compute_derived_numbers_of_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint derive_row_numbers_from_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute A in compressed rows, d, nu and step in `workspace`; return False without memory."""
     cdef int64_t m = j.p.n_rows, entries = m * m + THIN_PADDING if j.dense != NULL else 0
     cdef double* x
@@ -248,7 +248,7 @@ cdef inline bint compute_derived_numbers_of_matrix(task_t* j, workspace_t* works
     return True
 
 
-cdef inline bint compute_derived_numbers_of_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
+cdef inline bint derive_row_numbers_from_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
@@ -309,9 +309,9 @@ cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
         if j.factored:
-            j.has_derived = compute_derived_numbers_of_bodies(j, &workspaces.made)
+            j.has_derived = derive_row_numbers_from_bodies(j, &workspaces.made)
         else:
-            j.has_derived = compute_derived_numbers_of_matrix(j, &workspaces.made)
+            j.has_derived = derive_row_numbers_from_matrix(j, &workspaces.made)
     if not j.has_derived or j.made.n_empty:
         return False
     s.v = make_judge_view(j)

@@ -9,7 +9,7 @@ cdef class Workspace:
     cdef void* at               # memory, freed with the object
 
 
-cdef Workspace allocate_workspace(Py_ssize_t bytes)
+cdef Workspace allocate_bytes(Py_ssize_t bytes)
 
 
 cdef enum:                      # results of `compute_derived_numbers_of_jacobian`

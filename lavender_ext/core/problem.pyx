@@ -283,7 +283,7 @@ cdef class Workspace:
         free(self.at)
 
 
-cdef Workspace allocate_workspace(Py_ssize_t bytes):
+cdef Workspace allocate_bytes(Py_ssize_t bytes):
     """Allocate uninitialised memory; raise MemoryError if that fails."""
     cdef Workspace workspace = Workspace.__new__(Workspace)
     workspace.at = malloc(bytes if bytes > 0 else 1)
@@ -309,7 +309,7 @@ cdef class Data:
         cdef double* d = &numbers[0]
         cdef double* nu = d + m + 1
         cdef double* step = nu + m + 1
-        cdef Workspace marks = allocate_workspace((<Py_ssize_t>m + 1) * sizeof(int32_t))
+        cdef Workspace marks = allocate_bytes((<Py_ssize_t>m + 1) * sizeof(int32_t))
         cdef int32_t* empty = <int32_t*>marks.at
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
@@ -541,8 +541,8 @@ cdef class Data:
             if self.reference_energy >= 0.0:
                 return
             if islands != NULL:
-                numbers = allocate_workspace(2 * islands.n * sizeof(double))
-                marks = allocate_workspace((2 * k + islands.n + 1) * sizeof(int32_t))
+                numbers = allocate_bytes(2 * islands.n * sizeof(double))
+                marks = allocate_bytes((2 * k + islands.n + 1) * sizeof(int32_t))
                 memcpy(numbers.at, islands.reference, 2 * islands.n * sizeof(double))
                 at = <int32_t*>marks.at
                 memcpy(at, islands.label, k * sizeof(int32_t))
@@ -566,7 +566,7 @@ cdef class Data:
         cdef view_t v = self.get_pointers()
         cdef islands_t islands
         cdef Py_ssize_t i, k = self.blocks.n_blocks
-        cdef Workspace marks = allocate_workspace(island_workspace_integers(&v) * sizeof(int32_t))
+        cdef Workspace marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
         cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &islands)
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_

@@ -20,7 +20,7 @@ from lavender_ext.core.arrays cimport ndarray as Array
 from lavender_ext.core.validate cimport all_finite, find_invalid_number
 from lavender_ext.core.generalized cimport multiply_jacobian_transpose, whitened_row_dot
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
-from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
+from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.rows cimport multiply_jacobian
 from lavender_ext.core.velocity cimport compute_body_wrenches, apply_body_inverse_mass
 from lavender_ext.core.view cimport generalized_t, view_t
@@ -306,8 +306,8 @@ cdef class Linear:
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, with A of `data` (compressed rows, or J and M); return whether it is regular."""
         cdef view_t v = data.get_pointers()
-        cdef Workspace spare = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
-        self.data, self.factor = data, allocate_workspace(derivative_factor_workspace_size(self.at.rows) * sizeof(double))
+        cdef Workspace spare = allocate_bytes(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
+        self.data, self.factor = data, allocate_bytes(derivative_factor_workspace_size(self.at.rows) * sizeof(double))
         with nogil:
             factor_derivative_system(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
         return self.at.regular
@@ -346,7 +346,7 @@ cdef class Linear:
         cdef view_t v = self.data.get_pointers()
         cdef Workspace work
         if self.at.rows:
-            work = allocate_workspace(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
+            work = allocate_bytes(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
             form_derivative_system(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
@@ -437,7 +437,7 @@ cdef class Linears:
         if each is None:
             flat, first, sizes = impulses
         self.data, self.n = data, n
-        self.table = allocate_workspace(n * sizeof(linearised_t))
+        self.table = allocate_bytes(n * sizeof(linearised_t))
         self.at = <linearised_t*>self.table.at
         memset(self.at, 0, n * sizeof(linearised_t))
         for i in range(n):
@@ -449,7 +449,7 @@ cdef class Linears:
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
             size += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
             scratch = max(scratch, a.v.p.n_rows + count_judge_scratch(&a.v))
-        self.workspace, spare = allocate_workspace(size * sizeof(double)), allocate_workspace(scratch * sizeof(double))
+        self.workspace, spare = allocate_bytes(size * sizeof(double)), allocate_bytes(scratch * sizeof(double))
         to = <double*>self.workspace.at
         for i in range(n):
             a = self.at + i
@@ -473,7 +473,7 @@ cdef class Linears:
             if a.v.g != NULL and a.rows <= max_rows:
                 more += derivative_factor_workspace_size(a.rows)
                 scratch = max(scratch, derivative_factor_scratch_size(a.rows, &a.v))
-        self.factors, spare = allocate_workspace(more * sizeof(double)), allocate_workspace(scratch * sizeof(double))
+        self.factors, spare = allocate_bytes(more * sizeof(double)), allocate_bytes(scratch * sizeof(double))
         to, work = <double*>self.factors.at, <double*>spare.at
         with nogil:
             for i in range(n):

@@ -3,7 +3,7 @@ from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, info_t
-from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
+from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
@@ -73,7 +73,7 @@ cdef class Driver(Method):
         cdef int64_t n_allocated = -1
         while how == NEEDS_WORKSPACE and self.space.n_index > n_allocated:
             n_allocated = self.space.n_index
-            self.index = allocate_workspace(n_allocated * sizeof(int32_t))
+            self.index = allocate_bytes(n_allocated * sizeof(int32_t))
             self.space.index = <int32_t*>self.index.at
             with nogil:
                 how = lav_start(&self.view, &self.options, &self.space, NULL)
@@ -83,7 +83,7 @@ cdef class Driver(Method):
         """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
         self.set_target_and_clear_statistics(tol, budget)
         if self.real is None:
-            self.real = allocate_workspace(self.space.n_real * sizeof(double))
+            self.real = allocate_bytes(self.space.n_real * sizeof(double))
             self.space.real = <double*>self.real.at
         with nogil:
             lav_start(&self.view, &self.options, &self.space, &impulse[0])

@@ -17,7 +17,7 @@ from lavender_ext.core.arrays cimport (
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
-from lavender_ext.core.problem cimport Workspace, allocate_workspace
+from lavender_ext.core.problem cimport Workspace, allocate_bytes
 
 
 cpdef enum:
@@ -275,7 +275,7 @@ def extract_lower_triangle_of_mass(first_, count_, columns, values, x, y, double
         for made_ in like:
             make_read_only(made_)
     at, column = as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz)
-    copy, scratch = new(nnz), allocate_workspace(n * sizeof(double))
+    copy, scratch = new(nnz), allocate_bytes(n * sizeof(double))
     out, made = as_double_pointer(copy, nnz), <double*>scratch.at
     memcpy(out, as_double_pointer(values, nnz), nnz * sizeof(double))
     multiply_mass(n, at, column, out, v, False, made)
@@ -335,7 +335,7 @@ def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
     cdef double[6] big, gap, lost                       # One number per component; lost is 0, or NaN after a NaN.
     if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
-    cdef Workspace scratch = allocate_workspace(6 * bodies * sizeof(double))
+    cdef Workspace scratch = allocate_bytes(6 * bodies * sizeof(double))
     cdef double* made = <double*>scratch.at
     cdef const double* c = as_double_pointer(spatial, 6 * bodies)
     cdef const double* s = as_double_pointer(axis, 6 * n)
@@ -473,7 +473,7 @@ def compute_problem_numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_,
     cdef double* rhs = as_double_pointer(rhs_, m)
     cdef double* compliance = as_double_pointer(compliance_, m)
     cdef double* free = as_double_pointer(free_, n)
-    cdef Workspace scratch = allocate_workspace(3 * n * sizeof(double))
+    cdef Workspace scratch = allocate_bytes(3 * n * sizeof(double))
     cdef double* force_sum = <double*>scratch.at           # J^T f, then |J|^T |f|
     cdef double* change = force_sum + 2 * n                # dt a0
     for j in range(n):

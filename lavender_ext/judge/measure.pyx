@@ -10,7 +10,7 @@ from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
 from lavender_ext.core.islands cimport find_islands, has_no_moving_body, island_workspace_integers, list_one_island
 from lavender_ext.core.block_types cimport blocks_t, islands_t
-from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
+from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
@@ -154,7 +154,7 @@ cdef double estimate_factor_loss_of_pass(Data p, impulse, both) except -1.0:
     cdef Workspace workspace
     if p.blocks.n_rows == 0:
         return 0.0
-    workspace = allocate_workspace(2 * <Py_ssize_t>p.general.n * sizeof(double))
+    workspace = allocate_bytes(2 * <Py_ssize_t>p.general.n * sizeof(double))
     return estimate_factor_loss(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at, p.reference_energy,
                                 p.reference_velocity,
                           0.0)
@@ -196,7 +196,7 @@ cdef class Judged:
         w = &both[0]
         e = w + m
         if m > 0:
-            workspace = allocate_workspace(count_judge_scratch(&v) * sizeof(double))
+            workspace = allocate_bytes(count_judge_scratch(&v) * sizeof(double))
             with nogil:
                 judge_view(&v, &lam[0], w, e, <double*>workspace.at, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
@@ -231,7 +231,7 @@ cdef class Judged:
         if not (self.relative < 1.0 / 0.0 and self.loss > 0.1 * max(tol, self.relative)):
             return self
         lam, first = self.impulse, self.both
-        workspace = allocate_workspace((2 * m + count_judge_scratch(&v)) * sizeof(double))
+        workspace = allocate_bytes((2 * m + count_judge_scratch(&v)) * sizeof(double))
         memcpy(workspace.at, &first[0], m * sizeof(double))
         with nogil:
             refine_generalized_slack(&p.blocks, &p.general, &lam[0], <double*>workspace.at, <double*>workspace.at + m,
@@ -294,8 +294,8 @@ def store_zero_impulse_residual(Data p):
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
-    cdef Workspace workspace = allocate_workspace((2 * m + 2 * k + count_judge_scratch(&v)) * sizeof(double))
-    cdef Workspace marks = allocate_workspace(island_workspace_integers(&v) * sizeof(int32_t))
+    cdef Workspace workspace = allocate_bytes((2 * m + 2 * k + count_judge_scratch(&v)) * sizeof(double))
+    cdef Workspace marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
     cdef double* w = <double*>workspace.at
     start = np.zeros(m)
     x = start
@@ -475,7 +475,7 @@ def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t f
     cdef const int32_t* ptr = as_int_pointer(jac[0], m + 1)
     cdef const int32_t* column = as_int_pointer(jac[1], len(jac[1]))
     cdef const double* value = as_double_pointer(jac[2], len(jac[2]))
-    cdef Workspace workspace = allocate_workspace((n + 2 * m) * sizeof(double))
+    cdef Workspace workspace = allocate_bytes((n + 2 * m) * sizeof(double))
     cdef double* size = <double*>workspace.at
     cdef double* terms = size + n
     cdef double* acts = terms + m                       # (m) 1 for a row that acts, otherwise 0

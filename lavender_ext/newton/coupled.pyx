@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 
-cdef void list_rows_of_graph(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
+cdef void expand_graph_to_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                     int32_t* indptr, int32_t* indices) noexcept nogil:
     """Write the compressed rows of a graph of n elements, columns ascending; if indices is NULL, write indptr only."""
     cdef int32_t i, j, q, r, width, at
@@ -59,12 +59,12 @@ def list_coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32
     cdef int32_t n = <int32_t>ptr.shape[0] - 1
     indptr_array = np.empty(ptr[n] + 1, np.int32)
     cdef int32_t[::1] indptr = indptr_array, indices
-    list_rows_of_graph(n, &ptr[0], &to[0], &other[0], &indptr[0], NULL)
+    expand_graph_to_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], NULL)
     indices_array = np.empty(indptr[ptr[n]], np.int32)
     indices = indices_array
     if indices.shape[0]:
         with nogil:
-            list_rows_of_graph(n, &ptr[0], &to[0], &other[0], &indptr[0], &indices[0])
+            expand_graph_to_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], &indices[0])
     return indptr_array, indices_array
 
 

@@ -107,7 +107,7 @@ cdef inline double far_from_end() noexcept nogil:
     return 1e-2
 
 
-cdef inline double max_start_gain() noexcept nogil:
+cdef inline double max_start_residual_ratio() noexcept nogil:
     """Return the residual, relative to the start, above which an interior point follows the first stretch of damped Newton."""
     return 0.9
 
@@ -121,9 +121,10 @@ cdef inline double start_alpha() noexcept nogil:
 
 
 cdef inline double first_cone_weight() noexcept nogil:
-    """Return the first proximal weight on cones, with a wider scaling than rows; N loses 2^-53 / weight to rounding.
+    """Return the first proximal weight on cones, as a fraction of d; N loses 2^-53 / weight to rounding.
 
-    On a pyramid of redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8 at 4e-10; 1e-6 takes one more step.
+    It is larger than on rows because the scaling matrices of cones have a wider range of eigenvalues. On a pyramid of
+    redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8 at 4e-10; 1e-6 takes one more step.
     """
     return 1e-8
 
@@ -304,7 +305,7 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         state = COULOMB_END
     if state == START_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
-        begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_gain() * n.best)
+        begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
     elif state == FIRST_PATH:

@@ -176,7 +176,8 @@ cdef inline void add_normal_products(const elements_t* e, const double* psi, con
 
 
 cdef inline void form_de_saxce_matrices(system_t* s, const double* psi) noexcept nogil:
-    """Compute (theta + C W)^-1 = V (I + e_n c^T) = L P into `v` and P into `pair`, from V = (W + theta)^-1 = L L^T,
+    """Write (theta + C W)^-1 = V (I + e_n c^T) = L P to the system's `v` and P to its `pair`, with V = (W + theta)^-1 = L L^T;
+    C = I - e_n psi^T, psi (m) is the derivative of phi (head of the file), and theta is the compliance:
 
         c = (psi - t) / (1 + t_n),   t = V theta psi                 (c = psi without compliance)
     """

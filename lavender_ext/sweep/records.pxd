@@ -110,7 +110,7 @@ cdef inline pair_t* interleave_pairs(pair_t* out, int32_t n, const double* x, co
 
 cdef inline void write_contact_record(const blocks_t* p, const rows_t* r, int32_t kind, int32_t i, int32_t j,
                                       pair_t* out) noexcept nogil:
-    """Write the arrays of contacts i and j, in the order of `bind_contact_record`."""
+    """Write the arrays of contacts i and j, in the order of `bind_contact_to_record`."""
     cdef contact_t x, y
     cdef friction_components_t components_x, components_y
     cdef double tangent2_x[3]
@@ -182,7 +182,7 @@ cdef inline void write_block_record(const blocks_t* p, const rows_t* r, int32_t 
         write_contact_record(p, r, kind, i, j, out)
 
 
-cdef inline void bind_contact_record(const pair_t* record, int32_t kind, contact_t* out) noexcept nogil:
+cdef inline void bind_contact_to_record(const pair_t* record, int32_t kind, contact_t* out) noexcept nogil:
     """Point `out` at the arrays of a record of contacts of this kind."""
     cdef int32_t n = count_record_rows(kind)
     cdef const pair_t* x = record + HEADER_SIZE + n
@@ -246,10 +246,10 @@ cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* 
     cdef int32_t i
     # Each branch binds only the arrays that its kind reads.
     if kind == DISK:
-        bind_contact_record(record, DISK, &contacts)
+        bind_contact_to_record(record, DISK, &contacts)
         relax_contact_record(<const disk_t*>&contacts, read_offset, write_offset, lam, v)
     elif kind == NORMAL:
-        bind_contact_record(record, NORMAL, &contacts)
+        bind_contact_to_record(record, NORMAL, &contacts)
         relax_contact_record(<const normal_t*>&contacts, read_offset, write_offset, lam, v)
     elif kind >= JOINT:
         relax_joint_record(record, kind, lam, v, write_offset)
@@ -257,5 +257,5 @@ cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* 
         i = <int32_t>read_offset[READ_OFFSET]
         sweep_bodies(p, r, &i, 1, all_lam, v)
     else:
-        bind_contact_record(record, kind, &contacts)
+        bind_contact_to_record(record, kind, &contacts)
         relax_contact_record(<const other_contact_t*>&contacts, read_offset, write_offset, lam, v)

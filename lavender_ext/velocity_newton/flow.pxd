@@ -85,7 +85,7 @@ cdef struct flow_t:
     double* trial               # (m) impulse at the last point that was evaluated on a line
     double* best                # (m) best impulse of one descent
     double* island_best         # (m) best impulse of one island under the problem's own law
-    double* paused_start        # (m) start of a paused descent: phi; in COULOMB_STAGE the impulse
+    double* paused_start        # (m) value of phi at the start of a paused descent; in COULOMB_STAGE its first impulse
     double* w                   # (m) slack w of the point that was evaluated last
     double* e                   # (m)
     double* v                   # V at s

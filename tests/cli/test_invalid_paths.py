@@ -814,7 +814,9 @@ def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
 
 def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
     write_entries(tmp_path / "records.jsonl", [e for e in entries if e["kind"] != "case"])
-    with pytest.raises(lv.InputError, match="record of a case that no earlier line describes"):
+    with pytest.raises(
+        lv.InputError, match="line 4: the record belongs to a case that no earlier line describes"
+    ):
         bench.read_records(tmp_path)
 
 

@@ -182,7 +182,9 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
         bench.run([problem], [solver], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=repeats), records)
     assert "LAV_NNCG" in vectors.make_export_files(records, None, 1)["chosen.h"]
-    with pytest.raises(lv.InputError, match="reached no tolerance in these records; available: nncg"):
+    with pytest.raises(
+        lv.InputError, match="reached no tolerance in these records; give --solver with one of: nncg"
+    ):
         vectors.make_export_files(records, "direct", 1)
 
 

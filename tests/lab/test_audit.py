@@ -330,8 +330,8 @@ def test_worlds_start_from_keyframes(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ({"qpos": np.zeros((2, 15))}, "qvel missing"),
-        ({"qpos": np.zeros((2, 15)), "qvel": np.zeros((3, 13))}, "equally many entries"),
+        ({"qpos": np.zeros((2, 15))}, "has no qvel"),
+        ({"qpos": np.zeros((2, 15)), "qvel": np.zeros((3, 13))}, "different numbers: 2 of qpos, 3 of qvel"),
         ({"qpos": np.zeros((2, 14)), "qvel": np.zeros((2, 13))}, "qpos"),
         ({"qpos": np.full((1, 15), np.nan), "qvel": np.zeros((1, 13))}, "qpos"),
         ({"qpos": np.zeros((0, 15)), "qvel": np.zeros((0, 13))}, "at least one"),
@@ -353,7 +353,7 @@ def test_start_states_that_are_no_file_are_refused(boxes, tmp_path):
     for source, words in (
         (tmp_path / "torn.npz", "torn.npz"),
         (tmp_path / "no.npz", "no.npz"),
-        ("keyframes", "none"),
+        ("keyframes", "has no keyframes"),
     ):
         with pytest.raises(lv.InputError, match=words):
             audit(boxes(), worlds=1, steps=2, workers=1, states=source)

@@ -98,8 +98,8 @@ MISTAKES = {
     "gap or depth of the wrong sign": lambda s: s.with_targets(-1.0),
     "targets times dt once more": lambda s: s.with_targets(s.dt),
     "targets divided by dt twice": lambda s: s.with_targets(1.0 / s.dt),
-    "v* = v + a, without dt": lambda s: replace(s, v_free=s.before + s.acceleration),
-    "v* = v, without a": lambda s: replace(s, v_free=s.before),
+    "v* = v + a instead of v + dt a": lambda s: replace(s, v_free=s.before + s.acceleration),
+    "v* = v instead of v + dt a": lambda s: replace(s, v_free=s.before),
     "mu in degrees": lambda s: s.with_angles_of_friction(),
 }
 #: Kinds of the mistakes that only the state before the step shows.
@@ -192,7 +192,7 @@ def test_a_conveyor_and_speeds_in_another_unit_are_not_reported(scenes):
     assert kinds(replace(step, target=target).problem) == set()
     target[step.contacts[0, 1]] = 0.7
     assert "tangents first" in kinds(replace(step, target=target).problem)
-    wrong = MISTAKES["v* = v + a, without dt"](step)
+    wrong = MISTAKES["v* = v + a instead of v + dt a"](step)
     for length, expected in ((1.0, {"v_free"}), (1e6, set())):  # m, micrometres
         at_rest = replace(wrong, target=0.0 * wrong.target, v_free=length * wrong.v_free)
         assert kinds(at_rest.problem) == expected

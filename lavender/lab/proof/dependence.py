@@ -59,10 +59,11 @@ def find_dependent_rows(flint: Any, j: Any, target: FloatArray, sure: int = 0) -
     """Return rows of J that are independent of those before them, and dependent rows with contradicting targets.
 
     Rows that are independent modulo a prime are independent. If their number equals the number of columns that they
-    use, the other rows depend on them. Otherwise the rank over the integers decides; the targets are an additional
-    column for rows with consistent targets. The first `sure` rows are independent up to rounding. If a connected
-    component of J has as many of these rows as columns, they are its basis, which the inverse of their equations
-    proves.
+    use, the other rows depend on them. Otherwise the rank of J over the integers decides. To find contradicting
+    targets, the rank is computed again with the targets as an additional column of J: if it grows by one, a target
+    contradicts others. The first `sure` rows are independent up to rounding. If a connected component of J has as many
+    of these rows as columns, they are a basis of its rows; the inverse of their square matrix, which the proof
+    computes, confirms this.
 
     Raises
     ------

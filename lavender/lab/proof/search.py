@@ -202,10 +202,12 @@ class Search:
                 except _Recase:
                     continue
                 if not (exactly and self.exact):
-                    boundary = self._change_wrong_cases(lam, w)
+                    boundary = self._change_wrong_or_list_undecided_cases(lam, w)
                     exactly = bool(boundary) and self.exact
                 if exactly:
-                    boundary = self._change_wrong_cases(*self.solve_equations(Rationals(self.flint)))
+                    boundary = self._change_wrong_or_list_undecided_cases(
+                        *self.solve_equations(Rationals(self.flint))
+                    )
                 if boundary == []:
                     return self.make_enclosure(lam, w)
                 if boundary:
@@ -405,7 +407,7 @@ class Search:
 
     # -- inequalities ---------------------------------------------------------------------------
 
-    def _change_wrong_cases(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
+    def _change_wrong_or_list_undecided_cases(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
         """Change cases that are certainly wrong and return None; otherwise return the blocks that are undecided."""
         changed, boundary = False, []
         cones, number = self.problem.cones, self.number

@@ -255,7 +255,10 @@ def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
     if x.ndim == 1:
         x = np.diag(x)
     if np.abs(x - x.T).max() > 1e-12 * np.abs(x).max():
-        raise InputError(f"inertia of {label} is not symmetric")
+        raise InputError(
+            f"inertia of {label} differs from its transpose by up to {np.abs(x - x.T).max():.3g} kg m^2; a symmetric "
+            "tensor is needed: set both entries (i, j) and (j, i), or give 3 principal moments"
+        )
     x = 0.5 * x + 0.5 * x.T
     value = np.linalg.eigvalsh(x)
     if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:

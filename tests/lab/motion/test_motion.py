@@ -240,7 +240,7 @@ def test_a_reference_beside_a_file_is_judged_before_it_is_used(tmp_path, monkeyp
         lv.motion.load_reference(again, path)
     infeasible = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0])
     monkeypatch.undo()
-    with pytest.raises(lv.InputError, match="no solver reached the floor"):
+    with pytest.raises(lv.InputError, match="no solver reached the round-off floor"):
         lv.motion.save_reference(infeasible, path)
 
 

@@ -114,7 +114,7 @@ def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machi
         assert built.functions == ("lav_good",)
         assert built.size < 1000
     assert (tmp_path / "one.wasm").read_bytes() == (tmp_path / "two.wasm").read_bytes()
-    with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
+    with pytest.raises(wasm.BuildFailed, match="below 10 bytes are allowed"):
         wasm.build(tmp_path / "good.wasm", ROOT, [path], max_bytes=10)
 
 

@@ -138,7 +138,7 @@ class _Alternation:
                 for item, info in part:
                     for call in order:
                         if call.timing_mode != "batch" and any(info is other for _, other in accepted[call]):
-                            self.add_record(records, self.time_case(call, item, info, None)[0])
+                            self.add_record(records, self.time_call_on_case(call, item, info, None)[0])
             for call in order:
                 if call.timing_mode == "batch" and _is_timed_as_batch(accepted[call], is_sequence):
                     self.time_batch(call, accepted[call], records)
@@ -168,7 +168,9 @@ class _Alternation:
         if record is not None and record.key not in self.known:
             records.setdefault(record.key, []).append(record)
 
-    def time_case(self, call: CallSpec, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
+    def time_call_on_case(
+        self, call: CallSpec, item: Item, info: CaseInfo, before: Any
+    ) -> tuple[Record | None, Any]:
         """Time a call on a case, started from the result `before` of the previous step; return (record, result)."""
         task = self.make_task(call, info)
         if task.key in self.known and call.start != "carried":
@@ -185,7 +187,7 @@ class _Alternation:
             return
         before = None
         for item, info in steps:
-            record, before = self.time_case(call, item, info, before)
+            record, before = self.time_call_on_case(call, item, info, before)
             self.add_record(records, record)
 
     def time_batch(self, call: CallSpec, cases: Cases, records: RecordsByKey) -> None:

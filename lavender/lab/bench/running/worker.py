@@ -213,9 +213,10 @@ def parse_outcome(
             f"the status is {values.get('status')!r:.60}; one of {', '.join(Status.__members__)} is needed"
         )
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
+        sizes = ["none" if x is None else str(len(x)) for x in arrays]
         raise ValueError(
-            f"the worker returned {len(arrays)} arrays, or impulses that do not have {m} entries; two "
-            f"arrays are needed, the first one with {m} impulses"
+            f"the worker returned {len(arrays)} arrays with numbers of entries {', '.join(sizes)}; two arrays are "
+            f"needed: {m} impulses, and {m} impulses or none"
         )
     try:
         outcome = Outcome(*arrays, **values)
