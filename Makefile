@@ -29,10 +29,13 @@ lint:  ## run ruff, import-linter and cython-lint
 format:  ## format Python files as CI requires
 	$(BIN)ruff format .
 
-types:  ## run mypy and pyright
+types:  ## run mypy
 	$(BIN)mypy
 	$(BIN)mypy --config-file .ci/mypy_scripts.ini
-	$(BIN)python .ci/pyright
+
+pyright:  ## install pyright, which needs npm's package registry, and run it
+	$(PYTHON) -m pip install -q "pyright[nodejs]>=1.1.400"
+	$(PYTHON) .ci/pyright
 
 coverage:  ## measure the tests' line coverage of the Python files, in build/coverage/index.html
 	test -x $(PYTHON) || python3 -m venv .venv

@@ -124,7 +124,7 @@ cdef struct damped_newton_t:    # state of the proximal iterations
 
 cdef struct stretches_t:        # a damped Newton phase that continues as long as each stretch of it halves the residual
     double residual             # residual at the start of the stretch, which must halve it
-    int32_t is_running          # a stretch is on the stack
+    int32_t is_running          # whether a stretch has begun and not ended
     int32_t length              # factorisations of one stretch
     int32_t stretches
 

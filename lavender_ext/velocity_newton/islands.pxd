@@ -22,10 +22,10 @@ cdef struct requirements_t:     # sizes of the workspace, and the work of a fact
     int32_t panel_columns       # columns of the widest panel
     int32_t panel_values        # rows x columns of the largest panel
     int32_t panel_rows          # rows of the panel with the largest number of rows
-    int32_t rows                # rows of the largest island over rows, plus 3 for padding
+    int32_t rows                # number of rows of the largest island that is solved over rows, plus 3 for padding
     int32_t exceeds_pattern     # L has more entries than the given workspace; repeat with more
     double values               # values of the largest N of an island; its factor has as many
-    double row_matrix_values    # values of A and Y^T of the largest island over rows
+    double row_matrix_values    # values of A and Y^T of the largest island that is solved over rows
     double work                 # multiply-adds of forming N and of its factorisations, all islands
     double unused_entries       # upper bound of the entries of L of islands over rows, which are not factored
 

@@ -218,8 +218,8 @@ def recommend_for_cases(
     """Rank solvers on `cases`: solvers of calls that were timed alternately come first, then the others of `alone`.
 
     `calls` are ranked by `rank_calls_to_tolerance`, as in the first sentence of a report. `alone` is the ranking by
-    runs that were measured one after the other. It is returned unchanged if none of `calls` was timed on these cases,
-    or if the best call solves fewer of them than its best solver.
+    runs that were measured one after the other. `alone` is returned unchanged if none of `calls` was timed on these
+    cases, or if the best call solves fewer of them than the best solver of `alone`.
     """
     parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
     resampled = rank_calls_to_tolerance(records, [f for f in parts if f.runs], alone.target, len(cases))
