@@ -184,6 +184,34 @@ class Operators(ProblemData):
         bound = self._n_couplings if self.rows is not None else self.metric.entries_of_matrix
         return min(float(bound), float(self.m) ** 2)
 
+    def check_matrix_fits(self) -> None:
+        """Raise TooLarge if A in compressed rows may have more entries than 32-bit indices reach."""
+        if self.matrix is not None or "_compressed" in self.__dict__:
+            return
+        if self.generalized is not None:
+            self._check_bound_of_generalized()
+        else:
+            self._check_bound_of_rows(self._n_couplings)
+
+    def _check_bound_of_rows(self, bound: float) -> None:
+        """Raise TooLarge if this bound of the number of entries of A of bodies is too large."""
+        # Pairs of blocks that share both bodies were counted twice.
+        if min(bound, self.m**2) >= MAX_INDEXABLE_ENTRIES:
+            raise TooLarge(
+                f"A would have up to {bound:.0f} entries; at most 2^31 - 1 can be indexed: use a solver "
+                "that reads rows without forming A, for example a sweep solver"
+            )
+
+    def _check_bound_of_generalized(self) -> None:
+        """Raise TooLarge if the bound of the number of entries of A of J and M is too large."""
+        # Add m to the bound, because rows of J without entries have a diagonal entry, their compliance.
+        bound = min(self.metric.entries_of_matrix + self.m, self.m**2)
+        if bound >= MAX_INDEXABLE_ENTRIES:
+            raise TooLarge(
+                f"A would have up to {bound:.3g} entries, more than 32-bit indices reach: use a solver that takes "
+                "J and M as they are (operator 'generalized')"
+            )
+
     @computed_once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Arrays (indptr, indices, data) of A for kernels and the judge.
@@ -194,25 +222,15 @@ class Operators(ProblemData):
             return self._form_generalized()
         if self.rows is not None:
             bound, start, blocks = assemble.bound_delassus_entries(self.data)
-            bound = min(bound, self.m**2)  # Pairs of blocks that share both bodies were counted twice.
-            if bound >= MAX_INDEXABLE_ENTRIES:
-                raise TooLarge(
-                    f"A would have up to {bound} entries; at most 2^31 - 1 can be indexed: use a solver "
-                    "that reads rows without forming A, for example a sweep solver"
-                )
+            self._check_bound_of_rows(bound)
+            bound = min(bound, self.m**2)
             indptr, indices, data = assemble.form_delassus_matrix(self.data, bound, start, blocks)
             return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
         return dense_to_csr(self.matrix)
 
     def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
-        # Add m to the bound, because rows of J without entries have a diagonal entry, their compliance.
-        bound = min(self.metric.entries_of_matrix + self.m, self.m**2)
-        if bound >= MAX_INDEXABLE_ENTRIES:
-            raise TooLarge(
-                f"A would have up to {bound:.3g} entries, more than 32-bit indices reach: use a solver that takes "
-                "J and M as they are (operator 'generalized')"
-            )
+        self._check_bound_of_generalized()
         assert self.generalized is not None
         y = (
             self.metric.whitened()

@@ -270,6 +270,8 @@ class ADMM(Solver):
     def prepare(self, problem: Problem) -> AdmmState:
         """Build the state. The problem is scaled, analysed and factored later, with the clock at hand."""
         import_numerical_modules()
+        if not _is_over_bodies(problem):
+            problem.check_matrix_fits()
         return AdmmState(problem, self.memory, self.relaxation)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.

@@ -314,6 +314,7 @@ NOT_CALLED = {
          "Generalized.restrict_to_rows_and_velocities",
          "Generalized.with_diagonal_shift", "Generalized.with_scaled_rows", "Batch.start", "Solutions.store_late_start",
          "Problem.on_disk", "Residuals.store_residual", "Solution.with_late_fields", "Solution.from_fields",
+         "Solution.with_fields",
          "Solution.convert_from_disk",
          "Solutions.store_solution", "Solutions.store_late_solution", "Solutions.get_start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",

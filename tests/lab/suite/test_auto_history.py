@@ -13,7 +13,7 @@ CASES = {
     "box_stackF(n=10)": {"start", "anderson", "newton"},
     "granularF(n=3, sliding=0.5)": {"start", "anderson", "newton"},
     "anisotropic(ratio=100, speed=3)": {"start", "anderson"},
-    "hang(n=33)": {"start", "newton"},
+    "hang(n=33)": {"start", "direct"},
     "wedge(angle=1e-8)": {"start", "anderson", "newton", "admm", "nncg", "linear program"},
 }
 

@@ -75,6 +75,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
             return general.OUTCOMES["more"]
 
     monkeypatch.setattr(general, "FLOP_TIME", 1e-8)
+    monkeypatch.setattr(general, "SPARSE_FLOP_TIME", 2e-7)
     monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])
     claim = general.run_newton_steps(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
     assert claim.status is lv.Status.TIME_LIMIT
