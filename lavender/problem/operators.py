@@ -71,18 +71,24 @@ class Operators(ProblemData):
         If this is rounding (up to 1e-14), but the maximum of |A_ij - A_ji| / sqrt(d_i d_j) is not (above 1e-10), the
         value is that maximum: entries of heavy bodies are small compared with entries of light bodies.
         """
-        return 0.0 if self.matrix is None else self._scan[2]
+        return 0.0 if self.matrix is None else self._scan
 
     @cached_property
     def bandwidth(self) -> tuple[int, int]:
         """Lower and upper half bandwidth of A: the maximum of i - j and of j - i over the stored entries."""
-        if self.rows is None:
-            return self._scan[:2]
         return sparse.bandwidth(*self._compressed[:2])
 
+    @property
+    def max_bandwidth(self) -> int:
+        """Upper bound of the half bandwidth of A, without forming A of bodies or of J and M."""
+        if self.rows is not None:
+            return self._couplings[1]
+        return max(self.bandwidth) if self.generalized is None else int(self.metric.max_bandwidth)
+
     @cached_property
-    def _scan(self) -> tuple[int, int, float]:
-        return sparse.scan(*self._compressed, self.d)
+    def _scan(self) -> float:
+        """Value of `asymmetry` of a matrix."""
+        return sparse.scan(*self._compressed, self.d)[2]
 
     @property
     def is_symmetric(self) -> bool:
@@ -169,12 +175,21 @@ class Operators(ProblemData):
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @computed_once
-    def _n_couplings(self) -> float:
-        """Number of pairs of rows that share a body; pairs that share both bodies count twice.
+    def _couplings(self) -> tuple[float, int]:
+        """Number of pairs of rows that share a body, and the largest distance of two such rows; (0, 0) without bodies.
 
-        It is stored because the estimated time of every solver depends on it.
+        Pairs that share both bodies count twice. The numbers are stored because the estimated time of every solver
+        depends on them.
         """
-        return float(assemble.bound_delassus_entries(self.data)[0]) if self.rows is not None else 0.0
+        if self.rows is None:
+            return 0.0, 0
+        entries, *lists = assemble.bound_delassus_entries(self.data)
+        return float(entries), assemble.bound_delassus_bandwidth(self.data, *lists)
+
+    @property
+    def _n_couplings(self) -> float:
+        """Number of pairs of rows that share a body; pairs that share both bodies count twice."""
+        return self._couplings[0]
 
     @property
     def max_entries(self) -> float:

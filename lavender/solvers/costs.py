@@ -165,9 +165,9 @@ def estimate_newton_cost(count: Count, problem: Problem) -> float:
 def estimate_direct_cost(problem: Problem) -> float:
     """Estimate the cost of `direct` on bounded rows of a matrix [ns], (3)."""
     m = float(problem.m)
-    work = (
-        m * (1.0 + max(problem.bandwidth)) ** 2 if problem.is_symmetric else 2.0 * count_dense_work(problem.m)
-    )
+    work = m * (1.0 + problem.max_bandwidth) ** 2
+    if work < m**3 and not problem.is_symmetric:  # The check of symmetry reads all entries, so it comes last.
+        work = m**3
     return estimate_factorisation_count(problem) * (RATES["pivot row"] * m + RATES["pivot work"] * work)
 
 

@@ -46,6 +46,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual, judge_impulse
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work_counts
 from lavender.problem import OPERATORS, Problem
+from lavender.problem.derived import cached_property
 from lavender.solvers.costs import (
     Cost,
     Count,
@@ -104,7 +105,7 @@ class NewtonState:
     general: Any = None
     begun: bool = False
 
-    @property
+    @cached_property
     def count(self) -> Count:
         """Operation counts of one step over rows or bodies, from the analysis of the matrix."""
         problem, system = self.problem, self.system
@@ -127,7 +128,7 @@ class NewtonState:
         islands = 1 if self.general is None else max(1, self.general.islands)
         return estimate_factorisation_count(self.problem) * islands
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Estimated cost of all iterations [ns]."""
         if self.general is not None:

@@ -13,6 +13,7 @@ from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
     combine_best_islands,
     find_relative_at_zero,
+    get_zero_impulse_reference,
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
@@ -59,6 +60,7 @@ class SolveLog:
 
     def start_from_better_impulse(self, start: FloatArray) -> None:
         """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
+        get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
         self.judge_and_store_best(start, is_start=True)
         if self.best > 1.0:
             self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
@@ -73,6 +75,7 @@ class SolveLog:
         the relative residual of each island of `result`.
         """
         relative = find_relative_at_zero(self.problem, impulse)
+        is_known = relative is not None and self.result is self.problem._start
         if relative is None:
             last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
             relative, impulse = float(last.relative), last.impulse
@@ -80,7 +83,7 @@ class SolveLog:
                 self.judged = last
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
-        if self.best > self.tol:
+        if self.best > self.tol and not is_known:
             starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
             self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
 

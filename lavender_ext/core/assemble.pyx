@@ -215,6 +215,21 @@ def bound_delassus_entries(Data p):
     return max_entries, start_, blocks_
 
 
+def bound_delassus_bandwidth(Data p, const int32_t[::1] start, const int32_t[::1] blocks):
+    """Return an upper bound of the half bandwidth of A: the largest distance of two rows that share a body.
+
+    The arguments after p are the results of `bound_delassus_entries(p)`.
+    """
+    cdef const int32_t* ptr = p.blocks.ptr
+    cdef int32_t i, band = 0
+    for i in range(p.blocks.n_blocks):
+        band = max(band, ptr[i + 1] - 1 - ptr[i])
+    for i in range(p.rows.n_bodies):
+        if start[i] < start[i + 1]:
+            band = max(band, ptr[blocks[start[i + 1] - 1] + 1] - 1 - ptr[blocks[start[i]]])
+    return band
+
+
 def form_delassus_matrix(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] blocks):
     """Return A as (indptr, indices, data) of compressed rows with sorted columns.
 

@@ -509,6 +509,19 @@ cdef class Data:
             out += on[b] * on[b]
         return out
 
+    @property
+    def max_bandwidth(self):
+        """Upper bound of the half bandwidth of A = Y Y^T: the largest distance of two rows with the same column of Y."""
+        cdef const generalized_t* g = &self.general
+        cdef int32_t[::1] first = np.full(g.n + 1, -1, np.int32)
+        cdef int32_t b, q, band = 0
+        for b in range(g.n_panels):
+            for q in range(g.pcol[b], g.pcol[b + 1]):
+                if first[g.cols[q]] < 0:
+                    first[g.cols[q]] = g.prow[b]
+                band = max(band, g.prow[b + 1] - 1 - first[g.cols[q]])
+        return band
+
     def whitened(self):
         """Return (data, indices, indptr) of Y (m, n) in generalised coordinates, without zero entries."""
         cdef const generalized_t* g = &self.general
