@@ -360,7 +360,9 @@ class Audit:
             Curve.from_points(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
             for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0)) if known
         )  # fmt: skip
-        return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
+        return Figure(
+            "over-time", "Errors of all worlds", "step", "velocity error [m/s]", curves, x_log=False
+        )
 
     def write(self, folder: str | os.PathLike[str]) -> None:
         """Write `records.npz`, the worst steps as `worst/worst_1.npz` etc., and `states.npz`.

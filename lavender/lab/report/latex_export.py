@@ -154,7 +154,7 @@ def format_latex(table: Table, caption: str, label: str) -> str:
     line = " & ".join
     body = "".join(f"{line(map(escape_tex, row))} \\\\\n" for row in table.cell_texts)
     return (
-        f"\\begin{{table}}\n\\centering\n\\caption{{{escape_tex(caption)}}}\n\\label{{tab:{label}}}\n"
+        f"\\begin{{table}}\n\\centering\n\\caption{{{escape_tex(caption)}}}\n\\label{{tab:{label}}}\n\\smallskip\n"
         f"\\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n"
         f"\\begin{{tabular}}{{l{'r' * (len(table.heads) - 1)}}}\n\\toprule\n{line(map(escape_tex, table.heads))} \\\\\n"
         f"\\midrule\n{body}\\bottomrule\n\\end{{tabular}}}}\n\\end{{table}}\n"
@@ -191,6 +191,13 @@ def _include_figure(figure: Figure, report: Report) -> str:
     sequences = figure.name.startswith("sequence ") or not any(r.step < 0 for r in records)
     times = _describe_times(report, solvers, sequences) if is_time else ""
     caption = f"{figure.title}.{times}{_describe_unloaded_cases(records)}"
+    if figure.name.startswith("sequence "):
+        starts = ", or from the zero impulse (thin)" if any(c.thin for c in figure.curves) else ""
+        quantity = "Time of all steps so far" if is_time else "Relative residual of each step"
+        caption = (
+            f"Sequence {figure.title}. {quantity}, from the impulses of the previous step{starts}.{times}"
+        )
+        caption += _describe_unloaded_cases(records)
     if any(c.steps for c in figure.curves):
         by_work = figure.name.startswith("work ")
         cost = "the fewest passes over A" if by_work else "the fastest solver's time"
@@ -277,6 +284,7 @@ def _describe_method(report: Report) -> str:
         f"{format_count(sum(i.law == law for i in infos), 'problem')} of law {law}"
         for law in sorted({i.law for i in infos})
     ]
+    row_range = format_count(rows[0], "row") if rows[0] == rows[-1] else f"{rows[0]} to {rows[-1]} rows"
     repeats = sorted({r.repeats for r in own if r.is_usable})
     tolerances = ", ".join(map(format_tolerance, statistics.get_tolerances(records)))
     budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
@@ -293,7 +301,7 @@ def _describe_method(report: Report) -> str:
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
     timed = describe_timed_code(r for r in own if r.order == "given" and not r.interleave_group)
     parts = (
-        f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
+        f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {row_range}),",
         f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution.",

@@ -71,10 +71,10 @@ def create_environment() -> Any:
     return environment
 
 
-#: Matches texts that are not broken across lines: a number with exponent or unit, or the name of an option.
+#: Matches texts that are not broken across lines: a number with exponent or unit, a unit in brackets, or an option.
 NUMBER = re.compile(
     r"(?<![\w.])\d[\d.]*(?:e-?\d+(?:\s(?:m/s|N\ss|√J))?|\s(?:µs|ms|s|m/s|rad/s|N\ss|√J|%|times|iterations?|sweeps?))"
-    r"(?!\w)|(?<!\S)--[a-z][a-z-]*"
+    r"(?!\w)|(?<![\w-])--[a-z][a-z-]*|\[[^\]]{1,24}\]"
 )
 
 

@@ -77,7 +77,10 @@ def choose_ticks(limits: tuple[float, float], log: bool) -> list[float]:
 def label_axis(
     title: str, limits: tuple[float, float], ticks: Sequence[float], log: bool
 ) -> tuple[str, list[str]]:
-    """Return the title of an axis and the text of each tick; a time [s] gets the unit of the middle of the axis."""
+    """Return the title of an axis and the text of each tick; a time [s] gets the unit of the middle of the axis.
+
+    All ticks have one format: if one tick of a logarithmic axis needs a power of ten, all ticks except 1 are powers.
+    """
     middle = math.sqrt(limits[0] * limits[1]) if log else 0.5 * (limits[0] + limits[1])
     is_time = "[s]" in title
     scale, unit = (
@@ -85,12 +88,13 @@ def label_axis(
         if is_time
         else AXIS_TIME_UNITS[0]
     )
-    smallest = 9e-4 if is_time else 0.09  # Smaller numbers of a logarithmic axis are powers of ten.
-
-    def write(value: float) -> str:
-        return f"{value:.6g}" if not log or smallest < value < 1e4 else format_tolerance(value)
-
-    return title.replace("[s]", f"[{unit}]"), [write(tick / scale) for tick in ticks]
+    smallest = (
+        9e-4 if is_time else 0.09
+    )  # An axis with a smaller number, or one from 1e4 on, has powers of ten.
+    values = [tick / scale for tick in ticks]
+    is_plain = not log or all(smallest < value < 1e4 for value in values)
+    texts = [f"{value:.6g}" if is_plain or value == 1.0 else format_tolerance(value) for value in values]
+    return title.replace("[s]", f"[{unit}]"), texts
 
 
 def _mask_undrawable_points(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
@@ -316,12 +320,12 @@ def save_figures(figures: Iterable[Figure], folder: Path, styles: Mapping[str, C
 
 WIDTH, HEIGHT = 1000, 640  # [units] Size of a drawing in a page, about two units per pixel of a phone.
 PAGE_WIDTH = 1900  # [units] Width of a drawing that is as wide as the page on a screen.
-LEFT, RIGHT, TOP, BOTTOM = (
-    118,
-    256,
-    62,
-    92,
-)  # [units] Margins for the labels of the axes and the names at the ends of curves.
+LEFT, TOP, BOTTOM = 118, 62, 92  # [units] Margins for the labels of the axes.
+MIN_RIGHT = 60  # [units] Smallest right margin: half of the last number of the horizontal axis.
+NAME_INDENT = 24  # [units] Distance of the names of curves from the axes.
+NAME_CHARACTER_WIDTH = 13.5  # [units] Mean width of a character of a name, on a phone.
+# A drawing with more curves shows only the names of leaders, and of the curve near the pointer.
+MAX_SHOWN_NAMES = 8
 FONT_SIZE = 22  # [units] The page's style sheet has the same size.
 TITLE_CHARACTER_WIDTH = 15  # [units] Mean width of a character of a title with the largest font, on a phone.
 TITLE_LINE_HEIGHT = 32  # [units] Height of one line of a title.
@@ -352,7 +356,9 @@ def plot_for_page(
         Width of the drawing in its own units.
     """
     canvas = _create_canvas((width / 72.0, HEIGHT / 72.0), dpi=72)  # One unit is one pixel.
-    right, bottom = width - RIGHT, HEIGHT - BOTTOM
+    labels = [_shorten_label(c.label, MAX_NAME_LENGTH) for c in figure.curves if _has_name(c)]
+    margin = round(NAME_INDENT + NAME_CHARACTER_WIDTH * max(map(len, labels), default=0))
+    right, bottom = width - max(margin, MIN_RIGHT), HEIGHT - BOTTOM
     axes = canvas.add_axes(
         (LEFT / width, BOTTOM / HEIGHT, (right - LEFT) / width, (bottom - TOP) / HEIGHT), frame_on=False
     )
@@ -365,7 +371,10 @@ def plot_for_page(
         i: [(x, HEIGHT - y) for x, y in to_units([p for p in points if not math.isnan(p[1])])]
         for i, (_, points, _, _) in enumerate(artists)
     }
-    names = _place_curve_names([c for c, *_ in artists], places, leaders, right)
+    curves = [c for c, *_ in artists]
+    shows_all_names = sum(map(_has_name, curves)) <= MAX_SHOWN_NAMES
+    shown_names = [c.solver for c in curves] if shows_all_names else leaders
+    names = _place_curve_names(curves, places, shown_names, right)
     for i, (_, _, line, band) in enumerate(artists):
         line.set(gid=f"@{i} line", zorder=4 + i)
         if band is not None:
@@ -390,7 +399,12 @@ def plot_for_page(
         f' data-y="{_describe_axis(axes.get_ylim(), figure.y_log, bottom, TOP)}" data-t="{is_time}">'
         f"{text}"
     )
-    return "".join([head, *_rewrite_svg(canvas, [c for c, *_ in artists], number), "</svg>"])
+    return "".join([head, *_rewrite_svg(canvas, curves, number, shows_all_names), "</svg>"])
+
+
+def _has_name(curve: Curve) -> bool:
+    """Return whether a page shows the name of a curve; a thin curve belongs to another one that has the name."""
+    return curve.points or not curve.thin
 
 
 def _mark_elements_for_svg(axes: Any, figure: Figure) -> None:
@@ -418,34 +432,38 @@ def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int
 def _place_curve_names(
     curves: Sequence[Curve],
     places: Mapping[int, Sequence[tuple[float, float]]],
-    leaders: Sequence[str],
+    shown: Sequence[str],
     edge: float,
 ) -> dict[int, tuple[float, float]]:
-    """Return the positions of the names of curves: at their ends, with a distance between the names of leaders.
+    """Return the positions of the names of curves, to the right of the axes, where they cover no point.
 
-    If a curve is drawn as points without a line, all names are listed to the right of the axes, beyond `edge`, because
-    a name next to a point would cover other points.
+    A name is at the height of the end of its curve, with a distance between the names of the solvers in `shown`. If a
+    curve is drawn as points without a line, the names are a list from the top.
+
+    Parameters
+    ----------
+    curves : curves
+    places : number of a curve -> its points [units]
+    shown : solvers whose names are shown without a pointer
+    edge : right end of the axes [units]
     """
+    left = edge + NAME_INDENT / 2
     if any(c.points for c in curves):
-        return {i: (edge + 24.0, TOP + FONT_SIZE + MIN_NAME_DISTANCE * i) for i in range(len(curves))}
-    ends = {}
-    for i, c in enumerate(curves):
-        if not c.thin:
-            last = places[i][-1][1]
-            # Place the name to the right of all points of the curve at about the height of its end.
-            right = edge if c.steps else max(x for x, y in places[i] if abs(y - last) < MIN_NAME_DISTANCE)
-            ends[i] = (right + 12.0, last + 8.0)
-    leading = sorted((i for i in ends if curves[i].solver in leaders), key=lambda i: ends[i][1])
+        return {i: (left, TOP + FONT_SIZE + MIN_NAME_DISTANCE * i) for i in range(len(curves))}
+    ends = {i: (left, places[i][-1][1] + 8.0) for i, c in enumerate(curves) if _has_name(c)}
+    leading = sorted((i for i in ends if curves[i].solver in shown), key=lambda i: ends[i][1])
     for above, i in pairwise(leading):
         ends[i] = (ends[i][0], max(ends[i][1], ends[above][1] + MIN_NAME_DISTANCE))
-    lowest = HEIGHT - BOTTOM + 4.0  # Lowest position of a name, above the numbers of the horizontal axis.
+    lowest = HEIGHT - BOTTOM - 2.0  # Lowest position of a name, above the numbers of the horizontal axis.
     for i in reversed(leading):
         ends[i] = (ends[i][0], min(ends[i][1], lowest))
         lowest = ends[i][1] - MIN_NAME_DISTANCE
     return ends
 
 
-def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]) -> Iterable[str]:
+def _rewrite_svg(
+    canvas: Any, curves: Sequence[Curve], number: Mapping[str, int], shows_all_names: bool
+) -> Iterable[str]:
     """Yield the marked paths and texts of matplotlib's SVG, with classes in place of styles.
 
     The id of an artist is "@CURVE PART", or "@ PART" if it belongs to the axes. Parts of one curve become a group with
@@ -473,7 +491,7 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
         # Write "16" for "16 iterations": the page's script appends the word.
         notes = "|".join(note.removesuffix(" iterations") for note in c.notes)
         attribute = f' data-n="{escape(notes)}"' if notes else ""
-        kinds = f"c s{number.get(c.solver, 0)}{' w' if c.thin else ''}"
+        kinds = f"c s{number.get(c.solver, 0)}{' w' if c.thin else ''}{' k' if shows_all_names else ''}"
         yield f'<g class="{kinds}" data-l="{escape(c.label)}"{attribute}>'
         for kind, group in parts:
             data = _format_path(group)
@@ -484,7 +502,8 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
                     yield f'<path d="{data}"/>'
                 if c.points or not (c.unmarked or c.steps or c.low or len(c.x) > MAX_PAGE_DOTS):
                     dots = re.sub(r"[ML](\S+ \d+)", r"M\1h0", data)
-                    yield f'<path class="d" d="{dots}"/>'
+                    single = " o" if c.points and len(c.x) == 1 else ""
+                    yield f'<path class="d{single}" d="{dots}"/>'
             yield from _rewrite_texts(group, "", _shorten_label(c.label, MAX_NAME_LENGTH))
         yield "</g>"
 

@@ -348,7 +348,7 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
             d.case,
             str(d.rows),
             NONE if d.sweeps is None else str(d.sweeps),
-            NONE if d.condition is None else f"{d.condition:.1e}",
+            NONE if d.condition is None else format_residual(d.condition),
             NONE if d.boundary_fraction is None else format_percent(round(1e6 * d.boundary_fraction), 10**6),
             ", ".join(d.same),
             d.proof,
@@ -364,15 +364,12 @@ def tabulate_motion_errors(report: Report) -> Table:
     tolerances = report.velocity_tolerances
     rows: Rows = []
     for m in statistics.summarize_runs_by_case(report.records_by_motion_error, tolerances):
-        known = [
-            f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
-            for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
-        ]
+        known = [format_residual(x) if math.isfinite(x) else NONE for x in (m.best, m.motion_error, m.bound)]
         rows.append(
             [m.case, format_run_name(m.solver, m.start), *(Cell.time(m.times[x]) for x in tolerances), *known]
         )
     heads = [f"to {format_speed(x)}" for x in tolerances]
-    return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
+    return Table(["case", "solver", *heads, "best [m/s]", "relative", "bound [√J]"], rows)
 
 
 def tabulate_cases_solved_at_zero(records: Records) -> Table:
@@ -382,12 +379,12 @@ def tabulate_cases_solved_at_zero(records: Records) -> Table:
             c.case,
             str(c.rows),
             c.solver or NONE,
-            f"{format_residual(c.velocity)} m/s",
-            f"{format_residual(c.energy)} √J",
+            format_residual(c.velocity),
+            format_residual(c.energy),
         ]
         for c in list_cases_solved_at_zero(records)
     ]
-    return Table(["case", "rows", "solver", "velocity", "energy"], rows)
+    return Table(["case", "rows", "solver", "velocity [m/s]", "energy [√J]"], rows)
 
 
 def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:

@@ -92,10 +92,12 @@ def format_significant_digits(x: float, digits: int = 3) -> str:
 
 
 def format_ratio(x: float) -> str:
-    """Return a ratio in words: "1.3 times", "850 times"; from a million on, as a power of ten."""
+    """Return a ratio in words: "2.0 times", "850 times"; from a million on, as a power of ten: "1e8 times"."""
     if not math.isfinite(x):
         return NONE
-    return f"{x:.2g} times" if x < 99.5 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
+    if x >= 1e6:
+        return f"1e{math.log10(x):.0f} times"
+    return f"{format_significant_digits(x, 2) if x < 99.5 else f'{x:.0f}'} times"
 
 
 def format_count(n: int, noun: str, plural: str = "") -> str:

@@ -186,7 +186,7 @@ class Tuning:
         """Build the table of some settings."""
         rows: list[list[str | Cell]] = [
             [
-                m.setting.option_line or "as it is", Cell.time(m.mean_step_time),
+                m.setting.option_line or "model's own setting", Cell.time(m.mean_step_time),
                 f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
                 Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
             ]
@@ -195,7 +195,7 @@ class Tuning:
         heads = [
             "setting",
             "a step",
-            "of now",
+            "relative time",
             "error 99 % [m/s]",
             "worst",
             f"motion after {self.horizon} [m]",

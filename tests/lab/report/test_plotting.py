@@ -45,7 +45,7 @@ def test_a_drawing_holds_the_runs_of_its_solvers(tmp_path):
         root = ElementTree.fromstring(plot_for_page(figure, {"pgs": 1}, ["pgs"]))
         drawn = {g.get("data-l"): g for g in root.iter("g") if any(p.get("class") == "d" for p in g)}
         assert list(drawn) == [c.label for c in figure.curves]
-        assert drawn["pgs"].get("class") == "c s1"
+        assert drawn["pgs"].get("class") == "c s1 k"
         for c in figure.curves:
             runs = [
                 r
@@ -108,6 +108,7 @@ def test_an_axis_and_its_ticks_have_one_unit(low, high, log, unit, tick):
     assert title == f"time [{unit}]"
     assert 2 <= len(words) <= 9
     assert tick in words and all(re.fullmatch(r"[\d.]+(e-?\d+)?", word) for word in words)
+    assert len({"e" in word for word in words if word != "1"}) == 1  # one format
 
 
 def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time():

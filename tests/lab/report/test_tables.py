@@ -1,6 +1,7 @@
 """Tables and pages are readable: one unit and format in a column, whole numbers on a line, whole titles."""
 
 import io
+import itertools
 import re
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from lavender.lab.bench import statistics
 from lavender.lab.report import figures, table_specs
 from lavender.lab.report.findings import Report
 from lavender.lab.report.page import create_environment, keep_numbers_together, render_page
-from lavender.lab.report.plotting import LEFT, RIGHT, WIDTH, plot_for_page
+from lavender.lab.report.plotting import HEIGHT, LEFT, WIDTH, plot_for_page
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.terminal import print_table
@@ -66,6 +67,8 @@ def test_the_unit_is_that_of_the_middle():
         ("converged (50.0 %), in 6 worlds", ["50.0 %"]),
         ("after 16 iterations; a1e-3 is a name", ["16 iterations"]),
         ("again with --no-reuse", ["--no-reuse"]),
+        ("5 s together (--sequence-time-limit)", ["5 s", "--sequence-time-limit"]),
+        ("at most [m/s, rad/s]", ["[m/s, rad/s]"]),
         ("6 worlds", []),
     ],
 )
@@ -108,7 +111,29 @@ def test_names_of_single_points_stand_to_the_right_of_all_points():
     )
     places = re.findall(r'<text x="(\d+)" y="(\d+)">([ab])</text>', svg)
     assert [name for *_, name in places] == ["a", "b"] and len({y for _, y, _ in places}) == 2
-    assert all(int(x) > WIDTH - RIGHT for x, *_ in places) and LEFT < WIDTH - RIGHT
+    edge = int(re.search(r'data-x="\S+ \S+ \S+ \d+ (\d+)"', svg)[1])
+    assert all(int(x) > edge for x, *_ in places) and edge > LEFT
+
+
+def draw_with_names(names):
+    curves = tuple(
+        figures.Curve.from_points(name, name, [(1.0, 1.0), (2.0 + i, 1e-3 / (1 + i))])
+        for i, name in enumerate(names)
+    )
+    figure = figures.Figure("x", "", "sweeps", "error [m/s]", curves)
+    return plot_for_page(figure, {name: i for i, name in enumerate(names)}, names[:1])
+
+
+def test_all_names_of_a_few_curves_are_shown_inside_of_the_drawing_and_cover_no_point():
+    names = ["pgs", "a solver with a long name", *"abcdef"]
+    svg = draw_with_names(names)
+    edge = int(re.search(r'data-x="\S+ \S+ \S+ \d+ (\d+)"', svg)[1])
+    places = re.findall(r'<text x="(\d+)" y="(\d+)">([^<]+)</text>', svg)
+    assert len(places) == svg.count('<g class="c s') == len(names) and svg.count(" k") == len(names)
+    assert all(edge < int(x) <= WIDTH - 13.5 * len(name) for x, _, name in places)
+    heights = sorted(int(y) for _, y, _ in places)
+    assert all(b - a >= 30 for a, b in itertools.pairwise(heights)) and heights[-1] < HEIGHT - 90
+    assert " k" not in draw_with_names([*names, "g"])  # the names of many curves would cover each other
 
 
 def test_a_summary_page_has_a_drawing_for_a_screen_and_one_for_a_phone():

@@ -25,8 +25,8 @@ def test_numbers_are_written_with_what_they_know():
     percents = [format_percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)]
     assert percents == ["100.0 %", "99.9 %", "0.01 %", "0.0 %"]
     assert (format_percent(999, 1000), format_percent(1, 3)) == ("99 %", "33 %")
-    assert [format_ratio(x) for x in (1.34, 85.0, 99.7, 1234.4, 7.3e13, math.nan)] == [
-        "1.3 times", "85 times", "100 times", "1234 times", "10^14 times", "–",
+    assert [format_ratio(x) for x in (1.34, 2.0, 85.0, 99.7, 1234.4, 7.3e13, math.nan)] == [
+        "1.3 times", "2.0 times", "85 times", "100 times", "1234 times", "1e14 times", "–",
     ]  # fmt: skip
     assert [format_residual(x) for x in (3.44e-7, 0.0, math.inf, 1.0)] == ["3.4e-7", "0", "inf", "1.0e0"]
 

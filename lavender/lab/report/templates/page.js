@@ -27,7 +27,7 @@
     chosen.sort((a, b) => order.indexOf(a) - order.indexOf(b));
     const paint = () => {
       const rules = chosen.map((n, i) => `.s${n} { --c: var(--c${i % COLOURS + 1}); }
-        .c.s${n} { stroke-width: 5; opacity: 1; visibility: visible; } .c.s${n} text { display: block; }`);
+        .c.s${n} { stroke-width: 5; stroke-opacity: 1; visibility: visible; } .c.s${n} text { display: block; }`);
       if (chosen.length) rules.push(`.c.s${chosen[0]} .b { fill: var(--c); fill-opacity: 0.16; }`);
       if (alone.checked) rules.unshift(".c { visibility: hidden; }");
       style.textContent = rules.join("\n");
