@@ -200,8 +200,8 @@ def figure(path: str | PathLike[str]) -> None:
     """
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(13, 4.2), layout="constrained")
-    left, middle, right = canvas.subplots(1, 3)
+    canvas = Figure(figsize=(7.2, 9.0), layout="constrained")
+    left, middle, right = canvas.subplots(3, 1)
     h = 1.0 / 60.0
     turn = np.exp(1j * np.linspace(-1.0, 1.0, 200))
     left.plot(turn.real, turn.imag, "k", lw=0.8)
@@ -228,8 +228,8 @@ def figure(path: str | PathLike[str]) -> None:
     right.set(xlabel="substep [ms]", ylabel="growth [1/s]")
     right.set_title("g = 0: gravity is quicker than the sweeps", fontsize=10)
     for panel in (left, middle, right):
-        panel.legend(fontsize=8, loc="lower right" if panel is left else "upper left")
-    write_figure(canvas, path)
+        panel.legend(fontsize=10, loc="upper left" if panel is not left else "lower right")
+    write_figure(canvas, path, dpi=150)
 
 
 def numbers() -> Iterator[tuple[str, ...]]:

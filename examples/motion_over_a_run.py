@@ -73,14 +73,15 @@ def figure(found, path):
     """Draw one warm and one cold run over time, and residual and motion error of all runs against drift."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(12, 3.8), layout="constrained")
-    left, middle, right = canvas.subplots(1, 3)
+    canvas = Figure(figsize=(7.2, 6.2), layout="constrained")
+    panels = canvas.subplot_mosaic("AB;CC")
+    left, middle, right = (panels[name] for name in "ABC")
     for run, style in ((_run(found, 16, True), "-"), (_run(found, 16, False), "--")):
         name = "warm" if run["warm"] else "cold"
         left.semilogy(np.maximum(run["residual"], 1e-16), "C0" + style, label=f"residual, {name}")
         left.semilogy(np.maximum(run["motion"], 1e-16), "C1" + style, label=f"motion error, {name}")
         middle.semilogy(1e3 * np.maximum(run["drift"], 1e-16), "C2" + style, label=name)
-    left.set(xlabel="step", ylabel="relative [-]", title="16 sweeps, bottom up", ylim=(1e-9, 3))
+    left.set(xlabel="step", ylabel="relative [-]", title="16 sweeps, bottom up", ylim=(1e-13, 3))
     middle.set(xlabel="step", ylabel="drift [mm]", title="from the run solved to the floor", ylim=(1e-2, 1e3))
     for name, mark in (("residual", "o"), ("motion", "^")):
         x = [run[name][1:].mean() for run in found]
@@ -91,9 +92,9 @@ def figure(found, path):
         ylabel="drift at the end [mm]",
         title=f"rank correlation: {rank['residual']:.2f} and {rank['motion']:.2f}",
     )
-    for ax in (left, middle, right):
-        ax.legend(fontsize=8)
-    canvas.savefig(path)
+    for ax, place in ((left, "lower right"), (middle, "upper right"), (right, "upper left")):
+        ax.legend(fontsize=9, loc=place)
+    canvas.savefig(path, dpi=150)
 
 
 def _run(found, sweeps, warm):

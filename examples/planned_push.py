@@ -19,7 +19,7 @@ DT, STEPS, PUSHED = 0.02, 30, 15  # s, -, -
 MASS, MU, GRAVITY = 2.0, 0.5, 9.81  # kg, -, m/s2
 GOAL = 0.3  # m
 WEAK = 0.8  # fraction of the largest push at which the box still sticks
-TURNS = 60
+ITERATIONS = 60
 JAC = np.array([[0.0, 1.0], [1.0, 0.0]])  # normal, tangent of a box that moves along x and z
 
 
@@ -57,7 +57,7 @@ def descent(heeds):
     u = np.full(PUSHED, WEAK * MU * MASS * GRAVITY * DT)
     errors, crossed = [], 0
     x, _, taken = run(u)
-    for _ in range(TURNS):
+    for _ in range(ITERATIONS):
         errors.append(abs(x - GOAL))
         by_push, lacks, _ = gradient(taken)
         slope = float(by_push @ by_push)
@@ -75,22 +75,22 @@ def descent(heeds):
 
 def numbers():
     """Return the results of both descents."""
-    return {"as it is": descent(False), "heeding the switches": descent(True)}
+    return {"gradient descent": descent(False), "with the distance to the switch": descent(True)}
 
 
 def figure(found, path):
     """Draw the errors over the iterations, and the final speeds."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 3.4), layout="constrained")
+    canvas = Figure(figsize=(7.2, 3.2), layout="constrained")
     left, right = canvas.subplots(1, 2)
-    for name, way in found.items():
-        left.semilogy(np.maximum(way["errors"], 1e-13), label=name)
-        right.plot(DT * np.arange(1, STEPS + 1), run(way["pushes"])[1], label=name)
-    left.set(xlabel="turn", ylabel="distance from the goal [m]")
+    for (name, way), style in zip(found.items(), ("--", "-"), strict=True):
+        left.semilogy(np.maximum(way["errors"], 1e-13), style, label=name)
+        right.plot(DT * np.arange(1, STEPS + 1), run(way["pushes"])[1], style)
+    left.set(xlabel="iteration", ylabel="distance from the goal [m]")
     right.set(xlabel="time [s]", ylabel="speed of the box [m/s]")
-    left.legend(frameon=False, fontsize=8)
-    canvas.savefig(path)
+    canvas.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9)
+    canvas.savefig(path, dpi=150)
 
 
 def main(path="planned_push.png"):
@@ -98,8 +98,8 @@ def main(path="planned_push.png"):
     found = numbers()
     for name, way in found.items():
         print(
-            f"{name}: {way['errors'][0]:.3f} m from the goal at first, {way['errors'][-1]:.1e} m after {TURNS} turns, "
-            f"{way['crossed']} of them across a switch"
+            f"{name}: {way['errors'][0]:.3f} m from the goal at first, {way['errors'][-1]:.1e} m after "
+            f"{ITERATIONS} iterations, {way['crossed']} of them across a switch"
         )
     figure(found, path)
     print(f"figure: {path}")

@@ -21,7 +21,7 @@ DT, STEPS, GRAVITY = 0.02, 60, 9.81  # s, -, m/s2
 TRUE = {"mass": 0.7, "mu": 0.35}  # kg, -
 NOISE = 0.01  # m/s
 START = {"mass": 1.5, "mu": 0.15}
-TURNS = 40
+ITERATIONS = 40
 
 
 def push(k):
@@ -70,7 +70,7 @@ def numbers():
     exact, _ = slide(**TRUE)
     recorded = exact + NOISE * np.random.default_rng(0).standard_normal(len(exact))
     x, before, way = np.log([START["mass"], START["mu"]]), None, []
-    for _ in range(TURNS):
+    for _ in range(ITERATIONS):
         mass, mu = np.exp(x)
         value, gradient, states = loss(recorded, mass, mu)
         gradient = gradient * np.exp(x)
@@ -88,28 +88,28 @@ def figure(found, path):
     """Draw the slide, and mass and mu over the iterations."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 3.4), layout="constrained")
+    canvas = Figure(figsize=(7.2, 3.2), layout="constrained")
     left, right = canvas.subplots(1, 2)
     t = DT * np.arange(STEPS + 1)
     left.plot(t, found["recorded"], ".", markersize=3, label="recorded")
     left.plot(t, slide(**START)[0], "--", label="first guess")
     left.plot(t, slide(*found["way"][-1][:2])[0], label="found")
     left.set(xlabel="time [s]", ylabel="speed [m/s]")
-    left.legend(frameon=False, fontsize=8)
+    left.legend(frameon=False, fontsize=9)
     for i, (name, unit) in enumerate((("mass", "kg"), ("mu", "-"))):
         right.plot(found["way"][:, i], label=f"{name} [{unit}]")
         right.axhline(TRUE[name], color="gray", linewidth=0.8)
-    right.set(xlabel="turn")
-    right.legend(frameon=False, fontsize=8)
-    canvas.savefig(path)
+    right.set(xlabel="iteration")
+    right.legend(frameon=False, fontsize=9)
+    canvas.savefig(path, dpi=150)
 
 
 def main(path="recorded_slide.png"):
     """Print the identified parameters and save the figure."""
     found = numbers()
-    for turn in (0, 5, 10, 20, TURNS - 1):
-        mass, mu, value = found["way"][turn]
-        print(f"turn {turn:>2}: mass {mass:.4f} kg, mu {mu:.4f}, loss {value:.2e} m2/s2")
+    for iteration in (0, 5, 10, 20, ITERATIONS - 1):
+        mass, mu, value = found["way"][iteration]
+        print(f"iteration {iteration:>2}: mass {mass:.4f} kg, mu {mu:.4f}, loss {value:.2e} m2/s2")
     print(
         f"true:    mass {TRUE['mass']:.4f} kg, mu {TRUE['mu']:.4f}; the noise alone leaves {0.5 * NOISE**2:.1e}"
     )

@@ -65,8 +65,8 @@ def figure(found, path):
     ends = np.array([1e-5, 1.0])
     ax.loglog(ends, ends, "k-", lw=0.8)
     ax.set(xlabel="relative residual [-]", ylabel="relative motion error [-]", xlim=(1e-5, 2), ylim=(1e-5, 2))
-    ax.legend(fontsize=8)
-    canvas.savefig(path)
+    ax.legend(fontsize=9)
+    canvas.savefig(path, dpi=150)
 
 
 def main(path="residual_or_motion.png"):

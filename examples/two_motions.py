@@ -72,21 +72,22 @@ def figure(found, path):
     shown = [
         (f"motion {i}", velocities[0]),
         (f"motion {j}", velocities[1]),
-        (f"motion {j} less motion {i}", apart),
+        (f"motion {j} minus motion {i}", apart),
     ]
-    canvas = Figure(figsize=(12, 3.6), layout="constrained")
+    canvas = Figure(figsize=(7.2, 3.0), layout="constrained")
     panels = canvas.subplots(1, 3, sharex=True, sharey=True)
     for ax, (name, v) in zip(panels, shown, strict=True):
         for centre in at:
             ax.add_patch(_box(centre, half))
         size = float(np.hypot(*v.T).max())
         ax.quiver(
-            *at.T, *v.T, angles="xy", scale_units="xy", scale=size / half.min() / 1.6, color="C3", width=0.006
+            *at.T, *v.T, angles="xy", scale_units="xy", scale=size / half.min() / 1.6, color="C3", width=0.009
         )
-        ax.set(title=f"{name}: up to {size:.2g} m/s", xlabel="x [m]", aspect="equal")
+        ax.set(xlabel="x [m]", aspect="equal")
+        ax.set_title(f"{name}\nup to {size:.2g} m/s", fontsize=10)
     panels[0].set(ylabel="height [m]")
     panels[0].autoscale_view()
-    canvas.savefig(path)
+    canvas.savefig(path, dpi=150)
 
 
 def _box(centre, half):

@@ -113,16 +113,16 @@ def figure(found, path):
     from matplotlib.figure import Figure
 
     p = found["problem"]
-    canvas = Figure(figsize=(8, 3.6), layout="constrained")
+    canvas = Figure(figsize=(7.2, 3.6), layout="constrained")
     left, right = canvas.subplots(1, 2)
     left.barh([p.row_name(i) for i in range(p.m)], found["target"])
-    left.set(xlabel="forward speed by the row's target [-]")
-    right.barh([f"{p.names[i]}: {found['d'].states[i].name}" for i in range(2, 6)], found["mu"][2:])
-    right.set(xlabel="forward speed by mu [m/s]")
+    left.set(xlabel="d speed / d target [-]")
+    right.barh([f"{p.names[i]}: {found['d'].states[i].name}" for i in range(2, 6)], 1e3 * found["mu"][2:])
+    right.set(xlabel="d speed / d mu [mm/s]")
     for axes in (left, right):
         axes.invert_yaxis()
         axes.axvline(0.0, color="gray", linewidth=0.8)
-    canvas.savefig(path)
+    canvas.savefig(path, dpi=150)
 
 
 def main(path="which_contact.png"):

@@ -36,12 +36,12 @@ def save(panels, numbers, path):
 
     name = Path(str(path)).stem
     shown = [panels[name]] if name in panels else list(panels.values())
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    canvas = Figure(figsize=(7.2, 3.2 * len(shown)), layout="constrained")
     for axes, draw in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
         draw(axes, numbers)
-    canvas.savefig(path)
+    canvas.savefig(path, dpi=150)
 
 
 def put_legend_right(axes):
     """Put the legend to the right of the axes, where it covers no curve."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=9, frameon=False)

@@ -45,7 +45,8 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     )
     assert code == 0 and "held back" in out
     assert "Add the line after the model's own <option>" in " ".join(out.split())
-    assert len(out.splitlines()) <= 27
+    warned = 2 if "The machine was busy" in out else 0  # a warning, and longer comments
+    assert len(out.splitlines()) <= 27 + warned
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
     assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()

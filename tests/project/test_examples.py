@@ -162,9 +162,10 @@ def test_mass_and_friction_are_found_to_what_the_noise_allows(drawn):
 def test_a_push_gets_across_the_switch_only_where_it_looks_for_it(drawn):
     found = drawn("planned_push").numbers()
     assert (
-        found["as it is"]["errors"][-1] == found["as it is"]["errors"][0]
+        found["gradient descent"]["errors"][-1] == found["gradient descent"]["errors"][0]
     )  # the derivative is 0 all the way
-    assert found["heeding the switches"]["errors"][-1] < 1e-9 and found["heeding the switches"]["crossed"] > 0
+    crossing = found["with the distance to the switch"]
+    assert crossing["errors"][-1] < 1e-9 and crossing["crossed"] > 0
 
 
 def test_the_sensitivity_of_a_step_agrees_with_differences(drawn):
