@@ -9,19 +9,23 @@ theta > 0 [1/kg] on every row and s = J (v - v*) - b [m/s], a block's law determ
     V          -d lambda / d s, of the block's rows
 
 theta is equal on all tangents of a disk, so that (1) has a closed form.
+
+At a kink, V is the derivative on the side on which the row acts: a row with z at a bound, or a contact with z = 0,
+counts as free. All contacts of a stack at rest (b = 0) then act in the first step; otherwise one more acts in each step.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.block_projection cimport classify_active_bound, project_contact
+from lavender_ext.core.block_projection cimport project_contact
 from lavender_ext.core.block cimport compute_block_error, compute_row_error
 from lavender_ext.core.generalized cimport multiply_whitened_panel, add_panel_transpose_product
-from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, has_independent_rows
+from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.linear cimport linear_t
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.judge.tally cimport make_empty_tally, add_block_error, add_row_error, tally_t
+from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
 
 cdef struct descent_t:          # state of the Newton steps under one law
@@ -145,6 +149,15 @@ cdef inline int32_t end_block_of_run(const flow_t* f, int32_t a) noexcept nogil:
 # -- lambda(s) and V -------------------------------------------------------------------------------------
 
 
+cdef inline bint is_at_apex(const double* y, int32_t n) noexcept nogil:
+    """Return whether y (n) = 0: a contact at rest that carries no impulse."""
+    cdef int32_t k
+    for k in range(n):
+        if y[k] != 0.0:
+            return False
+    return True
+
+
 cdef inline void compute_contact_impulse(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
     """Project z (in lam) of contact i by (1), in place, and write V."""
     cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l
@@ -161,6 +174,9 @@ cdef inline void compute_contact_impulse(const flow_t* f, int32_t i, double* lam
     for k in range(q.n):
         q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * inv_sqrt_theta[0]
     project_contact(f.p.law, &q, y, out, v)
+    if is_at_apex(y, n):
+        for k in range(n):
+            v[k * n + k] = 1.0
     for k in range(n):
         lam[k] = lam[k] if out[k] == y[k] else out[k] * inv_sqrt_theta[k]
         for l in range(n):
@@ -186,20 +202,20 @@ cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, 
             z = (rho[k] * center[k] - s[k]) * soft[k]
             low = lower[k]
             high = upper[k]
-            v[k] = soft[k] if classify_active_bound(z, low, high) == 0 else 0.0
+            v[k] = soft[k] if low <= z <= high and low < high else 0.0
             lam[k] = low if z < low else (high if z > high else z)
         return
     for i in range(first, last):
         j = ptr[i]
         end = ptr[i + 1]
         at = vptr[i]
-        if has_independent_rows(&f.p, i):
+        if has_bounded_rows_only(&f.p, i):
             at -= j
             for k in range(j, end):
                 z = (rho[k] * center[k] - s[k]) * soft[k]
                 low = lower[k]
                 high = upper[k]
-                v[at + k] = soft[k] if classify_active_bound(z, low, high) == 0 else 0.0
+                v[at + k] = soft[k] if low <= z <= high and low < high else 0.0
                 lam[k] = low if z < low else (high if z > high else z)
             continue
         for k in range(j, end):
@@ -371,7 +387,7 @@ cdef inline double measure_impulse_errors(const flow_t* f, int32_t island, const
             continue
         last = end_block_of_run(f, a)
         for i in range(first_block_of_run(f, a), last):
-            if has_independent_rows(&f.p, i):
+            if has_bounded_rows_only(&f.p, i):
                 end = ptr[i + 1]
                 for k in range(ptr[i], end):
                     add_row_error(&f.p, k, compute_row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)

@@ -6,11 +6,12 @@ the rows of another.
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.order cimport sort_blocks_by_level
-from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction, has_independent_rows
+from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction
 from lavender_ext.core.roots cimport find_root
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport flow_t, end_row_of_run, first_row_of_run
 from lavender_ext.velocity_newton.sparse cimport count_mass_factor_work, find_pattern, pattern_index_size
+from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
 
 cdef enum:
@@ -81,7 +82,7 @@ cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
     for i in range(f.p.n_blocks):
         vptr[i] = at
         size = ptr[i + 1] - ptr[i]
-        at += size if has_independent_rows(&f.p, i) else size * size
+        at += size if has_bounded_rows_only(&f.p, i) else size * size
     vptr[f.p.n_blocks] = at
 
 
@@ -219,7 +220,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
-        if not has_independent_rows(p, i):
+        if not has_bounded_rows_only(p, i):
             f.bounded_rows_only = False
             break
     f.sparse = False

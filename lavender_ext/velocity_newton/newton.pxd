@@ -37,7 +37,7 @@ from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.block_types cimport (
-    CONE, COULOMB, blocks_t, has_independent_rows, get_friction_components, friction_components_t,
+    CONE, COULOMB, blocks_t, get_friction_components, friction_components_t,
 )
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t
@@ -45,7 +45,7 @@ from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, 
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
                                                 paused_t, recompute_slack, end_row_of_run, first_row_of_run)
 from lavender_ext.velocity_newton.normal cimport factor_normal_matrix, form_normal_matrix, is_v_unchanged, solve_step
-from lavender_ext.velocity_newton.soft cimport min_relative_compliance
+from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only, min_relative_compliance
 
 
 cdef enum:                      # stages of a round of Coulomb friction
@@ -213,7 +213,7 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
                 if not x >= low * d[k]:
                     x += softness * d[k]
                 theta[k] = x
-            if not has_independent_rows(&f.p, i):
+            if not has_bounded_rows_only(&f.p, i):
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
@@ -398,7 +398,7 @@ cdef inline void compute_normal_shifts(const flow_t* f, int32_t island, const do
     measure_impulse_errors(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
-            if not has_independent_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
+            if not has_bounded_rows_only(&f.p, i):
                 f.phi[f.p.ptr[i]] = compute_normal_shift(f, i)
 
 

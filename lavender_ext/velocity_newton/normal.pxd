@@ -15,11 +15,11 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.block_types cimport has_independent_rows
 from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
                                          solve_linear_system, linear_t)
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_run, form_column_of_a, flow_t, multiply_y
+from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
@@ -69,7 +69,7 @@ cdef inline int32_t multiply_block_by_v(const flow_t* f, int32_t i, int32_t row,
     cdef const double* v = f.v + f.vptr[i]
     cdef double* out
     cdef bint any_
-    if has_independent_rows(&f.p, i):
+    if has_bounded_rows_only(&f.p, i):
         for r in range(size):
             if v[r] != 0.0:
                 scale_row(f.weighted_y + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)
@@ -200,7 +200,7 @@ cdef inline int32_t compute_or_list_free_rows(const flow_t* f, const double* t, 
     for a in range(f.iptr[f.island], f.iptr[f.island + 1]):
         for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
             v, end = f.factored_v + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
-            size = 1 if has_independent_rows(&f.p, i) else end - place
+            size = 1 if has_bounded_rows_only(&f.p, i) else end - place
             while place < end:
                 is_free = False
                 for k in range(size * size):

@@ -1,8 +1,13 @@
-"""The compliance above which rows of J and M need no proximal term."""
+"""Blocks without friction, and the compliance above which rows of J and M need no proximal term."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
 from lavender_ext.core.view cimport generalized_t
+
+
+cdef inline bint has_bounded_rows_only(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return whether block i consists of bounded rows: no contact, or a contact of one row."""
+    return has_independent_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
 
 
 cdef inline double min_relative_compliance(const blocks_t* p, int32_t i) noexcept nogil:
@@ -10,7 +15,7 @@ cdef inline double min_relative_compliance(const blocks_t* p, int32_t i) noexcep
 
     With less, Newton's method without a proximal term takes more steps, since the kinks of lambda(s) are sharper.
     """
-    return 1e-6 if has_independent_rows(p, i) else 1e-3
+    return 1e-6 if has_bounded_rows_only(p, i) else 1e-3
 
 
 cdef inline bint needs_no_proximal_terms(const blocks_t* p, const generalized_t* g) noexcept nogil:

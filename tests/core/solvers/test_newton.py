@@ -434,3 +434,25 @@ for line in Path("/proc/self/smaps").read_text().splitlines():
     elif inside and word == "VmFlags:":
         print(line)
 """
+
+
+@pytest.mark.parametrize("law", ["lcp", "cone"])
+def test_the_height_of_a_stack_at_rest_does_not_matter(law):
+    """All contacts act from the first step on; they were found one by one, a factorisation for each."""
+    counts = []
+    for n in (10, 80):
+        rows = 1 if law == "lcp" else 3
+        jac = np.zeros((rows * n, 3 * n))
+        for k in range(n):
+            for row, axis in enumerate((2, 0, 1)[:rows]):
+                jac[rows * k + row, 3 * k + axis] = 1.0
+                if k:
+                    jac[rows * k + row, 3 * (k - 1) + axis] = -1.0
+        v_free = np.tile([0.0, 0.0, -0.1], n)
+        cones = lv.Cones.contacts(np.full(n, 0.5), tangents=rows - 1)
+        problem = lv.Problem.from_jacobian(jac, np.eye(3 * n), v_free, cones=cones, friction="cone")
+        solution = lv.solve(problem, "newton")
+        # Each contact carries the bodies above it.
+        assert solution.impulse[::rows] == pytest.approx(0.1 * np.arange(n, 0, -1), rel=1e-5)
+        counts.append(solution.work["factorisations"])
+    assert max(counts) <= 4
