@@ -227,6 +227,15 @@ def test_the_paper_is_short_and_its_references_and_figures_exist():
     text = paper.read_text(encoding="utf-8")
     body = text.split("---\n", 2)[2]
     assert len(body.split()) < 1000
+    assert re.findall(r"^# (.+)$", body, re.MULTILINE) == [  # required by JOSS since 2026
+        "Summary",
+        "Statement of need",
+        "State of the field",
+        "Software design",
+        "Research impact statement",
+        "AI usage disclosure",
+        "References",
+    ]
     keys = set(re.findall(r"^@\w+\{(\w+),", paper.with_name("paper.bib").read_text("utf-8"), re.MULTILINE))
     assert set(re.findall(r"@(\w+)", body)) == keys
     for figure in re.findall(r"\]\(([^)]+)\)", body):
