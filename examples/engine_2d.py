@@ -5,15 +5,20 @@ a warm start, and moves the bodies. Body 0 is the bar, on a hinge with a motor; 
 
     python examples/engine_2d.py [FIGURE.png]
 
-A file named after a panel shows it alone: paths.png, speed.png.
+A file named after a panel shows it alone: paths.png, speed.png. The figure needs Matplotlib and the folder
+`examples/panels`. Without the folder, only the numbers are printed.
 """
 
 import sys
 
 import numpy as np
-from panels import Numbers, put_legend_right, show
 
 import lavender as lv
+
+try:
+    import panels
+except ModuleNotFoundError:  # This file was copied without the folder.
+    panels = None
 
 # ------------------------------------------------------------------------------------------------------------------
 DT, STEPS, GRAVITY = 1 / 60, 300, np.array([0.0, -9.81, 0.0])  # s, -, m/s^2
@@ -66,12 +71,9 @@ def simulate():
 
 def numbers():
     """Return the run, the largest penetrations over its steps [m], and the drift of the hinge [m]."""
-    found = Numbers(
-        run=simulate,
-        depth=lambda: np.array([largest_depth(x) for x in found["run"][0]]),
-        drift=lambda: np.linalg.norm(found["run"][0][:, 0] - PIVOT, axis=1).max(),
-    )
-    return found
+    run = simulate()
+    depth = np.array([largest_depth(x) for x in run[0]])
+    return {"run": run, "depth": depth, "drift": np.linalg.norm(run[0][:, 0] - PIVOT, axis=1).max()}
 
 
 def largest_depth(position):
@@ -92,7 +94,7 @@ def draw_paths(axes, found):
     axes.plot(*np.stack([PIVOT - half, PIVOT + half], axis=1), "k", linewidth=2, label="bar")
     axes.plot(*PIVOT, "ko", label="hinge")
     axes.set(title=f"paths of {STEPS} steps, and the end", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    put_legend_right(axes)
+    panels.put_legend_right(axes)
 
 
 def draw_speed(axes, found):
@@ -100,7 +102,7 @@ def draw_speed(axes, found):
     axes.plot(DT * np.arange(1, STEPS + 1), found["run"][1])
     axes.axhline(SPEED, color="k", linewidth=0.8, linestyle="--", label="wanted")
     axes.set(title="speed of the bar", xlabel="time [s]", ylabel="[rad/s]")
-    put_legend_right(axes)
+    panels.put_legend_right(axes)
 
 
 PANELS = {"paths": draw_paths, "speed": draw_speed}
@@ -123,7 +125,11 @@ def print_numbers(found):
 
 def main(path="engine_2d.png"):
     """Print the numbers and draw the figure."""
-    show(PANELS, numbers(), print_numbers, path)
+    if panels is None:
+        print_numbers(numbers())
+        print("no figure: the folder examples/panels is missing")
+    else:
+        panels.show(PANELS, numbers(), print_numbers, path)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,14 @@ INSTEAD = {
         "Turn": "SolverStage",
         "motions": "find_solutions",
         "solvers": "available or known",
+        **dict.fromkeys(("Builder", "rowbuilder"), "RowBuilder"),
     },
     "Solution": {
+        "carry": "carry of the next problem: next_problem.carry(solution)",
         "contradicted": "status_conflict",
+        "error": "residual",
+        "force": "impulse divided by dt",
+        "forces": "impulse divided by dt",
         "impulses": "impulse",
         "converged": "success",
         "iters": "iterations",
@@ -55,20 +60,47 @@ ARGUMENT_HINTS = {
         ("guess", "initial_guess", "initvals", "lam0", "warm_start", "warmstart", "x0"), ("impulse", "guess")
     ),
     **dict.fromkeys(
-        ("iterations", "iters", "max_iterations", "maxit", "maxiter", "n_iter", "niter"), ("max_iter",)
+        (
+            "iterations",
+            "iters",
+            "max_iterations",
+            "max_sweeps",
+            "maxit",
+            "maxiter",
+            "n_iter",
+            "niter",
+            "sweeps",
+        ),
+        ("max_iter",),
     ),
     **dict.fromkeys(("accuracy", "eps", "rtol", "tolerance"), ("tol",)),
     **dict.fromkeys(("time_budget", "timeout"), ("time_limit",)),
     **dict.fromkeys(("algorithm", "method", "name"), ("solver",)),
     **dict.fromkeys(("coefficient", "friction", "friction_coefficient"), ("mu",)),
-    **dict.fromkeys(("distance_to_surface", "separation"), ("gap",)),
+    **dict.fromkeys(("depth", "distance_to_surface", "penetration", "separation"), ("gap",)),
     **dict.fromkeys(("max_motor_torque", "torque"), ("max_torque",)),
     **dict.fromkeys(("force", "max_motor_force"), ("max_force",)),
-    **dict.fromkeys(("pivot", "pos", "position"), ("anchor", "point", "anchor_a")),
+    **dict.fromkeys(("pivot", "pos", "position"), ("anchor", "point", "anchor_a", "position")),
+    **dict.fromkeys(("location", "point"), ("anchor", "anchor_a", "position")),
+    **dict.fromkeys(("body_a", "body1"), ("a",)),
+    **dict.fromkeys(("body_b", "body2"), ("b",)),
+    **dict.fromkeys(("beta", "erp"), ("baumgarte",)),
+    **dict.fromkeys(("inv_masses", "mass", "masses"), ("inv_mass",)),
+    **dict.fromkeys(("inertia", "inertias", "inv_inertias"), ("inv_inertia",)),
+    **dict.fromkeys(("positions", "x"), ("position",)),
+    **dict.fromkeys(("v", "velocities"), ("velocity", "speed")),
+    **dict.fromkeys(("h", "timestep", "time_step"), ("dt",)),
     **dict.fromkeys(("c", "damper"), ("damping",)),
     **dict.fromkeys(("k", "spring_constant"), ("stiffness",)),
     **dict.fromkeys(("rest_length", "l0"), ("length",)),
     **dict.fromkeys(("motor_speed", "target_velocity", "velocity"), ("speed",)),
+}
+
+#: Argument that users try -> remark after the suggested argument, if that has another meaning.
+ARGUMENT_NOTES = {
+    **dict.fromkeys(("depth", "penetration"), ", which is negative for penetration"),
+    **dict.fromkeys(("mass", "masses"), ", which is 1 / mass [1/kg]"),
+    **dict.fromkeys(("inertia", "inertias"), ", which is the inverse [1/(kg m^2)]"),
 }
 
 #: Solver name that users try -> name to suggest. For other unknown names, the most similar names are suggested.

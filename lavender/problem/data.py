@@ -267,6 +267,12 @@ class ProblemData:
                 f"{name} is a {type(impulse).__name__}; an array (m,) in N s is needed: give its .impulse, or "
                 "problem.carry(solution) if the problem has keys"
             )
+        shape = get_shape(name, impulse)
+        if len(shape) == 1 and shape != self.b.shape and name == "impulse":
+            raise InputError(
+                f"impulse [N s] has shape {shape}; {self.b.shape} is needed. If it is from a step with other contacts, "
+                "give problem.carry(solution), which assigns impulses to blocks by their keys"
+            )
         array = as_array(name, impulse, (self.m,), finite=False, unit="N s")
         check_finite(f"{name} [N s]", array)
         return array.copy()

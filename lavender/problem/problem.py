@@ -134,9 +134,9 @@ class Problem(Builders):
         elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
             before, impulse = previous.residual._problem, previous.impulse  # pyright: ignore[reportAttributeAccessIssue]
         else:
-            raise InputError(
-                f"previous is a {type(previous).__name__}; a Solution, or (problem, impulse), is needed"
-            )
+            given = "None" if previous is None else f"a {type(previous).__name__}"
+            hint = ": the first step has no start, solve it without impulse=" if previous is None else ""
+            raise InputError(f"previous is {given}; a Solution, or (problem, impulse), is needed{hint}")
         if keys is not None:
             if before.key is None:
                 raise InputError("the problem of the previous step has no keys: build it with key=")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from functools import wraps
+from inspect import Parameter, signature
 from math import hypot, inf
-from typing import NamedTuple
+from typing import Any, NamedTuple, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -16,6 +19,7 @@ from lavender.base.arrays import (
     get_shape,
 )
 from lavender.base.errors import InputError
+from lavender.base.renamed import ARGUMENT_NOTES, suggest_argument_name
 from lavender.problem.rows import check_and_symmetrise_inertia
 from lavender.problem.vectors import (
     X_AXIS,
@@ -45,6 +49,63 @@ PLANAR_VELOCITIES = (
     1,
     5,
 )  # Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
+
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def check_arguments(method: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Decorate a method of `RowBuilder` so that unknown, missing and surplus arguments raise a helpful InputError."""
+
+    @wraps(method)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        try:
+            return method(*args, **kwargs)
+        except TypeError:
+            try:
+                signature(method).bind(*args, **kwargs)
+            except TypeError:
+                reject_call(method, args, kwargs)
+            raise
+
+    return call
+
+
+def reject_call(method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> NoReturn:
+    """Raise InputError for arguments that a method of `RowBuilder` does not have, or that it needs."""
+    call = "RowBuilder" if method.__name__ == "__init__" else f"RowBuilder.{method.__name__}"
+    valid = dict(list(signature(method).parameters.items())[1:])  # Without `self`.
+    for name in kwargs:
+        if name not in valid:
+            successor = suggest_argument_name(name, valid)
+            words = (
+                f"use {successor}={ARGUMENT_NOTES.get(name, '')}" if successor else f"it takes {_list(valid)}"
+            )
+            raise InputError(f"{call} has no argument {name}=; {words}") from None
+    positional = [name for name, x in valid.items() if x.kind is Parameter.POSITIONAL_OR_KEYWORD]
+    given = len(args) - 1
+    if given > len(positional):
+        others = [name for name in valid if name not in positional]
+        named = f"; give all others by name: {_list(others)}" if others else ""
+        raise InputError(
+            f"{call} takes {len(positional)} positional arguments, {', '.join(positional)}; {given} were given{named}"
+        ) from None
+    for name in positional[:given]:
+        if name in kwargs:
+            raise InputError(f"{call} has {name} twice, by position and by name: leave one out") from None
+    missing = [
+        name for name, x in valid.items()
+        if x.default is Parameter.empty and name not in positional[:given] and name not in kwargs
+    ]  # fmt: skip
+    usage = (
+        ": builder.velocity_after(problem, solution.impulse)" if method.__name__ == "velocity_after" else ""
+    )
+    raise InputError(f"{call} lacks {_list(missing)}{usage}") from None
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(f"{name}=" for name in names)
 
 
 class Row(NamedTuple):
@@ -82,12 +143,33 @@ class Contact(NamedTuple):
     threshold: float
 
 
+def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], inertia: tuple[int, ...]) -> None:
+    """Check the shape of `position`; name it if the shapes of the other arguments belong to another dimension."""
+    order = "the order is inv_mass, inv_inertia, velocity, dt, position"
+    if len(position) == 2 and velocity == (position[0], {3: 2, 6: 3}.get(position[1])):
+        raise InputError(
+            f"position [m] has shape {position} and velocity {velocity}, so the two seem to be swapped: {order}"
+        )
+    if len(position) != 2 or position[1] not in (2, 3):
+        raise InputError(
+            f"position [m] has shape {position}; (n, 2) is needed in two dimensions, (n, 3) in three"
+        )
+    n = position[0]
+    if position[1] == 3 and velocity == (n, 3) and len(inertia) < 2:
+        raise InputError(
+            f"position [m] has shape {position}, three dimensions, but velocity has shape {velocity} and inv_inertia "
+            f"{inertia}, two dimensions: position ({n}, 2) is needed, without the angle; in three dimensions velocity "
+            f"({n}, 6) and inv_inertia ({n}, 3, 3)"
+        )
+
+
 class RowAssembly:
-    """Bodies, blocks and keys of a step; `row_builder` defines equations (1) to (5).
+    """Bodies, blocks and keys of a step; the notes of `RowBuilder` define equations (1) to (5).
 
     `RowBuilder` describes the arguments.
     """
 
+    @check_arguments
     def __init__(
         self,
         inv_mass: ArrayLike,
@@ -100,10 +182,7 @@ class RowAssembly:
         slop: float = 0.0,
     ) -> None:
         shape = get_shape("position", position)
-        if len(shape) != 2 or shape[1] not in (2, 3):
-            raise InputError(
-                f"position [m] has shape {shape}; (n, 2) is needed in two dimensions, (n, 3) in three"
-            )
+        _check_dimensions(shape, get_shape("velocity", velocity), get_shape("inv_inertia", inv_inertia))
         n, self._dimensions = shape[0], shape[1]
         if n > MAX_KEYED_BODIES:
             raise InputError(f"position has {n} bodies; at most {MAX_KEYED_BODIES} are needed for keys")

@@ -6,6 +6,8 @@ import math
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
+import numpy as np
+
 from lavender.base.arrays import ArrayLike
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
@@ -93,7 +95,7 @@ def solve(
             f"solve has {2 + len(surplus)} positional arguments; a problem and the name of a solver are needed, "
             "all others by name: lavender.solve(problem, solver, tol=..., impulse=...)"
         )
-    spec = get(solver)
+    spec = get(solver) if isinstance(solver, str) else _reject_solver(solver)
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if velocity_tol is not None:
         tol = relative_tolerance(problem, velocity_tol)
@@ -107,6 +109,25 @@ def solve(
             make_deadline(spec, limit, begun), history, callback, failed_call,
         )  # fmt: skip
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
+
+
+def _reject_solver(solver: Any) -> NoReturn:
+    """Raise the error for a second argument that is not a name, with the keyword for which it is a value."""
+    value = f"a {type(solver).__name__}"
+    if isinstance(solver, Solution):
+        example = "impulse=problem.carry(solution)"
+    elif isinstance(solver, np.ndarray | list | tuple):
+        example = "impulse=..."
+    elif isinstance(solver, float):
+        example, value = "tol=...", f"{solver:g}"
+    elif type(solver) is int:
+        example, value = "max_iter=...", f"{solver}"
+    else:
+        get(solver)  # Raises UnknownName with the names of the solvers.
+        example = "solver=..."
+    raise InputError(
+        f"solver is {value}; the name of a solver is needed, all others by name: lavender.solve(problem, {example})"
+    )
 
 
 def solve_prepared(

@@ -9,6 +9,7 @@ import pytest
 
 import lavender as lv
 from lavender.base.renamed import INSTEAD
+from lavender.problem.row_assembly import check_arguments
 
 A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
 LCP = lv.Problem.lcp(A, B)
@@ -30,7 +31,13 @@ def test_programs_keep_their_own_names_of_bounds():
 
 @pytest.mark.parametrize(
     ("name", "successor"),
-    [("warm_start", "impulse"), ("x0", "impulse"), ("iterations", "max_iter"), ("maxiter", "max_iter")],
+    [
+        ("warm_start", "impulse"),
+        ("x0", "impulse"),
+        ("iterations", "max_iter"),
+        ("maxiter", "max_iter"),
+        ("sweeps", "max_iter"),
+    ],
 )
 @pytest.mark.parametrize("solver", ["auto", "pgs"])
 def test_options_of_other_packages_suggest_ours(solver, name, successor):
@@ -126,12 +133,111 @@ def make_builder():
         ("motor", {"speed": 1.0, "torque": 2.0}, "no argument torque=; use max_torque="),
         ("hinge", {"pivot": (0.0, 0.0)}, "no argument pivot=; use anchor="),
         ("spring", {"k": 2.0}, "no argument k=; use stiffness="),
+        ("hinge", {"point": (0.0, 0.0)}, "no argument point=; use anchor="),
+        (
+            "contact",
+            {"point": (0.0, 0.0), "normal": (0.0, 1.0), "depth": 0.01},
+            "no argument depth=; use gap=, which is negative for penetration",
+        ),
         ("hinge", {"nonsense": 1}, "no argument nonsense=; it takes a=, b=, anchor=, axis="),
     ],
 )
 def test_arguments_of_row_builders_suggest_ours(method, keywords, words):
     with pytest.raises(lv.InputError, match=words):
         getattr(make_builder(), method)(-1, 0, **keywords)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"mass": [1.0, 1.0]}, r"no argument mass=; use inv_mass=, which is 1 / mass \[1/kg\]"),
+        ({"beta": 0.1}, "no argument beta=; use baumgarte="),
+        ({"inertia": 1.0}, "no argument inertia=; use inv_inertia=, which is the inverse"),
+    ],
+)
+def test_arguments_of_the_class_suggest_ours(changed, words):
+    valid = {"velocity": np.zeros((2, 3)), "dt": 0.01, "position": np.zeros((2, 2))}
+    with pytest.raises(lv.InputError, match=f"^RowBuilder has {words}"):
+        lv.RowBuilder(**valid, **changed)
+
+
+def test_missing_and_surplus_arguments_of_row_builders_are_named():
+    builder = make_builder()
+    with pytest.raises(lv.InputError, match=r"^RowBuilder lacks dt=, position=$"):
+        lv.RowBuilder([1.0], [1.0], np.zeros((1, 3)))
+    with pytest.raises(lv.InputError, match=r"contact lacks normal=$"):
+        builder.contact(-1, 0, (0.0, 0.0))
+    with pytest.raises(
+        lv.InputError,
+        match=r"contact takes 4 positional .* a, b, point, normal; 6 were given; .* by name: gap=, mu=",
+    ):
+        builder.contact(-1, 0, (0.0, 0.0), (0.0, 1.0), 0.0, 0.5)
+    with pytest.raises(lv.InputError, match=r"hinge has anchor twice, by position and by name"):
+        builder.hinge(-1, 0, (0.0, 0.0), anchor=(0.0, 0.0))
+    builder.contact(-1, 0, (0.0, 0.0), (0.0, 1.0))
+    solution = lv.solve(builder.problem())
+    with pytest.raises(
+        lv.InputError,
+        match=r"velocity_after lacks impulse=: builder\.velocity_after\(problem, solution\.impulse\)",
+    ):
+        builder.velocity_after(solution)
+
+
+def test_a_type_error_within_a_call_of_a_row_builder_stays_as_it_is():
+    @check_arguments
+    def add(self, number):
+        return number + ""
+
+    with pytest.raises(TypeError, match="unsupported operand"):
+        add(None, 1)
+    with pytest.raises(lv.InputError, match=r"^RowBuilder\.add lacks number=$"):
+        add(None)
+
+
+PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(np.eye(3), (2, 1, 1))
+SWAPPED = "so the two seem to be swapped: the order is inv_mass, inv_inertia, velocity, dt, position"
+
+
+@pytest.mark.parametrize(
+    ("inv_inertia", "velocity", "position", "words"),
+    [
+        (
+            [1.0, 1.0],
+            PLANE,
+            PLANE,
+            r"three dimensions, but velocity .* position \(2, 2\) is needed, without the angle",
+        ),
+        ([1.0, 1.0], np.zeros((2, 2)), PLANE, SWAPPED),
+        (TENSORS, PLANE, SPACE, SWAPPED),
+    ],
+)
+def test_positions_with_an_angle_or_in_place_of_velocities_are_named(inv_inertia, velocity, position, words):
+    shape = str(np.shape(position)).replace("(", r"\(").replace(")", r"\)")
+    with pytest.raises(lv.InputError, match=rf"^position \[m\] has shape {shape}.*{words}"):
+        lv.RowBuilder([1.0, 1.0], inv_inertia, velocity, 0.01, position)
+
+
+@pytest.mark.parametrize(
+    ("second", "words"),
+    [
+        (B, r"solver is a ndarray; .*solve\(problem, impulse=\.\.\.\)"),
+        (lv.solve(LCP), r"solver is a Solution; .*solve\(problem, impulse=problem\.carry\(solution\)\)"),
+        (1e-9, r"solver is 1e-09; .*solve\(problem, tol=\.\.\.\)"),
+        (10, r"solver is 10; .*solve\(problem, max_iter=\.\.\.\)"),
+    ],
+)
+def test_other_arguments_in_place_of_the_solver_go_by_name(second, words):
+    with pytest.raises(lv.InputError, match=words):
+        lv.solve(LCP, second)
+
+
+def test_starts_that_do_not_fit_name_the_way_to_get_one():
+    with pytest.raises(
+        lv.InputError, match=r"impulse \[N s\] has shape \(3,\); \(2,\) is needed.*problem\.carry"
+    ):
+        lv.solve(LCP, impulse=np.ones(3))
+    with pytest.raises(lv.InputError, match=r"previous is None; .* the first step .* without impulse="):
+        LCP.carry(None)
 
 
 def test_mistakes_with_a_builder_name_the_call_to_use():
@@ -164,7 +270,16 @@ def test_no_solver_suggests_auto():
         lv.solve(LCP, None)
 
 
-@pytest.mark.parametrize(("name", "instead"), [("converged", "success"), ("velocity", "residual.velocity")])
+@pytest.mark.parametrize(
+    ("name", "instead"),
+    [
+        ("converged", "success"),
+        ("velocity", "residual.velocity"),
+        ("error", "residual"),
+        ("force", "impulse divided by dt"),
+        ("carry", r"carry of the next problem: next_problem\.carry\(solution\)"),
+    ],
+)
 def test_other_names_of_results_suggest_ours(name, instead):
     with pytest.raises(AttributeError, match=f"use {instead}"):
         getattr(lv.solve(LCP), name)

@@ -217,6 +217,52 @@ def test_a_state_that_does_not_fit_the_problem_is_refused():
         lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
 
 
+def test_velocities_of_a_planar_engine_are_accepted():
+    dt, velocity = 0.01, np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
+
+    def found(after, given):
+        builder = lv.RowBuilder([1.0, 0.5], [6.0, 3.0], after, dt, [(0.0, 0.5), (3.0, 0.5)])
+        builder.hinge(0, 1, (1.5, 0.5))
+        for body, x in ((0, -0.5), (0, 0.5), (1, 2.5), (1, 3.5)):
+            builder.contact(-1, body, (x, 0.0), (0.0, 1.0), mu=0.5)
+        return lv.diagnose(builder.problem(), velocity=given)
+
+    fall = np.array([0.0, -9.81, 0.0])
+    wide = np.zeros((2, 6))
+    wide[:, [0, 1, 5]] = velocity
+    for given in (velocity, velocity.tolist(), wide):
+        assert [s.kind for s in found(velocity + dt * fall, given)] == []
+        assert "v* equals v" in str(found(velocity, given))
+        assert "do accelerations lack dt" in str(found(velocity + fall, given))
+
+
+def test_planar_velocities_of_a_problem_in_space_get_the_conversion():
+    problem = SCENES["stack"]
+    velocity = np.arange(3.0 * problem.rows.n_bodies).reshape(-1, 3)
+    with pytest.raises(lv.InputError, match=r"not in the xy plane: .*insert\(v, \[2, 2, 2\], 0\.0, axis=1\)"):
+        lv.diagnose(problem, velocity=velocity)
+    converted = np.insert(velocity, [2, 2, 2], 0.0, axis=1)
+    np.testing.assert_array_equal(converted[:, [0, 1, 5]], velocity)
+    assert not converted[:, 2:5].any()
+    lv.diagnose(problem, velocity=converted)
+
+
+@pytest.mark.parametrize(("mass", "size"), [(100.0, 1.0), (1000.0, 2.0)])
+def test_masses_in_place_of_inverse_masses_are_found_in_space_only(mass, size):
+    """Check the statement of docs/diagnose.md."""
+    inertia, dt, corners = mass * size**2 / 6, 1 / 60, (-size / 2, size / 2)
+    plane = lv.RowBuilder([mass], [inertia], [(0.0, -9.81 * dt, 0.0)], dt, [(0.0, size / 2)])
+    space = lv.RowBuilder(
+        [mass], [inertia * np.eye(3)], [(0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0)], dt, [(0.0, 0.0, size / 2)]
+    )
+    for x in corners:
+        plane.contact(-1, 0, (x, 0.0), (0.0, 1.0), mu=0.5)
+        for y in corners:
+            space.contact(-1, 0, (x, y, 0.0), (0.0, 0.0, 1.0), mu=0.5)
+    assert lv.diagnose(plane.problem()) == ()
+    assert [s.kind for s in lv.diagnose(space.problem())] == ["masses"]
+
+
 def test_a_bounce_before_the_surfaces_meet_is_no_gap_of_the_wrong_sign():
     dt, fall, e = 0.01, np.array([-2.0, -3.0]), 0.5
     gap = np.array([0.01, 0.02])  # m, closed within the step

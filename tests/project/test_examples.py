@@ -1,11 +1,15 @@
 """The examples run, and the relations that they show hold."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from worked import example
+from worked import example, python
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
+
+DOCS = Path(__file__).resolve().parent.parent.parent / "docs"
 
 
 @pytest.fixture
@@ -187,7 +191,16 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     )  # in the box
     assert speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0  # more than the motor's torque
     source = module.__loader__.get_source(module.__name__)
-    assert source.split("# ---")[1].count("\n") <= 60
+    lines = source.split("# ---")[1].count("\n") - 1
+    for page, words in (("quickstart", "an engine of"), ("examples", "a two-dimensional engine in")):
+        assert f"{words} {lines} lines" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+
+
+def test_the_planar_engine_runs_when_it_is_copied_alone(tmp_path):
+    copy = tmp_path / "engine_2d.py"
+    copy.write_text(example("engine_2d").__loader__.get_source("engine_2d"), encoding="utf-8")
+    output = python(copy, cwd=tmp_path).stdout
+    assert "bar: 1.50 rad/s wanted" in output and "no figure: the folder examples/panels is missing" in output
 
 
 # -- of the engine ---------------------------------------------------------------------------------

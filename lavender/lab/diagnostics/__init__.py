@@ -49,9 +49,9 @@ def diagnose(
     problem : Problem
     impulse : (m,) N s, optional
         A solution to examine; default: the problem's guess.
-    velocity : (n, 6) for bodies, (nv,) for J and M, m/s and rad/s, optional
-        Velocity before the step. It is compared with v*, which shows accelerations that were not multiplied by dt or
-        were left out.
+    velocity : (n, 6) for bodies, (n, 3) for bodies in the xy plane, (nv,) for J and M, m/s and rad/s, optional
+        Velocity before the step; in the plane (v_x, v_y, omega), as in `RowBuilder`. It is compared with v*, which
+        shows accelerations that were not multiplied by dt or were left out.
     gap : (n_contacts,), m, optional
         Distance between the surfaces of each contact, negative if they overlap; requires `dt`. It is compared with the
         targets, which shows a wrong sign, or a factor dt too many or too few.

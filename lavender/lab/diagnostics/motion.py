@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, as_array, check_float
+from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
 from lavender.base.errors import InputError
 from lavender.lab.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies, reconstruct_bodies
 from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
@@ -184,12 +184,42 @@ def check_state_arguments(
             "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
         )
     if velocity is not None and motion is not None:
+        if p.rows is not None and get_shape("velocity", velocity) == (p.rows.n_bodies, 3):
+            velocity = embed_planar_velocities(p.rows, velocity)
         velocity = as_array("velocity", velocity, motion[2].shape, unit="m/s")
     if gap is not None:
         if dt is None:
             raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
         gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
     return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
+
+
+def embed_planar_velocities(rows: Rows, velocity: Any) -> FloatArray:
+    """Return the velocities (n, 6) of a problem in the xy plane, given as (v_x, v_y, omega) of each body (n, 3).
+
+    Raises
+    ------
+    InputError
+        A body, joint or contact leaves the plane, so that three numbers may be linear velocities in space.
+    """
+    out_of_plane = [2, 3, 4]
+    jac = np.reshape(rows.jac, (-1, 6))
+    inertia = np.array(rows.inv_inertia)
+    inertia[:, 2, 2] = 0.0
+    vectors = (rows.normal, rows.tangent, rows.arm_a, rows.arm_b)
+    if (
+        rows.v_free[:, out_of_plane].any()
+        or jac[:, out_of_plane].any()
+        or inertia.any()
+        or any(x[:, 2].any() for x in vectors)
+    ):
+        n = rows.n_bodies
+        raise InputError(
+            f"velocity [m/s] has shape ({n}, 3); ({n}, 6) is needed, because the problem is not in the xy plane: "
+            "numpy.hstack([v, omega]) of the linear and the angular velocities, or of (v_x, v_y, omega_z) as v: "
+            "numpy.insert(v, [2, 2, 2], 0.0, axis=1)"
+        )
+    return np.insert(as_array("velocity", velocity, (rows.n_bodies, 3), unit="m/s"), [2, 2, 2], 0.0, axis=1)
 
 
 def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:

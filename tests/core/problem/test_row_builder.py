@@ -1,5 +1,6 @@
 """`RowBuilder`: closed-form solutions, two dimensions as a plane of three, keys, and agreement of all solvers."""
 
+import re
 from functools import partial
 
 import numpy as np
@@ -266,6 +267,45 @@ def test_blocks_have_names_and_order():
     assert (builder.rows_of(hinge), builder.rows_of(contact)) == (slice(0, 2), slice(2, 4))
     assert problem.row_name(3) == "contact 0 of world and body 0, tangent 1"
     assert np.diff(problem.cones.ptr).tolist() == [2, 2] and problem.name == "two"
+
+
+def largest_velocity_of_a_stack(slop, n=4, dt=1 / 120, steps=360, **options):
+    """Return the largest velocity [m/s or rad/s] of n boxes of 1 m in the last 30 of the steps."""
+    position = np.array([(0.0, 0.5 + k) for k in range(n)])
+    angle, velocity, solution, largest = np.zeros(n), np.zeros((n, 3)), None, []
+    for _ in range(steps):
+        builder = lv.RowBuilder(
+            np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop
+        )
+        turn = [np.array([(np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a))]) for a in angle]
+        for k in range(n):
+            below, frame = (position[k - 1], turn[k - 1]) if k else (np.array((0.0, -0.5)), np.eye(2))
+            for i, x in enumerate((-0.5, 0.5)):
+                along, height = (position[k] + turn[k] @ (x, -0.5) - below) @ frame
+                point = below + frame @ (np.clip(along, -0.5, 0.5) if k else along, height)
+                if height - 0.5 < 0.02:
+                    builder.contact(k - 1, k, point, frame @ (0.0, 1.0), gap=height - 0.5, mu=0.6, feature=i)
+        problem = builder.problem()
+        start = None if solution is None else problem.carry(solution)
+        solution = lv.solve(problem, "pgs", impulse=start, **options)
+        velocity = builder.velocity_after(problem, solution.impulse)
+        position, angle = position + dt * velocity[:, :2], angle + dt * velocity[:, 2]
+        largest.append(abs(velocity).max())
+    return max(largest[-30:])
+
+
+def test_a_slop_or_a_tolerance_keeps_a_stack_at_rest():
+    """Check the statement of the quick start about budgets, with four boxes for three seconds."""
+    assert largest_velocity_of_a_stack(0.0, tol=0, max_iter=10) > 0.03
+    assert largest_velocity_of_a_stack(0.001, tol=0, max_iter=10) < 1e-3
+    assert largest_velocity_of_a_stack(0.0, tol=1e-6, max_iter=10_000) < 1e-4
+
+
+def test_equations_that_the_help_cites_are_in_it():
+    notes = lv.RowBuilder.__doc__.split("Notes\n")[1]
+    for owner in (lv.RowBuilder, *vars(lv.RowBuilder).values()):
+        for number in re.findall(r"eq\. (\d)", getattr(owner, "__doc__", None) or ""):
+            assert f"({number})\n" in notes
 
 
 def test_a_builder_without_blocks_gives_an_empty_problem():
