@@ -54,7 +54,7 @@ class APGD:
                 if not tol < relative < GROWN:
                     state.before = before
                     status = lv.Status.CONVERGED if relative <= tol else lv.Status.DIVERGED
-                    return lv.Claim(status, i, {"matvecs": i})
+                    return lv.Claim(status, i, {"products": i})
             theta, now = state.theta, impulse.copy()
             after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
             y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - before)
@@ -64,7 +64,7 @@ class APGD:
             before = now
             state.done += 1
         state.before = before
-        return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"matvecs": n})
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"products": n})
 
 
 def refusal(problem):

@@ -23,9 +23,11 @@ from lavender.contract.requirement import (
     register_check,
 )
 from lavender.judge.residuals import residual
-from lavender.judge.solution import Status
+from lavender.judge.solution import MATRIX_PASS_COUNTERS, OTHER_WORK_COUNTERS, Status
 from lavender.solvers.registry import SolverSpec
 from lavender.solving.solve import solve
+
+WORK_COUNTERS = MATRIX_PASS_COUNTERS | OTHER_WORK_COUNTERS
 
 # -- laws, forms and options --------------------------------------------------------------------------
 
@@ -71,6 +73,11 @@ def require_every_listed_law_is_solved(spec: SolverSpec) -> None:
             raise_unless(
                 sum(solution.work.values()) > 0,
                 f"{text}. Its work counts nothing; the claim must count sweeps, products or other work",
+            )
+            raise_unless(
+                not WORK_COUNTERS.isdisjoint(solution.work),
+                f"{text}. Its work counts {', '.join(map(repr, solution.work))}; at least one of "
+                f"{', '.join(sorted(WORK_COUNTERS))} is needed, so that reports can compare it",
             )
             raise_unless(
                 solution.iterations > 0 or not spec.resumable,

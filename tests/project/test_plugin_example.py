@@ -34,7 +34,7 @@ assert "apgd" in lv.available(law="lcp"), lv.known()
 for name in ("stack(n=6)", "granular(n=3)", "random_spd(n=30, condition=100)"):
     problem = suite.case(name).problem
     found = lv.solve(problem, "apgd", tol=1e-9, max_iter=20_000)
-    assert found.success and found.work["matvecs"] > 0, found
+    assert found.success and found.work["products"] > 0, found
     exact = lv.solve(problem, "direct", tol=1e-9)
     # Slack is unique; both are within 1e-9 of the largest right-hand side, times the conditioning (below 1e3).
     np.testing.assert_allclose(found.slack, exact.slack, rtol=0.0, atol=1e-6 * abs(problem.b).max())
@@ -82,7 +82,7 @@ class Faulty(APGD):
     def run(self, state, impulse, n, tol, time_limit=None):
         if len(impulse) == 1:
             os._exit(7)
-        return lv.Claim(lv.Status.CONVERGED, 1, {"matvecs": 1})
+        return lv.Claim(lv.Status.CONVERGED, 1, {"products": 1})
 
 SPEC = replace(APGD_SPEC, name="faulty", factory=Faulty)
 """

@@ -15,7 +15,7 @@ from statistics import median
 
 from lavender.base.arrays import check_choice
 from lavender.judge.residuals import at_floor
-from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, MATRIX_PASS_COUNTERS, OTHER_WORK_COUNTERS
 from lavender.lab.bench.record import Record, describe_target
 from lavender.lab.bench.store import Records
 
@@ -246,7 +246,7 @@ def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None 
     return out
 
 
-def _repeats_earlier_run(r: Record) -> bool:
+def repeats_earlier_run(r: Record) -> bool:
     """Return whether a run times a call again that was measured before: an interleaved call without a time limit."""
     return bool(r.interleave_group) and r.mode != "time"
 
@@ -255,7 +255,7 @@ def list_failures(records: Records) -> list[Record]:
     """Return runs that missed their tolerance above the round-off floor, crashes, and false claims."""
     out = []
     for r in records:
-        if _repeats_earlier_run(r):
+        if repeats_earlier_run(r):
             continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.roundoff_floor)
         proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
@@ -299,7 +299,7 @@ def count_claims(records: Records) -> list[Claims]:
     """Count the correct and wrong claims of each solver."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        runs = [r for r in records if r.solver == solver and not _repeats_earlier_run(r)]
+        runs = [r for r in records if r.solver == solver and not repeats_earlier_run(r)]
         to_tolerance = [r for r in runs if r.mode == "tol"]
         out.append(
             Claims(
@@ -443,12 +443,6 @@ def collect_times_to_tolerance(records: Records, tolerance: float) -> dict[str, 
         if reach.start == "cold":
             out[reach.case][reach.solver] = reach.times[tolerance]
     return out
-
-
-#: Counters of `work` that count passes over the entries of A: sweeps over all blocks, or products with A.
-MATRIX_PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
-#: Counters of work that cannot be expressed in passes; solvers with such work are not in a profile by work.
-OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
 
 
 def count_sweeps_and_products(record: Record) -> float:

@@ -147,7 +147,7 @@ FLAT_LINES_NOTE = (
 )
 PASSES_NOTE = (
     "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "
-    "factorise, pivot or solve linear systems do other work and are not compared"
+    "factorise, pivot or solve linear systems, or count neither sweeps nor products, are not compared"
 )
 GRID_SIZE = 49  # Number of points on the horizontal axis at which the residuals of all cases are evaluated.
 

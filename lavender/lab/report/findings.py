@@ -84,14 +84,14 @@ class Report:
 
     @cached_property
     def load_summary(self) -> str:
-        """Sentences on the mean and largest load of the newest run, and on runs with more processes than cores.
+        """Sentences on the mean and largest load during the ranked runs, and on runs with more processes than cores.
 
         Empty without times or loads.
         """
         if self.is_campaign or not len(self.newest_run):
             return ""
         (run,) = self.newest_run.runs.values()
-        return machine.summarise_loads((r.load for r in self.newest_run), run.cores)
+        return machine.summarise_loads((r.load for r in self.ranked_records), run.cores)
 
     @cached_property
     def load_warning(self) -> str:
@@ -99,7 +99,7 @@ class Report:
         if self.is_campaign or not len(self.newest_run):
             return ""
         (run,) = self.newest_run.runs.values()
-        return machine.describe_loaded_runs((r.load for r in self.newest_run), run.cores)
+        return machine.describe_loaded_runs((r.load for r in self.ranked_records), run.cores)
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:

@@ -26,6 +26,7 @@ from lavender.base.deadline import format_seconds
 from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
+from lavender.lab.bench.recommendation import recommend_from_single_runs
 from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
 from lavender.lab.bench.stopwatch import excludes_setup
@@ -222,22 +223,20 @@ def _write_tables(report: Report) -> str:
         "Recommended solver, its mean time, and the cases that it brings to the tolerance if it misses some, from runs "
         f"to a tolerance. Solvers within {TIME_NOISE_FACTOR:g} times of each other count as equal."
     )
-    if table_specs.has_interleaved_calls(report):
-        caption += (
-            f" To {middle} the lower quartile of repetitions that alternate between solvers, otherwise the minimum of "
-            "consecutive repeats."
-        )
     everyone = {r.solver for r in records}
     single = any(r.step < 0 for r in records)
     caption += _describe_times(report, everyone, not single) + _describe_unloaded_cases(records)
-    advice, last = table_specs.tabulate_recommended_solvers(report), 1 + len(report.tolerances)
+    # All tables contain minima of consecutive repeats, so that they can be compared.
+    rankings = recommend_from_single_runs(records, report.recommendation_times)
+    advice = table_specs.tabulate_recommended_solvers(report, rankings=rankings)
+    last = 1 + len(report.tolerances)
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
             f"{line.n_cases}{format_left_out_count(line.left_out)}",
             *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
         ]
-        for row, line in zip(advice.rows, report.rankings, strict=True)
+        for row, line in zip(advice.rows, rankings, strict=True)
     ]
     parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
     for law, by_tolerance in statistics.compute_mean_times_by_law(records).items():
@@ -299,6 +298,9 @@ def _describe_method(report: Report) -> str:
     lost = format_left_out_count(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
+    solved_at_zero = len({r.case for r in report.newest_run}) - len({r.case for r in records})
+    if solved_at_zero:
+        row_range += f"; {solved_at_zero} more are left out, because the zero impulse solves them"
     timed = describe_timed_code(r for r in own if r.order == "given" and not r.interleave_group)
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {row_range}),",

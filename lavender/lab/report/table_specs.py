@@ -224,19 +224,23 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 
-def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None = None) -> Table:
+def tabulate_recommended_solvers(
+    report: Report,
+    links: Mapping[str, str] | None = None,
+    rankings: Sequence[FamilyAdvice] | None = None,
+) -> Table:
     """Tabulate the best solver to each tolerance and within each time [s], for each structure and sequence.
 
     `links` maps the name of a structure or sequence to the id of the part of the page to which its cell links.
+    `rankings` replaces the rankings of the report.
     """
+    rankings = report.rankings if rankings is None else rankings
     heads = [
         *(f"to {format_tolerance(x)}" for x in report.tolerances),
         *(f"in {format_seconds(t)}" for t in report.recommendation_times),
     ]
     tolerance = report.tolerances[len(report.tolerances) // 2]
-    engines = [
-        rank_engine(report.engines, report.ranked_records, line.cases, tolerance) for line in report.rankings
-    ]
+    engines = [rank_engine(report.engines, report.ranked_records, line.cases, tolerance) for line in rankings]
     rows: Rows = [
         [
             Cell(
@@ -249,7 +253,7 @@ def tabulate_recommended_solvers(report: Report, links: Mapping[str, str] | None
             *(format_advice(a, True) for a in line.by_time.values()),
             _format_engine(engine, tolerance),
         ]
-        for line, engine in zip(report.rankings, engines, strict=True)
+        for line, engine in zip(rankings, engines, strict=True)
     ]
     table = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
     return table if any(engines) else table.without_columns(ENGINES_OWN)
@@ -499,6 +503,9 @@ def explain_run_counts(records: Records) -> str:
         sentences.append(
             f"Candidates of a recommendation also have runs with a time limit: {', '.join(limited)}"
         )
+    repeated = sum(statistics.repeats_earlier_run(r) for r in records)
+    if repeated:
+        sentences.append(f"{format_count(repeated, 'run')} that time a call again are not counted")
     return ". ".join(sentences) + "."
 
 

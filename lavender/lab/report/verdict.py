@@ -152,7 +152,7 @@ def _recommend_solver(
         _make_statement_with_code(
             records, call, _add_engine_to_sentence(records, head, first, engine, cases)
         ),
-        *_state_plug_ins(subject.best, first.solver),
+        *_state_plug_ins(records, subject.best, first.solver),
         *_describe_resampled_ranking(resampled),
     ]
     leaders = [c.solver for _, c in resampled.ranking[:3] if c.solved]
@@ -306,7 +306,7 @@ def _add_engine_to_sentence(
     return f"{head} The engine's own {engine.solver} {of} {time}, {INSIDE}."
 
 
-def _state_plug_ins(advice: Advice, first: str) -> list[Statement]:
+def _state_plug_ins(records: Records, advice: Advice, first: str) -> list[Statement]:
     """State place and time of the best plug-ins other than the recommended solver `first`, in one sentence."""
     ranked = [
         (place, choice)
@@ -317,6 +317,8 @@ def _state_plug_ins(advice: Advice, first: str) -> list[Statement]:
     texts = []
     for place, choice in named:
         time = f" in {format_seconds(choice.score)}" if choice.solved else ""
+        if 0 < choice.solved < choice.cases:
+            time += f" (a miss counted as {format_seconds(statistics.get_penalty_time_of_miss(records))})"
         solved = f"{choice.solved} of {choice.cases} solved{time}"
         texts.append(f"{choice.solver}: place {place} of {len(advice.ranking)}, {solved}")
     if not texts:
@@ -424,7 +426,7 @@ def _make_statement_with_code(
     records: Records, call: TimedCall, text: str, requested: bool = False
 ) -> Statement:
     """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
-    if not call.as_record.times:
+    if not call.as_record.timing_mode:
         text += " Records of an earlier version: the call itself was not timed."
     line, reason, in_c = call.as_record, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)

@@ -90,6 +90,12 @@ class CountsNothing(Sweeps):
         return lv.Claim(claim.status, claim.iterations)
 
 
+class MisnamesWork(Sweeps):
+    def run(self, *arguments):
+        claim = super().run(*arguments)
+        return lv.Claim(claim.status, claim.iterations, {"passes": claim.iterations})
+
+
 class Sloppy(Sweeps):
     """It stops only at ten times the tolerance."""
 
@@ -204,6 +210,7 @@ FAULTS = [
         "Claim CONVERGED only if lv.residual(problem, impulse).relative <= tol",
     ),
     (CountsNothing, "every_listed_law_is_solved", "Its work counts nothing"),
+    (MisnamesWork, "every_listed_law_is_solved", "Its work counts 'passes'; at least one of backend_calls"),
     (
         Option,
         "options_match_the_factory",
