@@ -60,19 +60,10 @@ ARGUMENT_HINTS = {
         ("guess", "initial_guess", "initvals", "lam0", "warm_start", "warmstart", "x0"), ("impulse", "guess")
     ),
     **dict.fromkeys(
-        (
-            "iterations",
-            "iters",
-            "max_iterations",
-            "max_sweeps",
-            "maxit",
-            "maxiter",
-            "n_iter",
-            "niter",
-            "sweeps",
-        ),
+        ("iterations", "iters", "max_iterations", "maxit", "maxiter", "n_iter", "niter", "num_iterations"),
         ("max_iter",),
     ),
+    **dict.fromkeys(("max_sweeps", "n_sweeps", "num_sweeps", "sweeps"), ("max_iter",)),
     **dict.fromkeys(("accuracy", "eps", "rtol", "tolerance"), ("tol",)),
     **dict.fromkeys(("time_budget", "timeout"), ("time_limit",)),
     **dict.fromkeys(("algorithm", "method", "name"), ("solver",)),

@@ -12,6 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import (
     ArrayLike,
+    FloatArray,
     as_array,
     check_float,
     check_int,
@@ -163,6 +164,19 @@ def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], iner
         )
 
 
+def _as_inverses(name: str, value: ArrayLike, n: int, unit: str) -> FloatArray:
+    """Convert inverse masses or inertias (n,); the error for infinity names the value of a body that does not move."""
+    array = as_array(name, value, (n,), finite=False, unit=unit)
+    infinite = np.flatnonzero(np.isposinf(array))
+    if len(infinite):
+        raise InputError(
+            f"{name} [{unit}] of body {infinite[0]} is inf, and a finite number is needed; it is 0 for a body that "
+            "impulses do not move"
+        )
+    check_nonnegative_magnitudes(name, array, unit)
+    return array
+
+
 class RowAssembly:
     """Bodies, blocks and keys of a step; the notes of `RowBuilder` define equations (1) to (5).
 
@@ -189,13 +203,10 @@ class RowAssembly:
         self._position = np.zeros((n, 3))
         self._position[:, : shape[1]] = as_array("position", position, (n, shape[1]), unit="m")
         self._centres: list[Vector] = [(x, y, z) for x, y, z in self._position.tolist()]
-        self._inv_mass = as_array("inv_mass", inv_mass, (n,), unit="1/kg")
-        check_nonnegative_magnitudes("inv_mass", self._inv_mass, "1/kg")
+        self._inv_mass = _as_inverses("inv_mass", inv_mass, n, "1/kg")
         if self._is_planar:
-            about_z = as_array("inv_inertia", inv_inertia, (n,), unit="1/(kg m^2)")
-            check_nonnegative_magnitudes("inv_inertia", about_z, "1/(kg m^2)")
             self._inv_inertia = np.zeros((n, 3, 3))
-            self._inv_inertia[:, 2, 2] = about_z
+            self._inv_inertia[:, 2, 2] = _as_inverses("inv_inertia", inv_inertia, n, "1/(kg m^2)")
             self._velocity = np.zeros((n, 6))
             self._velocity[:, PLANAR_VELOCITIES] = as_array("velocity", velocity, (n, 3), unit="m/s, rad/s")
         else:

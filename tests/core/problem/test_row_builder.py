@@ -367,6 +367,9 @@ def test_errors_of_the_builder_and_of_three_dimensions():
         planar(position=np.zeros(4))
     with pytest.raises(lv.InputError, match=r"velocity .* has shape \(1, 2\); \(1, 3\) is needed"):
         planar(velocity=(1.0, 2.0))
+    for name in ("inv_mass", "inv_inertia"):
+        with pytest.raises(lv.InputError, match=rf"{name} .* of body 0 is inf.*; it is 0 for a body that"):
+            planar(**{name: np.inf})
     builder = partial(spatial, np.zeros((1, 6)), np.zeros((1, 3)))
     with pytest.raises(lv.InputError, match=r"axis is None; a vector \(3,\)"):
         builder().hinge(-1, 0, np.zeros(3))
