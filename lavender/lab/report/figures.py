@@ -194,10 +194,12 @@ def build_overall_figure(records: Records, measure: str = "time") -> Figure:
         # The curve starts after the last time at which half of the cases have no result.
         first = max(np.flatnonzero(bands[0] == 1.0), default=0)
         across, lower, middle, upper = (tuple(x[first:].tolist()) for x in (grid, *bands))
-        curves.append(Curve(solver, solver, across, middle, low=lower, high=upper))
+        # A solver may not accept every case.
+        label = solver if len(own) == len(cases) else f"{solver} ({len(own)} of {len(cases)})"
+        curves.append(Curve(solver, label, across, middle, low=lower, high=upper))
     over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
     if any(len(own) < len(cases) for own in by.values()):
-        over += "; no result: 1"
+        over += "; no result counts as 1 (the legend gives the number of cases with results)"
     note = FLAT_LINES_NOTE
     if by_work:
         names = f" ({', '.join(sorted(excluded))})" if excluded else ""

@@ -300,7 +300,7 @@ def _describe_method(report: Report) -> str:
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
     solved_at_zero = len({r.case for r in report.newest_run}) - len({r.case for r in records})
     if solved_at_zero:
-        row_range += f"; {solved_at_zero} more are left out, because the zero impulse solves them"
+        row_range += f"; left out because the zero impulse solves them: {solved_at_zero}"
     timed = describe_timed_code(r for r in own if r.order == "given" and not r.interleave_group)
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {row_range}),",
