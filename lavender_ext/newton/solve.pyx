@@ -26,7 +26,7 @@ from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_
                                          order_index_size, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
-from lavender_ext.newton.path cimport path_compliance, evaluate_smoothed_map
+from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
@@ -438,13 +438,6 @@ cdef class Solve(Method):
         cdef double[::1] f = f_array
         evaluate_system_natural_map(&self.n.s, &z[0], &s[0], law, eps, &f[0])
         return f_array
-
-    def evaluate_smoothed_natural_map(self, const double[::1] z, double tau, double ratio=1.0):
-        """Return F (m,) of path.pxd with c = ratio, and dF / d log tau (m,); small matrices go to p, einv and v."""
-        cdef newton_t* n = self.n
-        n.s.law, n.path.friction_ratio, n.path.eps = COULOMB, ratio, path_compliance()
-        evaluate_smoothed_map(n, &z[0], tau, True)
-        return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
 
     def multiply_by_natural_map_derivative(self, const double[::1] dz):
         """Return (I - P) dz + P H dz."""
