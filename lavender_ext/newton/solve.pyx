@@ -14,7 +14,6 @@ import numpy as np
 from lavender_ext.core.arrays cimport get_data_pointer, allocate_zeros
 from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
-from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide
