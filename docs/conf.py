@@ -5,8 +5,11 @@ and figures of the examples, cases, measured curves. The contents are added to t
 does not show their source.
 """
 
+import re
 import sys
 from pathlib import Path
+
+from docutils import nodes
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]  # generate.py, benchmarks
 
@@ -75,9 +78,30 @@ def add_contents(app, name, source):
         source[0] += toctree("", "\n".join(f"generated/solvers/{page}" for page in pages))
 
 
+#: Matches a number with an exponent, a unit, or both.
+UNIT = r"(?:[µnm]?s|[µmc]?m|m/s|rad/s|rad|N\ss|N|J|√J|kg|Hz|[kMGT]i?B|%|times)(?![\w/])"
+NUMBER = re.compile(rf"(?<![\w.])\d[\d.,]*(?:e-?\d+(?:\s{UNIT})?|\s{UNIT})")
+
+
+def keep_numbers_together(app, doctree, name):
+    """Mark numbers with their units in the text of a page, so that the style sheet keeps each on one line."""
+    for text in list(doctree.findall(nodes.Text)):
+        if isinstance(
+            text.parent, (nodes.literal, nodes.literal_block, nodes.math, nodes.raw, nodes.comment)
+        ):
+            continue
+        parts, end = [], 0
+        for match in NUMBER.finditer(text):
+            parts += [nodes.Text(text[end : match.start()]), nodes.inline("", match[0], classes=["number"])]
+            end = match.end()
+        if parts:
+            text.parent.replace(text, [*parts, nodes.Text(text[end:])])
+
+
 def setup(app):
     """Write the generated pages, and make reStructuredText of docstrings that are plain text."""
     app.connect("builder-inited", lambda app: generate.write(Path(app.srcdir), Path(app.doctreedir)))
     app.connect("source-read", add_contents)
+    app.connect("doctree-resolved", keep_numbers_together)
     app.connect("autodoc-process-docstring", docstrings.process, priority=100)
     app.connect("autodoc-process-docstring", docstrings.add_fields, priority=900)

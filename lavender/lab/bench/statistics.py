@@ -686,6 +686,7 @@ class Pass:
     times: Mapping[str, tuple[float, ...]]  # Start -> time [s] of each step.
     iterations: Mapping[str, int]
     residuals: Mapping[str, tuple[float, ...]]  # Start -> relative residual of each step.
+    numbers: Mapping[str, tuple[int, ...]]  # Start -> number of each step in its recording.
 
     @property
     def target(self) -> str:
@@ -739,6 +740,7 @@ def group_runs_by_pass(records: Records) -> list[Pass]:
                 times={s: tuple(_get_step_time(r) for r in g) for s, g in by_start.items()},
                 iterations={s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 residuals={s: tuple(r.relative for r in g) for s, g in by_start.items()},
+                numbers={s: tuple(r.step for r in g) for s, g in by_start.items()},
             )
         )
     return out

@@ -142,8 +142,8 @@ def _build_case_figure(name: str, x_title: str, records: Records, case: str, cur
 
 
 FLAT_LINES_NOTE = (
-    "A curve is flat after its solver has stopped: it met a tolerance (grey lines), and the curve keeps the "
-    "residual of its last run."
+    "A curve is flat after the last run of its solver, which ended at a tolerance (grey lines) or after a fixed "
+    "number of iterations."
 )
 PASSES_NOTE = (
     "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "
@@ -273,12 +273,14 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
             values = np.cumsum(w.times[start]).tolist() if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
             label = f"{w.solver} (cold)" if cold else w.solver
-            curves.append(Curve.from_points(w.solver, label, enumerate(values), thin=cold))
+            curves.append(
+                Curve.from_points(w.solver, label, zip(w.numbers[start], values, strict=True), thin=cold)
+            )
     target = passes[0].target
     return Figure(
         f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
         "time of all steps so far [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
-        y_log=not timed, left_out=tuple(sorted(set(ranked) - drawn)),
+        left_out=tuple(sorted(set(ranked) - drawn)),
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from lavender.base.deadline import format_seconds
 from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
+from lavender.lab.bench.machine import summarise_loads
 from lavender.lab.bench.recommendation import recommend_from_single_runs
 from lavender.lab.bench.record import format_tolerance, make_file_name
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
@@ -49,6 +50,10 @@ FIGURE_SIZE = (5.5, 3.4)  # [inches] The width is the text width of a page.
 FIGURES_HEAD = (
     "% \\usepackage{graphicx}\n"
     "% The figures are 5.5 in wide with text of 7 to 10 pt: use figure* in two columns.\n\n"
+)
+TABLES_HEAD = (
+    "% \\usepackage{booktabs}\n% \\usepackage{graphicx}\n"
+    "% A table that is wider than the line is scaled down: use table* in two columns.\n"
 )
 REFERENCE_SOLVER = "osqp"  # Figures of error against time show it if it was measured.
 
@@ -109,7 +114,11 @@ def _build_folder_figures(records: Records) -> Group:
         part = records.with_records(r for r in records if sources.get(r.case, Path()).parent == folder)
         name = folder.name if sum(f.name == folder.name for f in folders) == 1 else str(folder)
         groups[name] = tuple(
-            replace(figure, name=f"{prefix}class {name}", title=f"{name}: {figure.title}")
+            replace(
+                figure,
+                name=f"{prefix}class {name}",
+                title=f"Folder {name}: {figure.title[:1].lower()}{figure.title[1:]}",
+            )
             for prefix, measure in (("", "time"), ("work ", "work"))
             for figure in (build_overall_figure(part, measure),)
             if figure.curves
@@ -173,14 +182,15 @@ def _describe_unloaded_cases(records: Records) -> str:
 
 
 def _describe_times(report: Report, solvers: set[str], sequences: bool = False) -> str:
-    """Return a sentence on which code the times of these solvers include, and on the machine's load if it was high."""
+    """Return a sentence on which code the times of these solvers include, and one on a busy machine."""
     records = report.ranked_records
     runs = [
         r for r in records
         if r.solver in solvers and r.order == "given" and not r.interleave_group and (r.step >= 0) is sequences
     ]  # fmt: skip
     sentence = describe_timed_code(runs)
-    return f" {sentence} {report.load_warning}".rstrip() if sentence else ""
+    busy = " The machine was busy: these times may be too long." if report.load_warning else ""
+    return f" {sentence}{busy}" if sentence else ""
 
 
 def _include_figure(figure: Figure, report: Report) -> str:
@@ -201,10 +211,13 @@ def _include_figure(figure: Figure, report: Report) -> str:
         caption += _describe_unloaded_cases(records)
     if any(c.steps for c in figure.curves):
         by_work = figure.name.startswith("work ")
-        cost = "the fewest passes over A" if by_work else "the fastest solver's time"
+        cost = "the fewest passes over A of any solver" if by_work else "the fastest solver's time"
         caption = f"Share of cases solved within a multiple of {cost}: law {caption}"
         caption += f" {PASSES_NOTE}." if by_work else ""
         caption += " Only runs to a tolerance count."
+    banded = list(dict.fromkeys(c.solver for c in figure.curves if c.low))
+    if banded and "middle half" in figure.title:
+        caption += f" Bands (middle half of the cases): {', '.join(banded)}."
     if figure.note:
         caption += f" {figure.note}"
     if figure.left_out:
@@ -221,7 +234,7 @@ def _write_tables(report: Report) -> str:
     middle = format_tolerance(report.tolerances[len(report.tolerances) // 2])
     caption = (
         "Recommended solver, its mean time, and the cases that it brings to the tolerance if it misses some, from runs "
-        f"to a tolerance. Solvers within {TIME_NOISE_FACTOR:g} times of each other count as equal."
+        f"to a tolerance. ≈: other solvers take at most {TIME_NOISE_FACTOR:g} times as long, which counts as equal."
     )
     everyone = {r.solver for r in records}
     single = any(r.step < 0 for r in records)
@@ -234,7 +247,7 @@ def _write_tables(report: Report) -> str:
         [
             str(row[0]),
             f"{line.n_cases}{format_left_out_count(line.left_out)}",
-            *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
+            *(replace(c, after=" ≈" * ("≈" in c.after)) for c in row[1:last] if isinstance(c, Cell)),
         ]
         for row, line in zip(advice.rows, rankings, strict=True)
     ]
@@ -258,7 +271,7 @@ def _write_tables(report: Report) -> str:
             f"Solvers of other packages, to {middle}, geometric means over the cases that each solves. Call: the time "
             "of the other tables. Own interface: its part in the package's own solve function, on converted data"
             f"{f' (without set-up: {separate})' if separate else ''}. Rest: conversion, checks, judge, Python, and "
-            "set-up outside of that function. Last: cases on which the own interface takes less time than the "
+            "set-up outside of that function. Cases faster: cases on which the own interface takes less time than the "
             "complete call of lavender's fastest solver."
         )
         parts.append(format_latex(backends, caption + _describe_unloaded_cases(records), "own-interface"))
@@ -268,7 +281,7 @@ def _write_tables(report: Report) -> str:
     )
     caption += _describe_unloaded_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
-    return "% \\usepackage{booktabs}\n% \\usepackage{graphicx}\n" + "\n".join(parts)
+    return TABLES_HEAD + "\n".join(parts)
 
 
 def _describe_method(report: Report) -> str:
@@ -289,12 +302,15 @@ def _describe_method(report: Report) -> str:
     budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
     swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
-    minimum = f"the minimum of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
+    least = f"{repeats[0]} to " if len(repeats) > 1 else ""
+    minimum = f"the minimum of {least}{format_count(repeats[-1], 'repeat')}"
     limit, threads = (
         format_seconds(statistics.get_penalty_time_of_miss(records)),
         format_count(run.threads, "thread"),
     )
-    solvers = format_count(len({r.solver for r in own}), "solver")
+    names = sorted({r.solver for r in own})
+    solvers = f"{format_count(len(names), 'solver')} ({', '.join(names)})"
+    loads = summarise_loads((r.load for r in own), run.cores)
     lost = format_left_out_count(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
     shift = format_seconds(statistics.MEAN_TIME_SHIFT)
@@ -307,8 +323,8 @@ def _describe_method(report: Report) -> str:
         f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution.",
-        f"{timed} Each is {minimum}, within a limit of {limit}, on numbers that were written just before;",
-        f"BLAS and OpenMP had {threads}. {report.load_summary} {report.stopped_warning} {report.high_load}",
+        f"{timed} It is {minimum}, within a limit of {limit}, on numbers that were written just before;",
+        f"BLAS and OpenMP had {threads}. {loads} {report.stopped_warning}",
         "Times to a tolerance are of runs to this tolerance or a tighter one, never of runs with a fixed budget. Means",
         f"are geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
         f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",

@@ -16,7 +16,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -307,10 +307,15 @@ def _escape_dollars_in_legend(legend: Any) -> Any:
     return legend
 
 
-def save_figures(figures: Iterable[Figure], folder: Path, styles: Mapping[str, CurveStyle]) -> None:
-    """Write each figure as NAME.svg and NAME.png."""
+def save_figures(
+    figures: Iterable[Figure], folder: Path, styles: Mapping[str, CurveStyle], leaders: Sequence[str] = ()
+) -> None:
+    """Write each figure as NAME.svg and NAME.png. If `leaders` are given, only they have bands."""
     for figure in figures:
-        canvas = plot_figure(figure, styles)
+        curves = (
+            c if not leaders or c.solver in leaders else replace(c, low=(), high=()) for c in figure.curves
+        )
+        canvas = plot_figure(replace(figure, curves=tuple(curves)), styles)
         path = make_folder(folder) / make_file_name(figure.name)
         write_figure(canvas, path.with_name(path.name + ".svg"), metadata={"Date": None})
         write_figure(canvas, path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})

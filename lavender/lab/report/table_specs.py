@@ -515,7 +515,10 @@ def tabulate_mean_times(by_tolerance: Mapping[float, Mapping[str, tuple[float, i
     rows: Rows = [
         [
             solver,
-            *(Cell.time(t, after=f" {n}/{of}") for t, n, of in (by_tolerance[x][solver] for x in tolerances)),
+            *(
+                Cell.time(t, after=f" ({n}/{of})")
+                for t, n, of in (by_tolerance[x][solver] for x in tolerances)
+            ),
         ]
         for solver in by_tolerance[tolerances[0]]
     ]
@@ -539,7 +542,7 @@ def tabulate_backends(records: Records) -> Table:
         "call",
         "own interface",
         "rest",
-        "own interface below lavender's fastest call",
+        "cases faster",
     ]
     return Table(heads, rows)
 

@@ -50,7 +50,9 @@ def describe_timed_code(runs: Iterable[Record]) -> str:
     conversion = (
         f" (the set-up of {', '.join(others)} includes the conversion of the problem)" if others else ""
     )
-    return f"Time of {'; or of '.join(TIMED_CODE[mode][1] for mode in modes)}{conversion}."
+    return (
+        f"Each time is the duration of {'; or of '.join(TIMED_CODE[mode][1] for mode in modes)}{conversion}."
+    )
 
 
 def format_residual(x: float) -> str:

@@ -13,6 +13,8 @@ from lavender.lab.report.markdown import summarise_report
 from lavender.lab.report.page import render_page
 from lavender.lab.report.plotting import assign_styles, save_figures
 
+MAX_BANDS = 2  # More bands of one figure would hide each other.
+
 
 def write(source: Records | Report, folder: str | Path, *, figures: bool = True) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
@@ -52,5 +54,5 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
     write_text(folder / "summary.md", summarise_report(report))
     if figures:
         solvers = {*report.all_records.solvers, *(c.solver for figure in drawn for c in figure.curves)}
-        save_figures(drawn, folder / "figures", assign_styles(solvers))
+        save_figures(drawn, folder / "figures", assign_styles(solvers), report.verdict.leaders[:MAX_BANDS])
     return index

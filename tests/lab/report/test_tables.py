@@ -185,6 +185,10 @@ def test_a_figure_of_a_sequence_has_one_tolerance_and_few_solvers(sequence):
     assert {c.solver for c in figure.curves} == {"anderson", "jacobi", "newton", "nncg", "pgs"}
     assert figure.left_out == ("sequential_impulses", "sor")
     carried = next(c for c in figure.curves if c.label == "anderson")
+    later = figures.build_pass_figure(
+        "s", [replace(w, numbers=dict.fromkeys(w.numbers, (0, 3, 4, 9))) for w in timed]
+    )
+    assert carried.x == (0, 1, 2, 3) and {c.x for c in later.curves} == {(0, 3, 4, 9)}  # as recorded
     assert carried.y == pytest.approx([1e-3, 2e-3, 3e-3, 4e-3])  # the time of all steps so far
     drawn = figures.build_figures(sequence).sequences["s"]
     assert [f.title for f in drawn] == ["s: 8 iterations", "s: to 1e-9"]  # the middle of 1e-6 and 1e-9
