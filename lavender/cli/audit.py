@@ -82,14 +82,10 @@ def audit(
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with show_progress() as watch:
-        result = run(model, watch=watch, **options)
+        result = run(model, watch=watch, max_velocity_error=max_velocity_error, **options)
     result.write(out)
     show_page(result.summary_page, out)
-    if (
-        result.n_diverged
-        or result.n_unjudged
-        or (max_velocity_error is not None and result.max_velocity_error > max_velocity_error)
-    ):
+    if result.n_diverged or result.n_unjudged or result.n_above_limit:
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
@@ -114,6 +110,7 @@ def _audit_claims(
             total=steps,
             watch=watch,
         )
+    result.error_limit = max_velocity_error
     show_page(result.summary_page, out)
-    if result.is_any_lost or (max_velocity_error is not None and result.largest > max_velocity_error):
+    if result.is_any_lost or result.n_above_limit:
         raise click.exceptions.Exit(EXIT_UNMET)

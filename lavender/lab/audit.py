@@ -91,6 +91,10 @@ AUDIT_BUSY_CONSEQUENCE = (
     "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
 OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
+DIVERGENCE_ADVICE = (
+    'To find out whether the solver is the cause, audit again with <option solver="Newton" iterations="100" '
+    'tolerance="1e-12"/>: if worlds diverge again after exact solves, the cause is the model.'
+)
 # Matches "contact 12 " at the start of a row's name. The number differs between steps and is removed from names.
 CONTACT_NUMBER = re.compile(r"^contact \d+ ")
 
@@ -176,6 +180,8 @@ class Audit:
         The audit was stopped by Ctrl-C, or workers were lost.
     busy : str
         A warning if other processes used the processors; else empty.
+    error_limit : float, m/s, optional
+        The summary counts the steps with a larger velocity error that rounding does not explain.
     """
 
     runs: Runs
@@ -190,6 +196,7 @@ class Audit:
     divergences: list[Divergence]
     stopped: bool = False
     busy: str = ""
+    error_limit: float | None = None
 
     @property
     def is_judged(self) -> Any:
@@ -226,8 +233,19 @@ class Audit:
     @property
     def max_velocity_error(self) -> float:
         """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
+        return float(np.max(self._errors_above_floor, initial=0.0))
+
+    @property
+    def _errors_above_floor(self) -> FloatArray:
+        """Velocity errors of the steps judged that are not at their floor [m/s]."""
         measured = self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))
-        return float(np.max(self.numbers[0][measured], initial=0.0))
+        return self.numbers[0][measured]
+
+    @property
+    def n_above_limit(self) -> int:
+        """Number of steps with a velocity error above `error_limit` that rounding does not explain."""
+        limit = np.inf if self.error_limit is None else self.error_limit
+        return int(np.count_nonzero(self._errors_above_floor > limit))
 
     @property
     def judged_sizes(self) -> StepSizes:
@@ -269,8 +287,20 @@ class Audit:
             f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
             "Start from other states with --states."
         )  # fmt: skip
-        more = [self._describe_divergences(), warning]
+        more = [self._describe_limit(), self._describe_divergences(), warning]
         return " ".join([f"{text}.", *filter(None, more)])
+
+    def _describe_limit(self) -> str:
+        """Return a sentence with the number of steps above `error_limit`; empty without a limit."""
+        if self.error_limit is None:
+            return ""
+        count, judged = self.n_above_limit, self.n_judged
+        share = f" ({format_percent(count, judged, 1)})" if count else ""
+        has = "has" if count == 1 else "have"
+        return (
+            f"{count or 'None'} of {format_count(judged, 'step')} judged{share} {has} an error above "
+            f"{self.error_limit:g} m/s."
+        )
 
     def _describe_divergences(self) -> str:
         """Return a sentence about steps that were not judged and worlds that diverged; empty if there are none."""
@@ -287,7 +317,7 @@ class Audit:
             return f"{text} Every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
         if exact:
             text += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
-        return text
+        return f"{text} {DIVERGENCE_ADVICE}"
 
     @property
     def table_of_errors(self) -> Table:
@@ -398,7 +428,8 @@ class Audit:
             "steps": runs.steps,
             "seed": runs.seed, "judged": self.n_judged, "unjudged": self.n_unjudged, "diverged": self.n_diverged,
             "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
-            "largest": self.max_velocity_error, "divergences": divergences, **self.judged_sizes.as_dict,
+            "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
+            "divergences": divergences, **self.judged_sizes.as_dict,
             "busy": self.busy,
             "stopped": self.stopped,
         }  # fmt: skip
@@ -436,6 +467,7 @@ def audit(
     states: Any = None,
     precision: str | None = None,
     threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
     workers: int = -1,
     backend: str = "loky",
     watch: Callable[[Event], None] | None = None,
@@ -456,6 +488,8 @@ def audit(
         Precision in which MuJoCo computes; default float64. The other engines determine it themselves.
     threshold : float, m/s
         A smaller velocity error is close enough.
+    max_velocity_error : float, m/s, optional
+        The summary counts the steps with a larger velocity error.
     workers : int
         Processes for MuJoCo; -1: one for each core.
     backend : str
@@ -484,6 +518,8 @@ def audit(
             f"{' or '.join(PRECISIONS)}"
         )
     check_workers(workers)
+    if max_velocity_error is not None:
+        max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
     judging = precision or "float64", check_float("threshold", threshold, low=0.0)
     expected_time = None
     if worlds is None:
@@ -505,7 +541,7 @@ def audit(
     result = Audit(
         runs, engine, numbers, verdict, rows=rows, contacts=contacts,
         can_touch=can_any_geoms_collide(*runs.load_model()), where={},
-        worst=[], divergences=[],
+        worst=[], divergences=[], error_limit=max_velocity_error,
     )  # fmt: skip
     loads, processes = [], 1
     if engine == "mujoco":

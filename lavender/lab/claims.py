@@ -84,6 +84,8 @@ class ClaimComparison:
         converged.
     stopped : bool
         Ctrl-C ended the run early.
+    error_limit : float, m/s, optional
+        The summary counts the wrong answers with a larger velocity error.
     """
 
     engine: str
@@ -94,6 +96,7 @@ class ClaimComparison:
     where: dict[str, tuple[int, float]] = field(default_factory=dict)
     masses: list[tuple[float, bool]] = field(default_factory=list)
     stopped: bool = False
+    error_limit: float | None = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -111,8 +114,14 @@ class ClaimComparison:
         return float(np.max(self.velocity[np.isin(self.outcome, WRONG_OUTCOMES)], initial=0.0))
 
     @property
+    def n_above_limit(self) -> int:
+        """Number of wrong answers with a velocity error above `error_limit`."""
+        limit = np.inf if self.error_limit is None else self.error_limit
+        return int(np.count_nonzero(self.velocity[np.isin(self.outcome, WRONG_OUTCOMES)] > limit))
+
+    @property
     def head(self) -> str:
-        """Summary in two sentences."""
+        """Summary in a few sentences."""
         counts, total = self.counts, self.outcome.size
         claimed = counts[OUTCOMES[0]] + counts[OUTCOMES[1]]
         missing = counts[OUTCOMES[2]] + counts[OUTCOMES[3]]
@@ -124,6 +133,12 @@ class ClaimComparison:
         )
         if self.largest:
             text += f" The largest error is {format_size(self.largest)} m/s."
+        if self.error_limit is not None:
+            count = self.n_above_limit
+            text += (
+                f" {format_count(count, 'wrong answer')} {'has' if count == 1 else 'have'} an error above "
+                f"{self.error_limit:g} m/s."
+            )
         if lost:
             text += (
                 f" {format_count(lost, 'answer')} {'is' if lost == 1 else 'are'} not finite; the engine calls "

@@ -26,14 +26,21 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     )
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
-    assert len(out.splitlines()) <= 26
+    assert len(out.splitlines()) <= 27
     page = (tmp_path / "out" / "index.html").read_text()
     assert "worst_1.npz" in page and "<svg" in page
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
     assert told["unconverged"] > 0 and told["largest"] > 1e-3
     assert told["contacts"]["maximum"] > 0 and told["judged"] == 40
+    # The reason of the exit code: the records have the same count.
+    records = np.load(tmp_path / "out" / "records.npz")
+    above = np.count_nonzero((records["velocity"] > 1e-3) & (records["verdict"] > 0))
+    assert 0 < above == told["above_limit"] and told["error_limit"] == 1e-3
+    assert f"{above} of 40 steps judged ({100 * above / 40:g}" in " ".join(out.split())
+    assert "have an error above 0.001 m/s" in " ".join(out.split())
     code, out, _ = lavender("audit", boxes(), *words)
     assert code == 0 and "none of 40 steps judged in 2 worlds stopped before convergence" in out
+    assert "None of 40 steps judged have an error above 0.001 m/s" in " ".join(out.split())
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # those of another run are gone
 
 
@@ -55,7 +62,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
 def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):
     words = ("--worlds", 2, "--steps", 5, "--workers", 1, "--out", tmp_path / "out")
     code, out, _ = lavender("audit", boxes(), *words, "--spread", "1e12")
-    assert code == 1 and "1 world diverged" in out
+    assert code == 1 and "1 world diverged" in out and "an error above" not in out
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
     assert (told["judged"], told["unjudged"], told["diverged"]) == (6, 4, 1)
     assert told["divergences"][0]["world"] == 1 and told["largest"] < 1.0

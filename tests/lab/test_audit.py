@@ -246,6 +246,8 @@ def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
     exact = options == ""  # One sweep of PGS does not hold the box.
     assert found.is_unconverged.any() == (not exact and threshold < 1.0)
     assert ("outside the constraint solver" in found.summary_text) == exact
+    # Otherwise a sentence says how to separate the solver from the model.
+    assert ('audit again with <option solver="Newton"' in found.summary_text) != exact
     assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][
         not exact
     ] * 3
