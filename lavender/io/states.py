@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,10 +43,13 @@ class StartStates:
         State vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
     controls : (n, nu), optional
         Controls of the first step; None if the source has none.
+    missing : tuple of str
+        Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
     """
 
     vectors: FloatArray
     controls: FloatArray | None = None
+    missing: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -56,7 +59,8 @@ class StartStates:
         if len(self) <= count:
             return self
         chosen = np.arange(count) * len(self) // count
-        return StartStates(self.vectors[chosen], None if self.controls is None else self.controls[chosen])
+        controls = None if self.controls is None else self.controls[chosen]
+        return replace(self, vectors=self.vectors[chosen], controls=controls)
 
 
 def read_states(mj: Any, model: Any, source: Any) -> StartStates:
@@ -151,7 +155,9 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
             else:
                 getattr(data, name)[:] = x[i]
         vectors.append(_read_state_vector(mj, model, data))
-    return StartStates(np.array(vectors), parts.get("ctrl"))
+    has = {"warm start": "qacc_warmstart" in parts, "controls": "ctrl" in parts or not model.nu}
+    missing = tuple(name for name, is_present in has.items() if not is_present)
+    return StartStates(np.array(vectors), parts.get("ctrl"), missing)
 
 
 def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
@@ -173,7 +179,9 @@ def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
         mj.mj_setState(model, data, state, kinds[size])
         vectors.append(_read_state_vector(mj, model, data))
         controls.append(np.array(data.ctrl))
-    return StartStates(np.array(vectors), np.array(controls) if kinds[size] == integration else None)
+    if kinds[size] == integration:
+        return StartStates(np.array(vectors), np.array(controls))
+    return StartStates(np.array(vectors), missing=("warm start", *(("controls",) if model.nu else ())))
 
 
 def _read_state_vector(mj: Any, model: Any, data: Any) -> FloatArray:

@@ -264,6 +264,23 @@ class Audit:
         return bool(np.all(close | (verdict == AUDIT_VERDICTS.index(AT_FLOOR))))
 
     @property
+    def start_warning(self) -> str:
+        """Warning if the start states lack a warm start or controls; else empty."""
+        missing = self.runs.starts.missing if self.runs.starts is not None else ()
+        if not missing:
+            return ""
+        consequences = {
+            "warm start": "the first solve of each world starts cold",
+            "controls": "the controls of the first step are those of --controls",
+        }
+        return (
+            f"The start states have no {' and no '.join(missing)}: "
+            f"{' and '.join(consequences[name] for name in missing)}. The errors of the first step "
+            "are not those of the simulation that the states come from; only the array `state` (mjSTATE_INTEGRATION) "
+            "has everything."
+        )
+
+    @property
     def summary_text(self) -> str:
         """Summary in a few sentences."""
         unconverged, judged = self.is_unconverged, self.n_judged
@@ -430,7 +447,7 @@ class Audit:
             "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
             "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
             "divergences": divergences, **self.judged_sizes.as_dict,
-            "busy": self.busy,
+            "busy": self.busy, "start_warning": self.start_warning,
             "stopped": self.stopped,
         }  # fmt: skip
 
@@ -451,7 +468,7 @@ class Audit:
             ],
             self.totals,
             stopped=self.stopped,
-            warning=self.busy,
+            warning=" ".join(filter(None, (self.start_warning, self.busy))),
         )  # fmt: skip
 
 

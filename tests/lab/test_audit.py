@@ -10,6 +10,7 @@ from mujoco_scene import mj, whole_mass
 
 import lavender as lv
 from lavender.io.efc import from_efc
+from lavender.io.states import read_states
 from lavender.lab import audit as module
 from lavender.lab.audit import AUDIT_VERDICTS, audit
 from lavender.lab.simulated_worlds import Frame, Runs
@@ -314,6 +315,47 @@ def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, name
     # The fourth world starts from the first state with other velocities.
     assert [w.velocity for w in found.worst] == again.numbers[0, :3, 0].tolist()
     assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (
+            ("qpos", "qvel"),
+            "have no warm start and no controls: the first solve of each world starts cold and the",
+        ),
+        (
+            ("qpos", "qvel", "ctrl"),
+            "have no warm start: the first solve of each world starts cold. The errors",
+        ),
+        (("qpos", "qvel", "qacc_warmstart"), "have no controls: the controls of the first step are those of"),
+        (("state",), ""),
+        (("qpos", "qvel", "ctrl", "qacc_warmstart"), ""),
+    ],
+)
+def test_states_without_warm_start_or_controls_are_warned_of(boxes, names, words):
+    path = boxes(EARLY)
+    worst = audit(path, worlds=3, steps=25, workers=1).worst
+    states = {name: np.array([w.state[name] for w in worst]) for name in names}
+    found = audit(path, worlds=2, steps=1, workers=1, states=states)  # two of three states are selected
+    assert words in found.start_warning and bool(found.start_warning) == bool(words)
+    assert found.start_warning in found.summary_page.warning
+    same = [w.velocity for w in worst][:1] == found.numbers[0, :1, 0].tolist()
+    if "no controls: " not in words:  # The worst row does not depend on the controls.
+        assert same == (not words)
+    assert not audit(path, worlds=1, steps=1, workers=1).start_warning
+
+
+def test_physics_vectors_are_states_without_warm_start_and_controls(boxes):
+    made = mj.MjModel.from_xml_path(str(boxes()))
+    vector = np.concatenate([made.qpos0, np.zeros(made.nv)])
+    for kind, missing in (("PHYSICS", ("warm start", "controls")), ("INTEGRATION", ())):
+        data = mj.MjData(made)
+        data.qpos[:], data.qvel[:] = np.split(vector, [made.nq])
+        size = mj.mj_stateSize(made, getattr(mj.mjtState, f"mjSTATE_{kind}"))
+        state = np.empty(size)
+        mj.mj_getState(made, data, state, getattr(mj.mjtState, f"mjSTATE_{kind}"))
+        assert read_states(mj, made, state[None]).missing == missing
 
 
 KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".5"/>
