@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     P = TypeVar("P", bound=Plan)
 
+BAR_WIDTH = 40  # Largest width of a progress bar in characters; a narrow terminal has a shorter one.
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
 MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
 
@@ -203,26 +204,47 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
         yield _print_progress_lines()
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Column
+
+    def keep_width() -> Column:
+        """Return a column that is not narrowed."""
+        return Column(no_wrap=True)
+
+    class ShortenedColumn(TextColumn):
+        """Text that is cut if the terminal is narrow. Rich narrows columns that may wrap before all others."""
+
+        def __init__(self, text: str) -> None:
+            super().__init__(text, markup=False, table_column=Column())
+
+        def render(self, task: Any) -> Any:
+            text = super().render(task)
+            text.no_wrap, text.overflow = True, "ellipsis"
+            return text
 
     with Progress(
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
+        BarColumn(min(BAR_WIDTH, to.width // 8), table_column=keep_width()),
+        MofNCompleteColumn(table_column=keep_width()),
+        TimeElapsedColumn(table_column=keep_width()),
         TextColumn("{task.fields[remaining]}", markup=False),
-        TextColumn("{task.fields[what]}", markup=False),
+        ShortenedColumn("{task.fields[what]}"),
         console=to,
         transient=True,
         refresh_per_second=4,  # Drawing more often would take processor time from the measurement.
     ) as bar:
         task = bar.add_task("", total=None, what="", remaining="")
         began = time.monotonic()
-        yield lambda event: bar.update(
-            task,
-            completed=event.done,
-            total=event.total or None,
-            remaining=format_remaining_time(event, time.monotonic() - began),
-            what=_format_event(event),
-        )
+
+        def show_event(event: Event) -> None:
+            remaining = format_remaining_time(event, time.monotonic() - began)
+            bar.update(
+                task,
+                completed=event.done,
+                total=event.total or None,
+                remaining=f"{remaining}:" if remaining else "",
+                what=_format_event(event),
+            )
+
+        yield show_event
 
 
 def _print_progress_lines() -> Callable[[Event], None]:

@@ -156,8 +156,8 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
                 getattr(data, name)[:] = x[i]
         vectors.append(_read_state_vector(mj, model, data))
     has = {"warm start": "qacc_warmstart" in parts, "controls": "ctrl" in parts or not model.nu}
-    missing = tuple(name for name, is_present in has.items() if not is_present)
-    return StartStates(np.array(vectors), parts.get("ctrl"), missing)
+    absent = tuple(name for name, is_present in has.items() if not is_present)
+    return StartStates(np.array(vectors), parts.get("ctrl"), absent)
 
 
 def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:

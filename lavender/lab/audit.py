@@ -20,10 +20,12 @@ from __future__ import annotations
 import copy
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +53,7 @@ from lavender.lab.simulated_worlds import (
     Runs,
     StepSizes,
     can_any_geoms_collide,
+    count_engine_warnings,
     describe_exceedance,
     iterate_frames,
     simulate_world,
@@ -142,6 +145,8 @@ class Piece(NamedTuple):
         Index of a step that stopped before convergence, and the name of its worst row.
     worst : list of Worst
     divergences : sequence of Divergence
+    engine_warnings : dict
+        MuJoCo's own warnings, and how often each occurred.
     """
 
     world: Any
@@ -153,6 +158,7 @@ class Piece(NamedTuple):
     where: list[tuple[int, str]]
     worst: list[Worst]
     divergences: Sequence[Divergence] = ()
+    engine_warnings: Mapping[str, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +188,8 @@ class Audit:
         A warning if other processes used the processors; else empty.
     error_limit : float, m/s, optional
         The summary counts the steps with a larger velocity error that rounding does not explain.
+    engine_warnings : Counter
+        MuJoCo's own warnings, and how often each occurred.
     """
 
     runs: Runs
@@ -197,6 +205,7 @@ class Audit:
     stopped: bool = False
     busy: str = ""
     error_limit: float | None = None
+    engine_warnings: Counter[str] = field(default_factory=Counter)
 
     @property
     def is_judged(self) -> Any:
@@ -304,7 +313,12 @@ class Audit:
             f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
             "Start from other states with --states."
         )  # fmt: skip
-        more = [self._describe_limit(), self._describe_divergences(), warning]
+        engine_warnings = "; ".join(
+            f"{text} ({format_count(n, 'time')})" for text, n in self.engine_warnings.most_common()
+        )
+        if engine_warnings:
+            engine_warnings = f"MuJoCo's own warnings: {engine_warnings}."
+        more = [self._describe_limit(), self._describe_divergences(), engine_warnings, warning]
         return " ".join([f"{text}.", *filter(None, more)])
 
     def _describe_limit(self) -> str:
@@ -447,7 +461,7 @@ class Audit:
             "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
             "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
             "divergences": divergences, **self.judged_sizes.as_dict,
-            "busy": self.busy, "start_warning": self.start_warning,
+            "engine_warnings": dict(self.engine_warnings), "busy": self.busy, "start_warning": self.start_warning,
             "stopped": self.stopped,
         }  # fmt: skip
 
@@ -581,6 +595,7 @@ def audit(
                 count, largest = result.where.get(name, (0, 0.0))
                 result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
             result.worst[:] = _select_worst([*result.worst, *piece.worst])
+            result.engine_warnings.update(piece.engine_warnings)
             result.divergences[:] = sorted([*result.divergences, *piece.divergences])
             loads.append(machine.count_runnable_processes())
             if watch is not None:
@@ -592,7 +607,7 @@ def audit(
                 )
                 if since and elapsed >= MIN_PROGRESS_TIME:
                     remaining = elapsed * (worlds * steps - result.n_processed) / since
-                text = f"steps judged, {int(result.is_unconverged.sum())} {UNCONVERGED}"
+                text = f"steps, {int(result.is_unconverged.sum())} unconverged"
                 watch(Event(result.n_processed, worlds * steps, text, "", remaining=remaining))
     except KeyboardInterrupt:
         if not result.n_processed:
@@ -656,6 +671,13 @@ def _reject_unsupported_model(runs: Runs) -> None:
 def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
     """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
     mj, model = runs.load_model()
+    with count_engine_warnings(mj) as engine_warnings:
+        pieces = _audit_worlds(mj, model, runs, judging, worlds)
+    return [*pieces[:-1], pieces[-1]._replace(engine_warnings=engine_warnings)]
+
+
+def _audit_worlds(mj: Any, model: Any, runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
+    """Simulate and judge MuJoCo's steps of some worlds."""
     simulations = [simulate_world(mj, model, runs, world) for world in worlds]
     states = np.concatenate([states for states, _ in simulations])
     divergences = [divergence for _, divergence in simulations if divergence is not None]

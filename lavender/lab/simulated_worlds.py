@@ -14,7 +14,10 @@ and MuJoCo Warp step all worlds at once, in float32.
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -55,6 +58,10 @@ MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp a
 # and the error that 1 % of the steps exceed, then describe steps without contact. Examples: 6 % of the steps of
 # dm_control's finger model have contact, none of its stacker model.
 MIN_CONTACT_SHARE = 0.2
+
+
+# Matches the numbers in a warning of MuJoCo, such as a degree of freedom. Warnings are counted without them.
+WARNING_NUMBER = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
@@ -248,6 +255,20 @@ class Frame(NamedTuple):
     state: dict[str, FloatArray]
     rows: np.ndarray
     contacts: np.ndarray
+
+
+@contextlib.contextmanager
+def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
+    """Count MuJoCo's warnings by their first sentence instead of printing them, with N for each number."""
+    counts: Counter[str] = Counter()
+    handler = mj.get_mju_user_warning()
+    mj.set_mju_user_warning(
+        lambda message: counts.update([WARNING_NUMBER.sub("N", message.partition(". ")[0])])
+    )
+    try:
+        yield counts
+    finally:
+        mj.set_mju_user_warning(handler)
 
 
 def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:

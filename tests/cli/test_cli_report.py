@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +194,23 @@ def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatc
     with measuring.show_progress() as watch:
         watch(Event(0, 3, "stack", "newton"))
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_progress_on_a_terminal_keeps_counts_and_times(monkeypatch, width):
+    from rich.console import Console
+
+    console = Console(force_terminal=True, width=width, file=StringIO(), _environ={}, color_system=None)
+    monkeypatch.setattr(measuring, "make_console", lambda stderr: console)
+    with measuring.show_progress() as watch:
+        watch(Event(16816, 36200, "steps, 16816 unconverged", "", remaining=61.0))
+    last = re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", console.file.getvalue()).rstrip())[-1]
+    assert last.rstrip().endswith("16816/36200 0:00:00 about 61 s remain: steps, 16816 unconverged")
+    with measuring.show_progress() as watch:
+        watch(Event(199, 770, "timing: round 1 of 5, " + 99 * "x", "", remaining=61.0))
+    last = re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", console.file.getvalue()).rstrip())[-1]
+    # Only the description is cut.
+    assert "199/770 0:00:00 about 61 s remain: timing: round 1 of 5, x" in last and last.endswith("x…")
 
 
 def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):

@@ -423,6 +423,19 @@ def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 
+def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, tmp_path, capfd):
+    monkeypatch.chdir(tmp_path)
+    handler = mj.get_mju_user_warning()
+    found = audit(boxes(), worlds=3, steps=5, workers=1, spread=1e12)
+    ((text, count),) = found.engine_warnings.items()
+    assert count >= found.n_diverged == 2 and text.startswith("Nan, Inf or huge value in QVEL at DOF N")
+    assert f"MuJoCo's own warnings: {text} ({count} times)." in found.summary_text
+    assert found.totals["engine_warnings"] == {text: count}
+    assert "WARNING" not in "".join(capfd.readouterr()) and not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    assert mj.get_mju_user_warning() is handler
+    assert not audit(boxes(), worlds=1, steps=5, workers=1).engine_warnings
+
+
 @pytest.mark.parametrize(
     ("options", "given", "words"),
     [
