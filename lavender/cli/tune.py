@@ -24,6 +24,8 @@ from lavender.io.stored import lock_output
 @add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
+@click.option("--max-velocity-error", type=float, metavar="M/S",
+              help="Also recommend the fastest setting without a larger error in any step [m/s, rad/s].")  # fmt: skip
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page.")  # fmt: skip
@@ -35,8 +37,9 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     newton.ModelBuilder of one world, or the name of a builder in newton.tests.utils.basics. The time and the error of a
     step are measured with many settings on worlds of the model. Two lines with options are printed: one that is faster
     and as accurate as the present setting, and one that is more accurate and as fast. Both are chosen on half of the
-    worlds and validated on the other half. No line is printed if fewer than 20 % of the steps have contact: then start
-    from states with contact (--states).
+    worlds and validated on the other half. With --max-velocity-error E, the first line is the fastest setting whose
+    errors are at most E on all worlds, or the most accurate one if there is none. No line is printed if fewer than 20 %
+    of the steps have contact: then start from states with contact (--states).
 
     Exit code 130: stopped by Ctrl-C; the page shows the completed part.
     """

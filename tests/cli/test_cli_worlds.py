@@ -53,10 +53,24 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     assert code == 0 and "held back" in out
     assert "Add the line after the model's own <option>" in " ".join(out.split())
     warned = 2 if "The machine was busy" in out else 0  # a warning, and longer comments
-    assert len(out.splitlines()) <= 27 + warned
+    assert len(out.splitlines()) <= 29 + warned
+    assert "on other states they can be larger" in " ".join(out.split())
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
     assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()
+
+
+def test_tuning_to_a_limit_of_the_error(lavender, boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning, "TOLERANCES", (1e-12,))
+    monkeypatch.setattr(tuning, "ITERATIONS", {"CG": (3,)})
+    words = ("tune", boxes(EARLY), "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")
+    for limit, sentence in (
+        ("1e-3", "error at most 0.001 m/s, fastest"),
+        ("0", "error at most 0 m/s: none of"),
+    ):
+        code, out, _ = lavender(*words, "--max-velocity-error", limit)
+        assert code == 0 and sentence in " ".join(out.split())
+    assert lavender(*words, "--max-velocity-error", "-1")[0] == 2
 
 
 def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):

@@ -121,6 +121,73 @@ def test_what_is_chosen():
     assert '<option iterations="9"/>' in found.lines[0]
 
 
+def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
+    now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
+    rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)
+    rare.error[0] = 0.5  # One step in a hundred: the limit is for every step.
+    slow, other = measured(20.0, 1e-9, tolerance=1e-15), measured(1.0, 0.0, cone="elliptic")
+    found = replace(chosen(now, quick, rare, good, slow, other), error_limit=1e-3)
+    assert found.within_limit is found.limit_choice is good
+    assert found.lines[0] == '<option tolerance="1e-06"/>  <!-- error at most 0.001 m/s, fastest -->'
+    assert found.lines[1].endswith("(at most 1.0e-5 in 100 steps)") and "not measured" in found.lines[2]
+    assert "on other states they can be larger" in found.summary_page.render_html()
+    # What exceeds the limit on the worlds held back is not within it.
+    refuted = replace(found, held_errors={good.setting: 2e-3})
+    assert refuted.within_limit is slow
+    none = replace(found, error_limit=1e-12)
+    assert none.within_limit is None and none.most_accurate is slow
+    assert none.lines[:2] == [
+        "error at most 1e-12 m/s: none of 5 settings; the most accurate is",
+        '<option tolerance="1e-15"/>  <!-- most accurate -->',
+    ]
+    assert none.summary_page.numbers["is_limit_met"] is False
+    own = replace(chosen(now, slow), error_limit=0.2)
+    assert own.lines[0] == "error at most 0.2 m/s, fastest: the model's own setting"
+    assert "error at most" not in "".join(replace(found, error_limit=None).lines)
+
+
+@pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
+def test_the_limit_of_the_error_holds_on_the_worlds_held_back(boxes, monkeypatch, limit, is_met):
+    fewer(monkeypatch)
+    monkeypatch.setattr(mujoco_settings, "TOLERANCES", (1e-2, 1e-6, 1e-12))
+    found = tune(boxes(EARLY), worlds=4, steps=30, repeats=1, max_velocity_error=limit)
+    choice = found.limit_choice
+    (held,) = (h for h in found.held if h.setting == choice.setting)
+    assert np.isfinite(held.mean_step_time) and found.held_errors[choice.setting] == held.error.max()
+    assert (found.within_limit is choice) == is_met == (max(choice.error.max(), held.error.max()) <= limit)
+    for m in found.measured:  # Every faster setting exceeds the limit on one half of the worlds.
+        if is_met and m.mean_step_time < 0.95 * choice.mean_step_time and not m.setting.changes_problem:
+            assert max(m.error.max(), found.held_errors.get(m.setting, 0.0)) > limit
+    assert "held back: not measured" not in "".join(found.lines)
+
+
+def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
+    fewer(monkeypatch)
+    path = boxes('solver="CG" iterations="4" ls_iterations="8" tolerance="1e-3"')
+    found = tune(path, worlds=2, steps=10, repeats=1, max_velocity_error=1e3)
+    (default,) = (m for m in found.measured if m.setting.is_default)
+    model = mj.MjModel.from_xml_path(str(path))
+    applied, plain = default.setting.apply_to(mj, model).opt, mj.MjOption()
+    assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
+    assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
+    assert found.summary_page.render_html().count("MuJoCo&#39;s defaults: &lt;option") >= 1
+    assert default in found._terminal_settings and found._terminal_settings[0] is found.present_result
+    line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
+    assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
+    # A model with the default options: its own setting is not measured twice.
+    assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
+
+
+def test_the_terminal_shows_the_front_beyond_the_present_time():
+    now = measured(10.0, 0.4)
+    loose = [measured(float(t), 1.0 / t, iterations=t) for t in (2, 4, 6, 8)]
+    slow = [measured(10.0 + k, 10.0 ** -(k + 2), tolerance=10.0**-k) for k in range(1, 8)]
+    shown = chosen(now, *loose, *slow)._terminal_settings
+    assert shown[:3] == [now, loose[0], loose[-1]]
+    assert shown[3:] == [slow[0], slow[2], slow[4], slow[6]]
+    assert chosen(now)._terminal_settings == [now]
+
+
 def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
     now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
     found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
@@ -179,6 +246,8 @@ def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how):
     page = found.summary_page.render_html()
     assert "Provisional lines" in page and "Lines to copy" not in page and "measure again" in page
     assert "PROVISIONAL" not in chosen(now, quick).lines[0]
+    none = replace(chosen(now), **how)
+    assert none.lines[0].startswith("PROVISIONAL, the m") and "none of 1 settings" in none.lines[0]
 
 
 def test_a_line_after_the_model_s_own_option_wins_and_before_it_does_not():

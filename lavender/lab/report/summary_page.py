@@ -29,6 +29,7 @@ class PageSection:
     title, tables, figures, note : heading, tables, figures, note
     code : lines to copy
     short : number of rows of the first table that a terminal shows
+    terminal_table : table that a terminal shows instead of the first rows of the first table
     """
 
     title: str
@@ -37,6 +38,7 @@ class PageSection:
     note: str = ""
     code: Sequence[str] = ()
     short: int = 0
+    terminal_table: Table | None = None
 
     @property
     def is_shown(self) -> bool:
@@ -109,7 +111,8 @@ class SummaryPage:
                 console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
             if part.code and part.note:
                 console.print(part.note, highlight=False, markup=False)
-            for table in part.tables[:1] if part.short else ():
+            tables = [replace(t, rows=t.rows[: part.short]) for t in part.tables[:1]]
+            for table in tables if part.terminal_table is None else [part.terminal_table]:
                 if table.rows:
                     console.print()
-                    print_table(console, replace(table, rows=table.rows[: part.short]), cut=True)
+                    print_table(console, table, cut=True)

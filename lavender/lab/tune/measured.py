@@ -41,6 +41,7 @@ class Setting:
     merge_note: ClassVar[str] = ""  # Note for the user on where to insert `option_line`.
 
     options: tuple[tuple[str, Any], ...] = ()
+    is_default: bool = field(default=False, compare=False)  # Whether these are the engine's default options.
 
     @property
     def option_line(self) -> str:

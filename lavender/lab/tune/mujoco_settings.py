@@ -12,6 +12,7 @@ import copy
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -61,6 +62,11 @@ class MujocoSetting(Setting):
         has = {name: get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
         return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
 
+    @property
+    def name(self) -> str:
+        """`option_line`, after "MuJoCo's defaults" if the setting is that; or "the model's own setting"."""
+        return f"MuJoCo's defaults: {super().name}" if self.is_default else super().name
+
     def apply_to(self, mj: Any, model: Any) -> Any:
         """Return a copy of the model with these options."""
         configured = copy.copy(model)
@@ -82,6 +88,12 @@ def _map_keywords_to_values(mj: Any, name: str) -> dict[str, Any]:
     keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
     short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
     return {keywords.get(key, key.lower()): value for key, value in short}
+
+
+def get_default_options(mj: Any) -> dict[str, Any]:
+    """Return MuJoCo's default values of `OPTIONS`."""
+    default = SimpleNamespace(opt=mj.MjOption())
+    return {name: get_option_value(mj, default, name) for name in OPTIONS}
 
 
 def get_option_value(mj: Any, model: Any, name: str) -> Any:
@@ -209,15 +221,20 @@ class MujocoStage(Stage):
 
 
 def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
-    """List the first settings: each solver with each tolerance and number of iterations; then other problems."""
+    """List the first settings: the own one, MuJoCo's defaults, and each solver with each tolerance and budget.
+
+    Settings that change the problem are last.
+    """
     enough = max(100, int(model.opt.iterations))
-    tried: list[dict[str, Any]] = [{}]
+    tried: list[dict[str, Any]] = []
     for solver, budgets in ITERATIONS.items():
         tried += [{"solver": solver, "iterations": enough, "tolerance": t} for t in TOLERANCES]
         tried += [{"solver": solver, "iterations": n} for n in budgets]
     tried += [{"cone": "pyramidal"}, {"cone": "elliptic"}, {"impratio": 1.0}, {"impratio": 10.0}]
     tried += [{"noslip_iterations": n} for n in (0, 3, 10)]
-    return list(dict.fromkeys(MujocoSetting.from_options(mj, model, **x) for x in tried))
+    own = MujocoSetting.from_options(mj, model)
+    default = replace(MujocoSetting.from_options(mj, model, **get_default_options(mj)), is_default=True)
+    return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))
 
 
 def list_variants(mj: Any, model: Any, setting: Setting) -> list[MujocoSetting]:

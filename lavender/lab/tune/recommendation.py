@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,14 @@ from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_ratio, format_size
 from lavender.lab.simulated_worlds import StepSizes, describe_exceedance
-from lavender.lab.tune.measured import Measured
+from lavender.lab.tune.measured import Measured, Setting
 from lavender.problem.derived import cached_property
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
+N_SLOWER_ROWS = (
+    4  # The terminal shows at most this many settings of the front that are slower than the present one.
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,10 @@ class Tuning:
         A warning if other processes used the processors during the timing; else empty.
     n_held_worlds : int
         Number of worlds held back.
+    error_limit : float, m/s, optional
+        The fastest setting whose error is at most this number in every step is also recommended.
+    held_errors : dict
+        Largest error [m/s] on the worlds held back, of the settings that were judged there.
     """
 
     model: str
@@ -58,6 +65,8 @@ class Tuning:
     sizes: StepSizes | None = None
     busy: str = ""
     n_held_worlds: int = 0
+    error_limit: float | None = None
+    held_errors: Mapping[Setting, float] = field(default_factory=dict)
 
     @property
     def present_result(self) -> Measured:
@@ -103,6 +112,34 @@ class Tuning:
         best = min(good, key=lambda m: m.worst_error)
         return best if best.worst_error < now.worst_error > self.threshold else None
 
+    def _compute_largest_error(self, m: Measured) -> float:
+        """Return the largest error [m/s] of a setting on all worlds on which it was judged."""
+        return max(float(m.error.max()), self.held_errors.get(m.setting, 0.0))
+
+    @property
+    def within_limit(self) -> Measured | None:
+        """Fastest setting with errors of at most `error_limit`, also on the worlds held back if it was judged there.
+
+        The present setting counts as faster if the times are equal within noise. None if there is no such setting, or
+        no limit.
+        """
+        if self.error_limit is None:
+            return None
+        now = self.present_result
+        good = [m for m in self._same_problem if self._compute_largest_error(m) <= self.error_limit]
+        noise = {id(now): 1.0 - TIME_NOISE_FRACTION}
+        return min(good, key=lambda m: m.mean_step_time * noise.get(id(m), 1.0), default=None)
+
+    @property
+    def most_accurate(self) -> Measured:
+        """Setting with the smallest largest error on all worlds on which it was judged."""
+        return min(self._same_problem, key=self._compute_largest_error)
+
+    @property
+    def limit_choice(self) -> Measured:
+        """`within_limit`, or `most_accurate` if there is none."""
+        return self.within_limit or self.most_accurate
+
     @property
     def pareto_front(self) -> list[Measured]:
         """Settings that no other setting beats in both time and error, fastest first."""
@@ -132,6 +169,11 @@ class Tuning:
         return "the machine was busy" if self.busy else ""
 
     @property
+    def _provisional_prefix(self) -> str:
+        """Beginning of a provisional line; empty if the measurement is complete and its times are valid."""
+        return f"PROVISIONAL, {self.reason_provisional}: " if self.reason_provisional else ""
+
+    @property
     def lines(self) -> list[str]:
         """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
         if self.reason_without_line:
@@ -141,30 +183,51 @@ class Tuning:
             f"not needed, {format_size(self.present_result.worst_error)} m/s is within {self.threshold:g}"
         )
         closer = enough if self.present_result.worst_error <= self.threshold else none
-        lines = []
+        lines = self._format_limit_choice()
         for description, m, reason, gains, max_ratio in (
             ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
             ("as fast as now, more accurate", self.closer, closer, "worst_error", 1.0),
         ):
             if m is None:
-                lines.append(f"{description}: {reason}")
+                provisional = self._provisional_prefix if reason is none else ""
+                lines.append(f"{provisional}{description}: {reason}")
                 continue
-            held = next((h for h in self.held[1:] if h.setting == m.setting), None)
+            held = self._find_held_back(m)
             if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
                 description += ": not on the worlds held back"
-            if self.reason_provisional:
-                description = f"PROVISIONAL, {self.reason_provisional}: {description}"
-            lines += [
-                f"{m.setting.option_line}  {m.setting.comment.format(description)}",
-                f"    chosen on: {_format_comparison(m, self.present_result)}",
-                f"    held back: {'not measured' if held is None else self._compare_held_back(held)}",
-            ]  # fmt: skip
+            lines += self._format_choice(m, description, _format_comparison(m, self.present_result))
         return lines
 
-    def _compare_held_back(self, held: Measured) -> str:
-        """Compare a setting with the present one on the worlds held back, with the largest error there."""
-        worst = f"at most {format_size(float(held.error.max()))} in {len(held.error)} steps"
-        return f"{_format_comparison(held, self.held[0])} ({worst})"
+    def _find_held_back(self, m: Measured) -> Measured | None:
+        """Return the result of a setting on the worlds held back; None if it was not measured there."""
+        return next((h for h in self.held if h.setting == m.setting), None)
+
+    def _format_limit_choice(self) -> list[str]:
+        """Return the lines on `error_limit`; none without a limit."""
+        if self.error_limit is None:
+            return []
+        goal, m = f"error at most {self.error_limit:g} m/s", self.limit_choice
+        lines = []
+        if self.within_limit is None:
+            lines = [
+                f"{self._provisional_prefix}{goal}: none of {len(self._same_problem)} settings; the most accurate is"
+            ]
+        description = f"{goal}, fastest" if self.within_limit else "most accurate"
+        return lines + self._format_choice(m, description, _format_with_largest_error(m, self.present_result))
+
+    def _format_choice(self, m: Measured, description: str, comparison: str) -> list[str]:
+        """Return the line to copy with a description, and the results on both halves of the worlds."""
+        if m.setting.is_default:
+            description += ", MuJoCo's defaults"
+        description = f"{self._provisional_prefix}{description}"
+        held = self._find_held_back(m)
+        line = m.setting.option_line
+        comment = m.setting.comment.format(description)
+        return [
+            f"{line}  {comment}" if line else f"{description}: {m.setting.name}",
+            f"    chosen on: {comparison}",
+            f"    held back: {'not measured' if held is None else _format_with_largest_error(held, self.held[0])}",
+        ]
 
     @property
     def _lines_note(self) -> str:
@@ -172,7 +235,8 @@ class Tuning:
         if self.reason_without_line:
             return "None, for the reason above."
         sentences = ["Chosen on the worlds with even numbers, tested on the others."]
-        if self.faster or self.closer:
+        if self.faster or self.closer or self.error_limit is not None:
+            sentences.append("All errors are those of these states; on other states they can be larger.")
             if self.reason_provisional:
                 sentences.append(
                     f"The lines are provisional, because {self.reason_provisional}: measure again."
@@ -186,7 +250,7 @@ class Tuning:
         """Build the table of some settings."""
         rows: list[list[str | Cell]] = [
             [
-                m.setting.option_line or "model's own setting", Cell.time(m.mean_step_time),
+                m.setting.name if m.setting.options else "model's own setting", Cell.time(m.mean_step_time),
                 f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
                 Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
             ]
@@ -201,6 +265,23 @@ class Tuning:
             f"motion after {self.horizon} [m]",
         ]
         return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
+    def _terminal_settings(self) -> list[Measured]:
+        """Settings in the table of the terminal: the present one first, the others by time.
+
+        The others are MuJoCo's defaults; of the Pareto front the fastest setting, the most accurate one in the present
+        time, and at most `N_SLOWER_ROWS` that take more time, up to the most accurate one.
+        """
+        now, front = self.present_result, self.pareto_front
+        max_time = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+        slower = [m for m in front if m.mean_step_time > max_time]
+        quick = [m for m in front if m.mean_step_time <= max_time]
+        spaced = np.linspace(0, max(0, len(slower) - 1), min(N_SLOWER_ROWS, len(slower))).round().astype(int)
+        defaults = [m for m in self._same_problem if m.setting.is_default]
+        shown = dict.fromkeys([*quick[:1], *quick[-1:], *(slower[i] for i in spaced.tolist()), *defaults])
+        shown.pop(now, None)
+        return [now, *sorted(shown, key=lambda m: m.mean_step_time)]
 
     @property
     def figure(self) -> Figure:
@@ -235,7 +316,7 @@ class Tuning:
                 if self.closer.worst_error
                 else "exact:"
             )
-            head += f" In the same time the error can be {gain} less."
+            head += f" In the same time the error can be {gain} less on these states."
         if self.reason_without_line:
             head += f" {self.reason_without_line}"
         other = [m for m in self.measured if m.setting.changes_problem]
@@ -250,13 +331,16 @@ class Tuning:
                      note=self._lines_note),
                 PageSection("Rows and contacts", sizes, short=2,
                      note="Rows and contacts of the steps with the model's own setting."),
-                PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures, short=5),
+                PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures,
+                     terminal_table=self._build_table_of_settings(self._terminal_settings)),
                 PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
                 PageSection("Every setting", [self._build_table_of_settings(every)],
                      note="Settings with which a world diverges are left out."),
             ],
             {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+             "error_limit": self.error_limit,
+             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
              **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
              "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
             stopped=self.stopped,
@@ -272,7 +356,13 @@ def _format_comparison(m: Measured, now: Measured) -> str:
     )
 
 
+def _format_with_largest_error(m: Measured, now: Measured) -> str:
+    """Compare time and error of a setting with the present ones, and add the largest error."""
+    worst = f"at most {format_size(float(m.error.max()))} in {len(m.error)} steps"
+    return f"{_format_comparison(m, now)} ({worst})"
+
+
 def _to_dict(m: Measured) -> dict[str, Any]:
     """Convert a result to a dict for JSON."""
-    return {"options": dict(m.setting.options), "seconds": m.mean_step_time, "error": m.worst_error,
-            "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip
+    return {"options": dict(m.setting.options), "default": m.setting.is_default, "seconds": m.mean_step_time,
+            "error": m.worst_error, "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip

@@ -24,7 +24,7 @@ from lavender.io.recording import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
-from lavender.lab.simulated_worlds import Runs, StepSizes, can_any_geoms_collide
+from lavender.lab.simulated_worlds import Runs, StepSizes, can_any_geoms_collide, count_engine_warnings
 from lavender.lab.tune.kamino_settings import KaminoStage
 from lavender.lab.tune.measured import Measured, Schedule, Setting, Stage
 from lavender.lab.tune.mujoco_settings import MujocoStage
@@ -55,6 +55,7 @@ def tune(
     horizon: int = 10,
     repeats: int = 5,
     threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
     """Measure an engine's settings on worlds of a model or scene.
@@ -76,6 +77,8 @@ def tune(
         Repetitions of the timing, in which settings alternate.
     threshold : float, m/s, m
         Errors [m/s] and distances [m] up to this number count as accurate enough.
+    max_velocity_error : float, m/s, optional
+        Also recommend the fastest setting whose error is at most this number in every step of all worlds.
     watch : callable, optional
         Called with the progress.
 
@@ -100,6 +103,8 @@ def tune(
     horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
     threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
     check_float("spread", spread, low=0.0)
+    if max_velocity_error is not None:
+        max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
         raise InputError(f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon")
     if engine == "kamino":
@@ -110,7 +115,8 @@ def tune(
         start = {"states": states, "spread": spread, "seed": seed}
         return run_tuning(
             lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
-            name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2, watch=watch,
+            name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2,
+            error_limit=max_velocity_error, watch=watch,
         )  # fmt: skip
     runs = Runs(name, worlds, steps, control=control, seed=seed, spread=spread).with_start_states(states)
     mj, configured = runs.load_model()
@@ -126,10 +132,11 @@ def tune(
         )
         return cast("tuple[Stage, Stage]", (even, odd))
 
-    return run_tuning(
-        make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
-        n_held_worlds=worlds // 2, watch=watch,
-    )  # fmt: skip
+    with count_engine_warnings(mj):  # Settings with which worlds diverge are left out.
+        return run_tuning(
+            make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
+            n_held_worlds=worlds // 2, error_limit=max_velocity_error, watch=watch,
+        )  # fmt: skip
 
 
 def run_tuning(
@@ -141,6 +148,7 @@ def run_tuning(
     *,
     can_touch: bool,
     n_held_worlds: int,
+    error_limit: float | None = None,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
     """Measure settings on one stage, and measure the chosen settings on a second stage.
@@ -157,8 +165,11 @@ def run_tuning(
         Whether bodies of the model can collide, see `StepSizes`.
     n_held_worlds : int
         Number of worlds held back.
+    error_limit : float, m/s, optional
+        Also choose the fastest setting whose error is at most this number on both stages.
     """
     schedule = Schedule(watch)
+    held_errors: dict[Setting, float] = {}
     measured: list[Measured] = []
     held: list[Measured] = []
     sizes: StepSizes | None = None
@@ -169,7 +180,7 @@ def run_tuning(
         busy = machine.make_busy_warning(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
-            n_held_worlds=n_held_worlds,
+            n_held_worlds=n_held_worlds, error_limit=error_limit, held_errors=dict(held_errors),
         )  # fmt: skip
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
@@ -222,6 +233,14 @@ def run_tuning(
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
+        held_errors |= {m.setting: float(m.error.max()) for m in last}
+        # Judge the fastest setting within the limit on the worlds held back; if it exceeds the limit there, the next.
+        tested: dict[Setting, Measured] = {m.setting: m for m in last}
+        while error_limit is not None and (setting := make_result(False).limit_choice.setting) not in tested:
+            (tested[setting],) = judge(held_back, [setting])
+            held_errors[setting] = float(tested[setting].error.max())
+        if error_limit is not None and all(m.setting != setting for m in last):
+            last.append(tested[setting])
         schedule.reserve_measurements("judging", 0)
         schedule.reserve_measurements("timing", 0)
         held_back.time_settings(last, 2 * repeats, schedule)
