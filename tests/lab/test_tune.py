@@ -171,7 +171,7 @@ def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
     assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
     assert found.summary_page.render_html().count("MuJoCo&#39;s defaults: &lt;option") >= 1
-    assert default in found._terminal_settings and found._terminal_settings[0] is found.present_result
+    assert default in found.terminal_settings and found.terminal_settings[0] is found.present_result
     line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
     assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
     # A model with the default options: its own setting is not measured twice.
@@ -182,10 +182,10 @@ def test_the_terminal_shows_the_front_beyond_the_present_time():
     now = measured(10.0, 0.4)
     loose = [measured(float(t), 1.0 / t, iterations=t) for t in (2, 4, 6, 8)]
     slow = [measured(10.0 + k, 10.0 ** -(k + 2), tolerance=10.0**-k) for k in range(1, 8)]
-    shown = chosen(now, *loose, *slow)._terminal_settings
+    shown = chosen(now, *loose, *slow).terminal_settings
     assert shown[:3] == [now, loose[0], loose[-1]]
     assert shown[3:] == [slow[0], slow[2], slow[4], slow[6]]
-    assert chosen(now)._terminal_settings == [now]
+    assert chosen(now).terminal_settings == [now]
 
 
 def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():

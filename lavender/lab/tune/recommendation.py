@@ -267,7 +267,7 @@ class Tuning:
         return Table(heads, rows, words=frozenset({"setting"}))
 
     @property
-    def _terminal_settings(self) -> list[Measured]:
+    def terminal_settings(self) -> list[Measured]:
         """Settings in the table of the terminal: the present one first, the others by time.
 
         The others are MuJoCo's defaults; of the Pareto front the fastest setting, the most accurate one in the present
@@ -332,7 +332,7 @@ class Tuning:
                 PageSection("Rows and contacts", sizes, short=2,
                      note="Rows and contacts of the steps with the model's own setting."),
                 PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures,
-                     terminal_table=self._build_table_of_settings(self._terminal_settings)),
+                     terminal_table=self._build_table_of_settings(self.terminal_settings)),
                 PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
                 PageSection("Every setting", [self._build_table_of_settings(every)],
