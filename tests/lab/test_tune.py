@@ -171,6 +171,7 @@ def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
     assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
     assert found.summary_page.render_html().count("MuJoCo&#39;s defaults: &lt;option") >= 1
+    assert "MuJoCo's defaults" in [row[0] for row in found.terminal_table.cell_texts]
     assert default in found.terminal_settings and found.terminal_settings[0] is found.present_result
     line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
     assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
@@ -186,6 +187,10 @@ def test_the_terminal_shows_the_front_beyond_the_present_time():
     assert shown[:3] == [now, loose[0], loose[-1]]
     assert shown[3:] == [slow[0], slow[2], slow[4], slow[6]]
     assert chosen(now).terminal_settings == [now]
+    # An error that is hardly smaller is not worth a row.
+    assert len(chosen(now, slow[0], measured(12.0, 0.95e-3, tolerance=1e-3)).terminal_settings) == 2
+    texts = [row[0] for row in chosen(now, *loose, *slow).terminal_table.cell_texts]
+    assert texts[:2] == ["model's own setting", "iterations=2"] and texts[-1] == "tolerance=1e-07"
 
 
 def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():

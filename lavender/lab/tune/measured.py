@@ -54,6 +54,12 @@ class Setting:
         return self.option_line or "the model's own setting"
 
     @property
+    def short_name(self) -> str:
+        """Options without the engine's syntax, for narrow tables."""
+        values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)
+        return " ".join(f"{name}={x}" for name, x in values) or "model's own setting"
+
+    @property
     def changes_problem(self) -> bool:
         """Whether the setting changes the constraint problem, and not only how it is solved."""
         return any(name in self.problem_options for name, _ in self.options)

@@ -67,6 +67,11 @@ class MujocoSetting(Setting):
         """`option_line`, after "MuJoCo's defaults" if the setting is that; or "the model's own setting"."""
         return f"MuJoCo's defaults: {super().name}" if self.is_default else super().name
 
+    @property
+    def short_name(self) -> str:
+        """Options without the syntax of MJCF; or "MuJoCo's defaults"."""
+        return "MuJoCo's defaults" if self.is_default else super().short_name
+
     def apply_to(self, mj: Any, model: Any) -> Any:
         """Return a copy of the model with these options."""
         configured = copy.copy(model)

@@ -20,9 +20,10 @@ from lavender.problem.derived import cached_property
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
-N_SLOWER_ROWS = (
-    4  # The terminal shows at most this many settings of the front that are slower than the present one.
-)
+# The terminal shows at most this many settings of the front that are slower than the present one.
+N_SLOWER_ROWS = 4
+# Each of these has at most this fraction of the error of the one before.
+MAX_ERROR_RATIO = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +268,18 @@ class Tuning:
         return Table(heads, rows, words=frozenset({"setting"}))
 
     @property
+    def terminal_table(self) -> Table:
+        """Table of `terminal_settings`, narrow enough for a terminal of 80 columns."""
+        now = self.present_result.mean_step_time
+        rows: list[list[str | Cell]] = [
+            [m.setting.short_name, f"{m.mean_step_time / now:.2f}", Cell.size(m.worst_error),
+             Cell.size(float(m.error.max()))]
+            for m in self.terminal_settings
+        ]  # fmt: skip
+        heads = ["setting", "relative time", "error 99 % [m/s]", "worst"]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
     def terminal_settings(self) -> list[Measured]:
         """Settings in the table of the terminal: the present one first, the others by time.
 
@@ -275,7 +288,11 @@ class Tuning:
         """
         now, front = self.present_result, self.pareto_front
         max_time = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
-        slower = [m for m in front if m.mean_step_time > max_time]
+        slower: list[Measured] = []
+        for m in front:
+            last_error = slower[-1].worst_error if slower else np.inf
+            if m.mean_step_time > max_time and m.worst_error <= MAX_ERROR_RATIO * last_error:
+                slower.append(m)
         quick = [m for m in front if m.mean_step_time <= max_time]
         spaced = np.linspace(0, max(0, len(slower) - 1), min(N_SLOWER_ROWS, len(slower))).round().astype(int)
         defaults = [m for m in self._same_problem if m.setting.is_default]
@@ -332,7 +349,7 @@ class Tuning:
                 PageSection("Rows and contacts", sizes, short=2,
                      note="Rows and contacts of the steps with the model's own setting."),
                 PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures,
-                     terminal_table=self._build_table_of_settings(self.terminal_settings)),
+                     terminal_table=self.terminal_table),
                 PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
                      note="Settings that change the problem: the error is that of its own problem."),
                 PageSection("Every setting", [self._build_table_of_settings(every)],
