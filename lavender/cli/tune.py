@@ -38,8 +38,8 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     step are measured with many settings on worlds of the model. Two lines with options are printed: one that is faster
     and as accurate as the present setting, and one that is more accurate and as fast. Both are chosen on half of the
     worlds and validated on the other half. With --max-velocity-error E, the first line is the fastest setting whose
-    errors are at most E on all worlds, or the most accurate one if there is none. No line is printed if fewer than 20 %
-    of the steps have contact: then start from states with contact (--states).
+    errors do not exceed E on all worlds, or the one with the smallest error if there is none. No line is printed if
+    fewer than 20 % of the steps have contact: then start from states with contact (--states).
 
     Exit code 130: stopped by Ctrl-C; the page shows the completed part.
     """

@@ -20,9 +20,9 @@ from lavender.problem.derived import cached_property
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
-# The terminal shows at most this many settings of the front that are slower than the present one.
+# The terminal shows up to this many settings of the front that are slower than the present one.
 N_SLOWER_ROWS = 4
-# Each of these has at most this fraction of the error of the one before.
+# The error of each of these does not exceed this fraction of the error of the one before.
 MAX_ERROR_RATIO = 0.9
 
 
@@ -52,7 +52,7 @@ class Tuning:
     n_held_worlds : int
         Number of worlds held back.
     error_limit : float, m/s, optional
-        The fastest setting whose error is at most this number in every step is also recommended.
+        The fastest setting whose error does not exceed this number in any step is also recommended.
     held_errors : dict
         Largest error [m/s] on the worlds held back, of the settings that were judged there.
     """
@@ -119,7 +119,7 @@ class Tuning:
 
     @property
     def within_limit(self) -> Measured | None:
-        """Fastest setting with errors of at most `error_limit`, also on the worlds held back if it was judged there.
+        """Fastest setting with no error above `error_limit`, also on the worlds held back if it was judged there.
 
         The present setting counts as faster if the times are equal within noise. None if there is no such setting, or
         no limit.
@@ -133,7 +133,7 @@ class Tuning:
 
     @property
     def most_accurate(self) -> Measured:
-        """Setting with the smallest largest error on all worlds on which it was judged."""
+        """Setting with the smallest maximum error on all worlds on which it was judged."""
         return min(self._same_problem, key=self._compute_largest_error)
 
     @property
@@ -283,8 +283,8 @@ class Tuning:
     def terminal_settings(self) -> list[Measured]:
         """Settings in the table of the terminal: the present one first, the others by time.
 
-        The others are MuJoCo's defaults; of the Pareto front the fastest setting, the most accurate one in the present
-        time, and at most `N_SLOWER_ROWS` that take more time, up to the most accurate one.
+        The others are MuJoCo's defaults; of the Pareto front the fastest setting, the one with the smallest error
+        in the present time, and up to `N_SLOWER_ROWS` that take more time, with the smallest error of all.
         """
         now, front = self.present_result, self.pareto_front
         max_time = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time

@@ -78,7 +78,7 @@ def tune(
     threshold : float, m/s, m
         Errors [m/s] and distances [m] up to this number count as accurate enough.
     max_velocity_error : float, m/s, optional
-        Also recommend the fastest setting whose error is at most this number in every step of all worlds.
+        Also recommend the fastest setting whose error does not exceed this number in any step of all worlds.
     watch : callable, optional
         Called with the progress.
 
@@ -166,7 +166,7 @@ def run_tuning(
     n_held_worlds : int
         Number of worlds held back.
     error_limit : float, m/s, optional
-        Also choose the fastest setting whose error is at most this number on both stages.
+        Also choose the fastest setting whose error does not exceed this number on both stages.
     """
     schedule = Schedule(watch)
     held_errors: dict[Setting, float] = {}
