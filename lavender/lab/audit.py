@@ -280,13 +280,12 @@ class Audit:
             return ""
         consequences = {
             "warm start": "the first solve of each world starts cold",
-            "controls": "the controls of the first step are those of --controls",
+            "controls": "the first step uses the controls of --controls",
         }
         return (
             f"The start states have no {' and no '.join(missing)}: "
-            f"{' and '.join(consequences[name] for name in missing)}. The errors of the first step "
-            "are not those of the simulation that the states come from; only the array `state` (mjSTATE_INTEGRATION) "
-            "has everything."
+            f"{' and '.join(consequences[name] for name in missing)}. The first step therefore has "
+            "other errors than in the original simulation. Only the array `state` (mjSTATE_INTEGRATION) contains all."
         )
 
     @property

@@ -71,7 +71,7 @@ class Operators(ProblemData):
         If this is rounding (up to 1e-14), but the maximum of |A_ij - A_ji| / sqrt(d_i d_j) is not (above 1e-10), the
         value is that maximum: entries of heavy bodies are small compared with entries of light bodies.
         """
-        return 0.0 if self.matrix is None else self._scan
+        return 0.0 if self.matrix is None else self._matrix_asymmetry
 
     @cached_property
     def bandwidth(self) -> tuple[int, int]:
@@ -86,9 +86,9 @@ class Operators(ProblemData):
         return max(self.bandwidth) if self.generalized is None else int(self.metric.max_bandwidth)
 
     @cached_property
-    def _scan(self) -> float:
+    def _matrix_asymmetry(self) -> float:
         """Value of `asymmetry` of a matrix."""
-        return sparse.scan(*self._compressed, self.d)[2]
+        return float(sparse.measure_asymmetry(*self._compressed, self.d))
 
     @property
     def is_symmetric(self) -> bool:

@@ -239,7 +239,7 @@ def estimate_disk_cost(problem: Problem) -> float:
 
 def estimate_refusal_cost(problem: Problem) -> float:
     """Estimate the cost of `SolverSpec.refusal` [ns]; adapters of other packages read the complete A in it."""
-    if problem.matrix is None or "_scan" in problem.__dict__:
+    if problem.matrix is None or "_matrix_asymmetry" in problem.__dict__:
         return 0.0
     return float(estimate_judge_setup_cost(problem) + RATES["judge entry"] * float(problem.matrix.size))
 
@@ -251,7 +251,7 @@ def estimate_import_cost(*modules: str) -> float:
 
 def estimate_symmetry_cost(problem: Problem) -> float:
     """Estimate the cost to check whether A is symmetric [ns]; 0 if it is known."""
-    is_known = problem.matrix is None or "_scan" in problem.__dict__
+    is_known = problem.matrix is None or "_matrix_asymmetry" in problem.__dict__
     return 0.0 if is_known else float(RATES["judge entry"] * problem.max_entries)
 
 

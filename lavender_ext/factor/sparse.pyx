@@ -18,22 +18,22 @@ def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
     return lower, upper
 
 
-def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const double[::1] d):
-    """Return (lower bandwidth, upper bandwidth, asymmetry) of a canonical CSR matrix with the metric d (n,)."""
+def measure_asymmetry(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const double[::1] d):
+    """Return the asymmetry of a canonical CSR matrix with the metric d (n,)."""
     cdef int32_t n = <int32_t>indptr.shape[0] - 1
     cdef int32_t band[2]
     cdef double asymmetry
     cdef csr_t a
     cdef int32_t[::1] cursor
     if n <= 0 or data.shape[0] == 0:
-        return 0, 0, 0.0
+        return 0.0
     a.indptr = &indptr[0]
     a.indices = &indices[0]
     a.data = &data[0]
     cursor = np.empty(n, np.int32)
     with nogil:
         asymmetry = measure_asymmetry_and_bandwidth(&a, &d[0], n, &cursor[0], band)
-    return band[0], band[1], asymmetry
+    return asymmetry
 
 
 def has_symmetric_pattern(const int32_t[::1] indptr, const int32_t[::1] indices):

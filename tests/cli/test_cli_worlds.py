@@ -54,7 +54,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     assert "Add the line after the model's own <option>" in " ".join(out.split())
     warned = 2 if "The machine was busy" in out else 0  # a warning, and longer comments
     assert len(out.splitlines()) <= 29 + warned
-    assert "on other states they can be larger" in " ".join(out.split())
+    assert "On other states they can be larger" in " ".join(out.split())
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
     assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()

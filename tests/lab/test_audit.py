@@ -326,9 +326,9 @@ def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, name
         ),
         (
             ("qpos", "qvel", "ctrl"),
-            "have no warm start: the first solve of each world starts cold. The errors",
+            "have no warm start: the first solve of each world starts cold. The first step",
         ),
-        (("qpos", "qvel", "qacc_warmstart"), "have no controls: the controls of the first step are those of"),
+        (("qpos", "qvel", "qacc_warmstart"), "have no controls: the first step uses the controls of"),
         (("state",), ""),
         (("qpos", "qvel", "ctrl", "qacc_warmstart"), ""),
     ],

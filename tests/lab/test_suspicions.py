@@ -220,7 +220,7 @@ def test_a_state_that_does_not_fit_the_problem_is_refused():
 def test_velocities_of_a_planar_engine_are_accepted():
     dt, velocity = 0.01, np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
 
-    def found(after, given):
+    def diagnose(after, given):
         builder = lv.RowBuilder([1.0, 0.5], [6.0, 3.0], after, dt, [(0.0, 0.5), (3.0, 0.5)])
         builder.hinge(0, 1, (1.5, 0.5))
         for body, x in ((0, -0.5), (0, 0.5), (1, 2.5), (1, 3.5)):
@@ -231,9 +231,9 @@ def test_velocities_of_a_planar_engine_are_accepted():
     wide = np.zeros((2, 6))
     wide[:, [0, 1, 5]] = velocity
     for given in (velocity, velocity.tolist(), wide):
-        assert [s.kind for s in found(velocity + dt * fall, given)] == []
-        assert "v* equals v" in str(found(velocity, given))
-        assert "do accelerations lack dt" in str(found(velocity + fall, given))
+        assert [s.kind for s in diagnose(velocity + dt * fall, given)] == []
+        assert "v* equals v" in str(diagnose(velocity, given))
+        assert "do accelerations lack dt" in str(diagnose(velocity + fall, given))
 
 
 def test_planar_velocities_of_a_problem_in_space_get_the_conversion():

@@ -130,7 +130,7 @@ def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
     assert found.within_limit is found.limit_choice is good
     assert found.lines[0] == '<option tolerance="1e-06"/>  <!-- error at most 0.001 m/s, fastest -->'
     assert found.lines[1].endswith("(at most 1.0e-5 in 100 steps)") and "not measured" in found.lines[2]
-    assert "on other states they can be larger" in found.summary_page.render_html()
+    assert "On other states they can be larger" in found.summary_page.render_html()
     # What exceeds the limit on the worlds held back is not within it.
     refuted = replace(found, held_errors={good.setting: 2e-3})
     assert refuted.within_limit is slow

@@ -121,8 +121,8 @@ class Tuning:
     def within_limit(self) -> Measured | None:
         """Fastest setting with no error above `error_limit`, also on the worlds held back if it was judged there.
 
-        The present setting counts as faster if the times are equal within noise. None if there is no such setting, or
-        no limit.
+        If the present setting takes the same time within noise, it is returned. The result is None if all settings
+        exceed the limit, or without a limit.
         """
         if self.error_limit is None:
             return None
@@ -138,7 +138,7 @@ class Tuning:
 
     @property
     def limit_choice(self) -> Measured:
-        """`within_limit`, or `most_accurate` if there is none."""
+        """`within_limit`, or `most_accurate` if that is None."""
         return self.within_limit or self.most_accurate
 
     @property
@@ -237,7 +237,9 @@ class Tuning:
             return "None, for the reason above."
         sentences = ["Chosen on the worlds with even numbers, tested on the others."]
         if self.faster or self.closer or self.error_limit is not None:
-            sentences.append("All errors are those of these states; on other states they can be larger.")
+            sentences.append("The errors were measured on these states. On other states they can be larger.")
+            if self.error_limit is not None:
+                sentences.append("The line for the error limit was chosen on all worlds.")
             if self.reason_provisional:
                 sentences.append(
                     f"The lines are provisional, because {self.reason_provisional}: measure again."

@@ -438,7 +438,7 @@ for line in Path("/proc/self/smaps").read_text().splitlines():
 
 @pytest.mark.parametrize("law", ["lcp", "cone"])
 def test_the_height_of_a_stack_at_rest_does_not_matter(law):
-    """All contacts act from the first step on; they were found one by one, a factorisation for each."""
+    """The number of factorisations does not grow with the height, because all contacts act from the first step on."""
     counts = []
     for n in (10, 80):
         rows = 1 if law == "lcp" else 3
