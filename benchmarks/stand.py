@@ -6,12 +6,12 @@ centres of the boxes,
     drift = max over boxes and t >= 2 s of |p(t) - p(2 s)|,                                     (1)
 
 sampled ten times per second. The tower has fallen when a box is half an edge below its start
-(`lavender.lab.phenomena.parts.has_fallen`); the run then ends. Lines are sorted by the sweeps per simulated second:
+(`has_fallen`); the run then ends. Lines are sorted by the sweeps per simulated second:
 sweeps x substeps / dt.
 
 LavenderSim is stepped by its public interface, with observations; the others by their own step functions. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
-Node. All use the adapters of `lavender phenomena`.
+Node.
 """
 
 from __future__ import annotations
@@ -26,25 +26,35 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
-from lavender.base.arrays import FloatArray
-from lavender.base.errors import InputError, UnknownName
-from lavender.cli.options import ListType
-from lavender.lab.bench.machine import get_versions
-from lavender.lab.phenomena.engines import (
+from benchmarks.engines import (
     PACKAGES_OF_NODE,
     Stepping,
     create_engine,
     get_missing_installation_command,
     get_npm_versions,
 )
-from lavender.lab.phenomena.parts import has_fallen
+from benchmarks.output import markdown, out_option, write_json
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError, UnknownName
+from lavender.cli.options import ListType
+from lavender.lab.bench.machine import get_versions
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
 
 FRICTION = 0.5
 SETTLE = 2.0  # s
 LOOK = 0.1  # s
+
+
+def has_fallen(start: FloatArray, now: FloatArray) -> bool:
+    """Return whether a box is half an edge lower than at the start, or a position is not finite.
+
+    Parameters
+    ----------
+    start, now : (n, 3) m
+        Centres of the boxes.
+    """
+    return not (start[:, 2] - now[:, 2]).max() <= 0.5
 
 
 @dataclass(frozen=True)
@@ -101,7 +111,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Contestant:
-    """An engine of `lavender.phenomena` with its requirements and options."""
+    """An engine of `benchmarks.engines` with its requirements and options."""
 
     name: str
     module: str = "own"
@@ -133,7 +143,7 @@ class Contestant:
         return Standing(made, name, made.sim.solver_iterations if self.sweeps else 0, p.substeps)
 
 
-_ELLIPTIC = {"cone": "elliptic", "tree": False}
+_ELLIPTIC = {"cone": "elliptic"}
 #: Engines by their names in `--engines`. Joints of all engines are constraints between bodies.
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant("lavender", substeps=True),
@@ -143,7 +153,7 @@ ENGINES: dict[str, Contestant] = {
     "lavendersim": Contestant("lavendersim", "lavender_sim", "lavendersim", 22),
     "mujoco_newton": Contestant("mujoco Newton", "mujoco", "mujoco", sweeps="", options=_ELLIPTIC),
     "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options=_ELLIPTIC),
-    "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True, options={"bodies": True}),
+    "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True),
     "rapier": Contestant(
         "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations", options={"engine": "rapier"}
     ),

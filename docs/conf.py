@@ -57,7 +57,7 @@ CONTENTS = {
         "commands report campaigns formats generalized quadratic-programs mujoco worlds engines audit "
         "tune derivatives proof c solvers generated/api"
     ),
-    "LavenderSim": "engine engine-measurements scenes towers web phenomena",
+    "LavenderSim": "engine engine-measurements scenes towers web",
     "Background": (
         "chapter motion newtons-method auto performance peers catalogue generated/cases "
         "generated/measured method"

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from lavender.batch.solve import Solutions, solve_many
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
-    from lavender.lab import bench, motion, phenomena, report, suite
+    from lavender.lab import bench, motion, report, suite
     from lavender.lab.check import CrossCheck, cross_check
     from lavender.lab.diagnostics import Diagnostic, diagnose
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
@@ -109,7 +109,6 @@ _LAZY_MODULES = {
     "export": "lavender.export",
     "io": "lavender.io",
     "motion": "lavender.lab.motion",
-    "phenomena": "lavender.lab.phenomena",
     "registry": "lavender.solvers.registry",
     "report": "lavender.lab.report",
     "scene": "lavender.sim.scene",
@@ -177,7 +176,6 @@ __all__ = [
     "load",
     "motion",
     "motion_error",
-    "phenomena",
     "prepare",
     "prove",
     "redundancy",

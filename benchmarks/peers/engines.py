@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks import stand
+from benchmarks.engines import create_engine, get_missing_installation_command
 from benchmarks.stand import Contestant, Tower
 from lavender.base.errors import UnknownName
-from lavender.lab.phenomena.engines import create_engine, get_missing_installation_command
 from lavender.problem import Problem
 from lavender.sim.scene import Scene
 
@@ -70,7 +70,7 @@ ENGINES: dict[str, Contestant] = {
     name: stand.ENGINES[name] for name in ("lavender", "newton", "mujoco_pgs", "mujoco_newton", "pybullet")
 }
 ENGINES["mujoco_pyramidal"] = replace(
-    ENGINES["mujoco_newton"], name="mujoco Newton pyramidal", options={"cone": "pyramidal", "tree": False}
+    ENGINES["mujoco_newton"], name="mujoco Newton pyramidal", options={"cone": "pyramidal"}
 )
 
 
@@ -84,7 +84,7 @@ def export(scene: str, cone: str = "elliptic", settle: int = 120) -> Problem:
     """
     import mujoco
 
-    made: Any = create_engine("mujoco", _scene(scene), cone=cone, dt=DT, sweeps=16, tree=False)
+    made: Any = create_engine("mujoco", _scene(scene), cone=cone, dt=DT, sweeps=16)
     made.advance(settle)
     mujoco.mj_forward(made.model, made.data)
     problem: Problem = made.read_last_problem()

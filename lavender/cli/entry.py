@@ -28,7 +28,7 @@ from lavender.cli.options import (
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
     "Solve and judge": ("solve", "check", "prove", "reference", "explain"),
-    "Measure": ("report", "phenomena"),
+    "Measure": ("report",),
     "MuJoCo": ("record", "audit", "tune", "slip", "bench"),
     "Engine": ("run", "view", "web"),
     "Tools": ("solvers", "contract", "cases", "problems", "doctor", "export"),

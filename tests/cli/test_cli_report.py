@@ -1,4 +1,4 @@
-"""`lavender report`, `phenomena`, `prove`, `explain`: what measures and examines from the command line."""
+"""`lavender report`, `prove`, `explain`: what measures and examines from the command line."""
 
 import json
 import os
@@ -25,7 +25,6 @@ from lavender.cli import measuring
 from lavender.cli.bench import mujoco
 from lavender.export import vectors
 from lavender.lab.bench import Event, simulators
-from lavender.lab.phenomena import PHENOMENA
 from lavender.lab.report import motion_tables
 from lavender.lab.suite import steps
 
@@ -59,30 +58,6 @@ def test_without_a_problem_nothing_is_printed_but_why(boxes):
         assert CliRunner().invoke(mujoco, [*words, *bad]).exit_code == 2
     warm = CliRunner().invoke(mujoco, [*words, "--warm", "40"])
     assert warm.exit_code == 0 and "ours, median" in warm.output and "Cold" not in warm.output
-
-
-def test_the_command(lavender, tmp_path):
-    file = tmp_path / "found.json"
-    code, out, _ = lavender("phenomena", "lift", "--steppers", "impulses,avbd", "--out", file)
-    assert code == 0 and "| impulses | 0 m, 2/2 |" in out
-    told = json.loads(file.read_text())
-    assert {r["engine"] for r in told["records"]} == {
-        "impulses",
-        "impulses 16x4",
-        "impulses newton",
-        "avbd",
-        "avbd 16x4",
-    }
-    assert all(r["setting"] for r in told["records"])
-
-
-def test_the_list_tells_truths_without_running(lavender):
-    code, out, _ = lavender("phenomena", "--list")
-    assert code == 0
-    for name, p in PHENOMENA.items():
-        assert f"{name}: {p.title}" in out
-    code, _, err = lavender("phenomena", "--list", "--out", "measured.json")
-    assert code == 2 and "--out has no effect with --list" in err
 
 
 def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkeypatch):

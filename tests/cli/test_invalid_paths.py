@@ -446,7 +446,6 @@ COMMANDS = [
      "--repeats", "1", "--out", "report", "--paper"),
     ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
     ("solve", "stack(n=2)", "--output", "solution.npz"),
-    ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
     ("export", "c", "c", "--records", "report"),
     ("web", "page", "page"),
     ("problems", "@hard", "--page", "set.md"),
@@ -482,7 +481,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         print("OPENED", sorted(opened))"""
     done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
     files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
-    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page", "phenomena.json", "set.md"}
+    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page", "set.md"}
     locks = [f"{name}/{FOLDER_LOCK}" for name in ("c", "page", "report", "steps")]
     assert literal_eval(done.stdout.splitlines()[-1].removeprefix("OPENED ")) == sorted(
         [*locks, "report/records.jsonl", "report/records.jsonl.lock"]

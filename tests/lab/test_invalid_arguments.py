@@ -18,7 +18,7 @@ from random_problems import nearly_singular, random_contact_problem, seeds, warm
 from worked import after
 
 import lavender as lv
-from lavender import bench, motion, phenomena, suite
+from lavender import bench, motion, suite
 from lavender.lab.suite import hard
 
 A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
@@ -74,7 +74,6 @@ CALLS = {
         bench.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
     ),
     "bench.classify_structure": Call(bench.classify_structure, {"problem": LCP}),
-    "phenomena.select_phenomena": Call(phenomena.select_phenomena, {"names": ["slide"]}),
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),

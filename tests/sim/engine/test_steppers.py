@@ -1,4 +1,4 @@
-"""Ways to step: laws that each keeps, beside lab/phenomena; twins in NumPy, snapshots, refusals."""
+"""Ways to step: laws that each keeps, beside test_exact_motions.py; twins in NumPy, snapshots, refusals."""
 
 import math
 from dataclasses import replace

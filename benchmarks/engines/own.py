@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.engines import Stepping
 from lavender.base.arrays import FloatArray
-from lavender.lab.phenomena.engines import Stepping
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 
@@ -15,11 +15,8 @@ class Engine(Stepping):
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.sim = scene, Simulation(scene)
-        p = scene.parameters
-        self.dt, self.substep = p.dt, p.dt / p.substeps
+        self.dt = scene.parameters.dt
         self.observation = self.sim.reset()[0]
-        work = f"{self.sim.solver_iterations} sweeps" if p.solver == "sequential_impulses" else p.solver
-        self.setting = f"{1e3 * p.dt:.3g} ms in {p.substeps} of {work}"
         self.has_ended = False
 
     def step(self) -> None:
@@ -36,8 +33,3 @@ class Engine(Stepping):
         gap = np.abs(self.sim.state.a["joint_error"]).max(initial=0.0)
         depth = max(self.observation["contacts"]["depth"].max(initial=0.0), gap)
         return int(self.observation["solver"][2]), float(depth), float(self.sim.residual()["relative"])
-
-    def get_joint_force(self) -> float:
-        """See `Stepping.get_joint_force`; the first joint must be a ball joint with three rows."""
-        rows = self.observation["joint_impulses"][:3]
-        return float(np.linalg.norm(rows)) / self.substep if len(rows) == 3 else float("nan")

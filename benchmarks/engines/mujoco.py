@@ -1,4 +1,4 @@
-"""MuJoCo: native shapes and joints, its default step and solver."""
+"""MuJoCo: native shapes; joints are equality constraints between free bodies."""
 
 from __future__ import annotations
 
@@ -7,15 +7,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from benchmarks.engines import Stepping, get_collision_shape
 from lavender.base.arrays import FloatArray
 from lavender.io.mujoco import from_mujoco, impulse
 from lavender.judge.residuals import residual
-from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import (
-    compute_relative_pose,
-    get_collision_shape,
-    map_bodies_to_parent_joints,
-)
 from lavender.problem import Problem
 from lavender.sim.scene import Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import convert_to_rotation_matrix
@@ -36,57 +31,30 @@ def _make_equality_constraint(joint: Joint) -> str:
 
 
 class Engine(Stepping):
-    """`mj_step`, 2 ms with Newton to 1e-8 by default.
+    """`mj_step`, Newton to 1e-8 by default; with `sweeps`, PGS with this many iterations at tolerance 0 instead."""
 
-    Parameters
-    ----------
-    cone : {"pyramidal", "elliptic"}
-    noslip : int
-        Number of noslip iterations.
-    dt : float, optional, s
-    sweeps : int, optional
-        If given, PGS with this many iterations and tolerance 0 replaces Newton.
-    tree : bool
-        True: joints of a tree. False: equality constraints between free bodies.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        cone: str,
-        noslip: int = 0,
-        dt: float | None = None,
-        sweeps: int = 0,
-        tree: bool = True,
-    ) -> None:
-        self.scene, self.up = scene, map_bodies_to_parent_joints(scene, "mujoco") if tree else {}
-        ties = [] if tree else scene.joints
+    def __init__(self, scene: Scene, cone: str, dt: float, sweeps: int = 0) -> None:
+        self.scene = scene
         p = scene.parameters
         spin = ' condim="6"' if p.rolling_radius else ' condim="4"' if p.patch_radius else ""
         friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} {p.rolling_radius!r}"'
-        step = f' timestep="{dt!r}"' if dt else ""
         solver = f' solver="PGS" iterations="{sweeps}" tolerance="0"' if sweeps else ""
-        gravity = _format_numbers(p.gravity)
-        option = f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{gravity}"{step}{solver}/>'
-        memory = "64M" if tree else "1G"  # Memory for contacts and constraint rows.
+        option = f'<option cone="{cone}" gravity="{_format_numbers(p.gravity)}" timestep="{dt!r}"{solver}/>'
         self.no_collision = ' contype="0" conaffinity="0"' if scene.joints else ""
-        trees = "".join(
-            self._make_body_element(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0
-        )
+        bodies = "".join(self._make_body_element(i) for i in range(scene.n_bodies))
+        # Of the size element, 1G is the memory for contacts and constraint rows.
         self.model = mujoco.MjModel.from_xml_string(
-            f"<mujoco>{option}<size memory='{memory}'/><default><geom {friction}{spin}/></default>"
-            f"<worldbody>{trees}</worldbody>"
-            f"<equality>{''.join(map(_make_equality_constraint, ties))}</equality></mujoco>"
+            f"<mujoco>{option}<size memory='1G'/><default><geom {friction}{spin}/></default>"
+            f"<worldbody>{bodies}</worldbody>"
+            f"<equality>{''.join(map(_make_equality_constraint, scene.joints))}</equality></mujoco>"
         )
         self.data = mujoco.MjData(self.model)
         self.dt = float(self.model.opt.timestep)
-        method = f"{sweeps} sweeps" if sweeps else "Newton"
-        self.setting = f"{1e3 * self.dt:.3g} ms, {method}, {cone}" + (f", noslip {noslip}" if noslip else "")
         self.ids = [
             mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}") for i in range(scene.n_bodies)
         ]
         for i, body in enumerate(scene.bodies):
-            if i not in self.up and not body.is_static:
+            if not body.is_static:
                 at = self.model.jnt_dofadr[self.model.body_jntadr[self.ids[i]]]
                 # The angular velocity of a free joint is in the body's frame.
                 angular_velocity = convert_to_rotation_matrix(body.quaternion).T @ body.angular_velocity
@@ -94,8 +62,8 @@ class Engine(Stepping):
         mujoco.mj_forward(self.model, self.data)
 
     def _make_body_element(self, i: int) -> str:
-        """Build the MJCF element of a body with its children."""
-        body, joint = self.scene.bodies[i], self.up.get(i)
+        """Build the MJCF element of a body."""
+        body = self.scene.bodies[i]
         shape = get_collision_shape(body, "mujoco")
         if isinstance(shape, Plane):
             point = _format_numbers(shape.offset * np.asarray(shape.normal))
@@ -105,21 +73,11 @@ class Engine(Stepping):
             geom = f'type="sphere" size="{shape.radius!r}"'
         else:
             geom = f'type="box" size="{_format_numbers(0.5 * np.asarray(shape.size))}"'
-        parent = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
-        position, quaternion = compute_relative_pose(parent, body)
         tie = "" if body.is_static else "<freejoint/>"
         geom += self.no_collision if not body.is_static else ""
-        if joint is not None:
-            kind = (
-                f'type="hinge" axis="{_format_numbers(joint.axis_b)}"'
-                if joint.kind == "hinge"
-                else 'type="ball"'
-            )
-            tie = f'<joint {kind} pos="{_format_numbers(joint.anchor_b)}"/>'
-        children = "".join(self._make_body_element(j) for j, other in self.up.items() if other.a == i)
         weight = f' mass="{body.mass!r}"' if body.mass else ""
-        pose = f'pos="{_format_numbers(position)}" quat="{_format_numbers(quaternion)}"'
-        return f'<body name="b{i}" {pose}>{tie}<geom {geom}{weight}/>{children}</body>'
+        pose = f'pos="{_format_numbers(body.position)}" quat="{_format_numbers(body.quaternion)}"'
+        return f'<body name="b{i}" {pose}>{tie}<geom {geom}{weight}/></body>'
 
     def step(self) -> None:
         """See `Stepping.step`."""

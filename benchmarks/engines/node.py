@@ -11,15 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError, LavenderError
-from lavender.lab.phenomena.engines import (
+from benchmarks.engines import (
     PACKAGES_OF_NODE,
     Stepping,
     explain_missing_npm_package,
     find_node_folder,
+    get_collision_shape,
+    reject_joints,
 )
-from lavender.lab.phenomena.engines.tree import get_collision_shape, map_bodies_to_parent_joints
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError, LavenderError
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 SCRIPT = Path(__file__).with_name("served.mjs")
@@ -28,7 +29,7 @@ SCRIPT = Path(__file__).with_name("served.mjs")
 class JsonLines:
     """A program that answers each line of JSON with one line of JSON.
 
-    It has no time limit: its parent is a `ProcessBackend`, which is killed together with it.
+    It has no time limit.
     """
 
     def __init__(self, command: Sequence[str]) -> None:
@@ -61,22 +62,14 @@ class Engine(Stepping):
     """An engine under Node, which returns its state with each answer."""
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
-        map_bodies_to_parent_joints(scene, engine)  # Raises CapabilityError if the scene is not a tree.
+        reject_joints(scene, engine)
         self.dt, self.cpu_time = dt, 0.0
-        self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
         request = {
             "gravity": list(p.gravity),
             "friction": p.friction,
             "bodies": [_describe_body(body, engine) for body in scene.bodies],
-            "joints": [
-                {
-                    "kind": j.kind, "a": j.a, "b": j.b,
-                    **{k: getattr(j, k).tolist() for k in ("anchor_a", "anchor_b", "axis_a", "axis_b")},
-                }
-                for j in scene.joints
-            ],
-        }  # fmt: skip
+        }
         folder = find_node_folder(PACKAGES_OF_NODE[engine])
         if folder is None:
             raise LavenderError(f"{engine}: {explain_missing_npm_package(PACKAGES_OF_NODE[engine])}")

@@ -1,21 +1,20 @@
 // Jolt (jolt-physics): planes, boxes and spheres of its own, no sleep, no damping.
-const STILL = 0; // object layers: what stands, what moves, and what hangs on joints and meets nothing
+const STILL = 0; // object layers: static bodies, and moving bodies
 const MOVING = 1;
-const JOINTED = 2;
 
 export async function build(module, scene, options) {
   const J = await module.default();
   const vec = (v) => new J.Vec3(...v);
   const place = (v) => new J.RVec3(...v);
   const settings = new J.JoltSettings();
-  const pairs = new J.ObjectLayerPairFilterTable(3);
+  const pairs = new J.ObjectLayerPairFilterTable(2);
   pairs.EnableCollision(STILL, MOVING);
   pairs.EnableCollision(MOVING, MOVING);
-  const layers = new J.BroadPhaseLayerInterfaceTable(3, 2);
-  [STILL, MOVING, JOINTED].forEach((k) => layers.MapObjectToBroadPhaseLayer(k, new J.BroadPhaseLayer(Math.min(k, 1))));
+  const layers = new J.BroadPhaseLayerInterfaceTable(2, 2);
+  [STILL, MOVING].forEach((k) => layers.MapObjectToBroadPhaseLayer(k, new J.BroadPhaseLayer(k)));
   settings.mObjectLayerPairFilter = pairs;
   settings.mBroadPhaseLayerInterface = layers;
-  settings.mObjectVsBroadPhaseLayerFilter = new J.ObjectVsBroadPhaseLayerFilterTable(layers, 2, pairs, 3);
+  settings.mObjectVsBroadPhaseLayerFilter = new J.ObjectVsBroadPhaseLayerFilterTable(layers, 2, pairs, 2);
   const all = new J.JoltInterface(settings);
   const system = all.GetPhysicsSystem();
   const interface_ = system.GetBodyInterface();
@@ -28,13 +27,12 @@ export async function build(module, scene, options) {
     sphere: (s) => new J.SphereShape(s.radius),
     box: (s) => new J.BoxShape(vec(s.size.map((x) => 0.5 * x)), Math.min(0.05, 0.5 * Math.min(...s.size))),
   };
-  const moving = scene.joints.length ? JOINTED : MOVING;
   const bodies = scene.bodies.map((b) => {
     const still = b.mass === 0;
     const [w, x, y, z] = b.quaternion;
     const kind = still ? J.EMotionType_Static : J.EMotionType_Dynamic;
     const made = new J.BodyCreationSettings(
-      shapes[b.shape.kind](b.shape), place(still ? [0, 0, 0] : b.position), new J.Quat(x, y, z, w), kind, still ? STILL : moving,
+      shapes[b.shape.kind](b.shape), place(still ? [0, 0, 0] : b.position), new J.Quat(x, y, z, w), kind, still ? STILL : MOVING,
     );
     made.mFriction = scene.friction;
     made.mAllowSleeping = false;
@@ -52,20 +50,6 @@ export async function build(module, scene, options) {
     interface_.AddBody(body.GetID(), J.EActivation_Activate);
     return body;
   });
-  for (const j of scene.joints) {
-    const hinge = j.kind === "hinge";
-    const made = hinge ? new J.HingeConstraintSettings() : new J.PointConstraintSettings();
-    made.mSpace = J.EConstraintSpace_LocalToBodyCOM;
-    made.mPoint1 = place(j.anchor_a);
-    made.mPoint2 = place(j.anchor_b);
-    if (hinge) {
-      made.mHingeAxis1 = vec(j.axis_a);
-      made.mHingeAxis2 = vec(j.axis_b);
-      made.mNormalAxis1 = vec(j.axis_a).GetNormalizedPerpendicular();
-      made.mNormalAxis2 = vec(j.axis_b).GetNormalizedPerpendicular();
-    }
-    system.AddConstraint(made.Create(j.a < 0 ? J.Body.prototype.sFixedToWorld : bodies[j.a], bodies[j.b]));
-  }
   const of = (body) => {
     const [x, q, v, s] = [body.GetPosition(), body.GetRotation(), body.GetLinearVelocity(), body.GetAngularVelocity()].map(
       (t) => [t.GetX(), t.GetY(), t.GetZ(), t.GetW?.()],

@@ -5,13 +5,8 @@ from __future__ import annotations
 import lavendersim
 import numpy as np
 
+from benchmarks.engines import Stepping, get_collision_shape, reject_joints
 from lavender.base.arrays import FloatArray
-from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import (
-    get_collision_shape,
-    map_bodies_to_parent_joints,
-    reorder_to_xyzw,
-)
 from lavender.sim.scene import Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import convert_frame_to_quaternion
 from lavender.sim.scene.parts import convert_to_rotation_matrix
@@ -33,8 +28,8 @@ class Engine(Stepping):
     def __init__(self, scene: Scene, sweeps: int, dt: float = 1.0 / 60.0) -> None:
         self.scene, self.dt = scene, dt
         self.substeps = max(1, int(np.ceil(240.0 * dt - 1e-9)))
-        self.setting = f"{1e3 * dt:.3g} ms in {self.substeps} of {sweeps} sweeps"
-        up, p = map_bodies_to_parent_joints(scene, "lavendersim"), scene.parameters
+        reject_joints(scene, "lavendersim")
+        p = scene.parameters
         g = np.asarray(p.gravity, float)
         size = float(np.linalg.norm(g))
         self.frame = _make_engine_axes(-g / size if size else np.array([0.0, 0.0, 1.0]))
@@ -44,27 +39,15 @@ class Engine(Stepping):
             # The engine multiplies the coefficient of rolling friction by the contact radius.
             "rolling_friction": p.rolling_radius / (p.patch_radius or 0.02),
         }  # fmt: skip
-        engine_scene = lavendersim.Scene("phenomenon", gravity=-size, solver_iterations=sweeps, ground=False)
-        refs = [self._add_body(engine_scene, i, jointed=i in up or bool(up)) for i in range(scene.n_bodies)]
-        for i, joint in up.items():
-            body = scene.bodies[i]
-            orientation = convert_to_rotation_matrix(body.quaternion)
-            parent = lavendersim.WORLD if joint.a < 0 else refs[joint.a]
-            anchor = self.frame @ (body.position + orientation @ joint.anchor_b)
-            if joint.kind == "hinge":
-                axis = self.frame @ orientation @ joint.axis_b
-                no_motor = lavendersim.PD(0.0, 0.0, 0.0)
-                engine_scene.revolute(
-                    joint.name, parent, refs[i], anchor=anchor, axis=axis, limits=(-100.0, 100.0), pd=no_motor
-                )
-            else:
-                engine_scene.spherical(joint.name, parent, refs[i], anchor=anchor)
+        engine_scene = lavendersim.Scene("scene", gravity=-size, solver_iterations=sweeps, ground=False)
+        for i in range(scene.n_bodies):
+            self._add_body(engine_scene, i)
         self.env = lavendersim.CodeSceneEnv(engine_scene, control_dt=self.dt, horizon=None)
         self.env.reset()
         self.first = len(self.env.body_state()) - scene.n_bodies
         self.step = self.env.step  # type: ignore[method-assign]
 
-    def _add_body(self, engine_scene: lavendersim.Scene, i: int, jointed: bool) -> lavendersim.BodyRef:
+    def _add_body(self, engine_scene: lavendersim.Scene, i: int) -> None:
         """Add body i to the engine's scene."""
         body = self.scene.bodies[i]
         shape = get_collision_shape(body, "lavendersim")
@@ -72,23 +55,25 @@ class Engine(Stepping):
             normal = self.frame @ np.asarray(shape.normal)
             orientation = _make_engine_axes(normal).T
             position = (shape.offset - 0.5 * GROUND_BOX_SIZE[1]) * normal
-            return engine_scene.box(
+            engine_scene.box(
                 f"b{i}",
                 size=GROUND_BOX_SIZE,
                 mass=0.0,
                 position=position,
-                rotation=reorder_to_xyzw(convert_frame_to_quaternion(orientation)),
+                rotation=np.roll(convert_frame_to_quaternion(orientation), -1),
                 **self.material,
             )
+            return
         orientation = convert_frame_to_quaternion(self.frame @ convert_to_rotation_matrix(body.quaternion))
         body_options = {
-            "mass": body.mass, "position": self.frame @ body.position, "rotation": reorder_to_xyzw(orientation),
-            "linear_velocity": self.frame @ body.velocity, "collision": not jointed,
+            "mass": body.mass, "position": self.frame @ body.position, "rotation": np.roll(orientation, -1),
+            "linear_velocity": self.frame @ body.velocity, "collision": True,
             "angular_velocity": self.frame @ body.angular_velocity, **self.material,
         }  # fmt: skip
         if isinstance(shape, Sphere):
-            return engine_scene.sphere(f"b{i}", radius=shape.radius, **body_options)
-        return engine_scene.box(f"b{i}", size=shape.size, **body_options)
+            engine_scene.sphere(f"b{i}", radius=shape.radius, **body_options)
+        else:
+            engine_scene.box(f"b{i}", size=shape.size, **body_options)
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.get_state`."""

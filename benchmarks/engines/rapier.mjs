@@ -1,4 +1,4 @@
-// Rapier (@dimforge/rapier3d-compat): impulse joints, half-spaces, no sleep.
+// Rapier (@dimforge/rapier3d-compat): half-spaces, no sleep.
 const xyz = ([x, y, z]) => ({ x, y, z });
 const turn = ([w, x, y, z]) => ({ w, x, y, z });
 
@@ -29,17 +29,9 @@ export async function build(module, scene, options) {
         .setCanSleep(false),
     );
     shape.setMassProperties(b.mass, xyz([0, 0, 0]), xyz(b.inertia), turn([1, 0, 0, 0]));
-    world.createCollider(scene.joints.length ? shape.setCollisionGroups(0) : shape, made);
+    world.createCollider(shape, made);
     return made;
   });
-  for (const j of scene.joints) {
-    const [a, b] = [xyz(j.anchor_a), xyz(j.anchor_b)];
-    const data =
-      j.kind === "hinge"
-        ? R.JointData.revoluteWithAxes(a, b, xyz(j.axis_a), xyz(j.axis_b))
-        : R.JointData.spherical(a, b);
-    world.createImpulseJoint(data, j.a < 0 ? ground : bodies[j.a], bodies[j.b], true);
-  }
   const of = (body, k) => {
     const [x, q, v, s] = [body.translation(), body.rotation(), body.linvel(), body.angvel()];
     return [x.x, x.y, x.z, q.w, q.x, q.y, q.z, v.x, v.y, v.z, s.x, s.y, s.z];
