@@ -21,6 +21,7 @@ NAMES = (
     "peers",
     "rates",
     "regret",
+    "scale",
     "stability",
     "stand",
     "worlds",

@@ -1,0 +1,314 @@
+"""Cost of exact friction against the number of rows: `auto`, named solvers, mixes of them, another checkout, Siconos.
+
+    python -m benchmarks scale [--structures NAMES] [--rows N ...] [--sliding V ...] [--spread S ...] [--seed 7]
+                               [--limit 20] [--base CHECKOUT ...] [--siconos PYTHON] [--out FILE] [--figure FILE]
+
+Every solve runs in a process of its own, which reads the problem from a file, solves a small problem first, and then
+solves to `TOL` without a start: CPU time of one thread, smallest of alternating runs if a run is short; increase of the
+peak memory of the process; factorisations. Answers are judged under Coulomb's law by this checkout. A mix is a list of
+stages (solver, law, iterations), each started from the impulse of the one before, which ends as soon as Coulomb's law
+is met. Regret is the time of `auto` divided by the time of the fastest named solver or mix. The growth exponent of a
+structure is the slope of log time over log rows, by least squares from `MIN_GROWTH_ROWS` rows on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import lavender as lv
+from benchmarks.output import markdown, out_option, write_json
+from benchmarks.peers.adapters import check_siconos, contestants
+from benchmarks.scale_structures import HELD_OUT, STRUCTURES, build
+
+ROOT = Path(__file__).parents[1]
+TOL = 1e-6  # Relative residual to reach.
+SIZES = (900, 3_000, 10_000, 30_000, 60_000, 200_000)
+MIN_GROWTH_ROWS = 2_500
+MAX_REPEATED_TIME = 0.5  # [s] Shorter solves run three times, and the smallest time counts.
+START_TIME = 60.0  # [s] A process may take this much longer than the limit of its solve.
+SICONOS_MAX_ROWS = 8_000  # Larger problems take Siconos longer than any limit of a table.
+SICONOS_SOLVERS = ("siconos NSGS", "siconos ADMM", "siconos NSN_AC")
+Stage = tuple[str, str, int]  # solver, law, iterations (0: the solver's default)
+CONTESTANTS: dict[str, tuple[Stage, ...]] = {
+    "auto": (("auto", "coulomb", 0),),
+    "newton": (("newton", "coulomb", 0),),
+    "anderson": (("anderson", "coulomb", 20_000),),
+    "admm": (("admm", "coulomb", 0),),
+    "nncg": (("nncg", "coulomb", 20_000),),
+    "sweeps, relaxed then exact": (("anderson", "cone", 2_000), ("anderson", "coulomb", 2_000)),
+    "newton, relaxed": (("anderson", "cone", 100), ("newton", "cone", 0)),
+    "admm, relaxed": (("anderson", "cone", 100), ("admm", "cone", 0)),
+    "sweeps then admm": (("anderson", "coulomb", 100), ("admm", "coulomb", 0)),
+}  # fmt: skip
+# Reads {path, stages, tol, limit} as JSON, writes the impulse to PATH.npy and {time, memory, work, stages} to stdout.
+WORKER = """
+import json, resource, sys, time
+from dataclasses import replace
+import numpy as np
+import lavender as lv
+task = json.loads(sys.argv[1])
+given = lv.load(task["path"])
+small = lv.Problem.contact(np.eye(3), [1.0, 0.5, 0.2], [0.5])
+for solver, law, _ in task["stages"]:
+    lv.solve(small.relaxed(law), solver)
+best, spent = float("inf"), 0.0
+while best == float("inf") or (best < task["repeat"] and spent < 3.0 * best):
+    problem = replace(given, copy=False)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun, start, impulse, work, names = time.perf_counter(), time.process_time(), None, {}, []
+    for solver, law, count in task["stages"]:
+        law_problem = problem if law == problem.law else problem.relaxed(law)
+        remaining = task["limit"] - (time.perf_counter() - begun)
+        if remaining <= 0.01:
+            break
+        solution = lv.solve(law_problem, solver, impulse=impulse, tol=task["tol"], time_limit=remaining,
+                            **({"max_iter": count} if count else {}))
+        impulse = solution.impulse
+        names += [stage.solver for stage in solution.stages] or [solver]
+        for key, value in solution.work.items():
+            work[key] = work.get(key, 0) + value
+        if len(task["stages"]) > 1 and lv.residual(problem, impulse).relative <= task["tol"]:
+            break
+    taken = time.process_time() - start
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before if best == float("inf") else memory
+    best, spent = min(best, taken), spent + taken
+np.save(task["path"] + ".npy", impulse)
+print(json.dumps({"time": best, "memory": memory / 1024, "work": work, "stages": names}))
+"""
+
+
+def run_worker(
+    python: str, folder: Path, path: Path, stages: tuple[Stage, ...], limit: float
+) -> dict[str, Any]:
+    """Run stages on a problem's file in a new process; return its measurement, empty if the process failed."""
+    task = {"path": str(path), "stages": stages, "tol": TOL, "limit": limit, "repeat": MAX_REPEATED_TIME}
+    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    Path(f"{path}.npy").unlink(missing_ok=True)
+    try:
+        done = subprocess.run(
+            [python, "-c", WORKER, json.dumps(task)], cwd=folder, env=os.environ | variables, text=True,
+            capture_output=True, timeout=limit + START_TIME, check=True,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return {}
+    except subprocess.CalledProcessError as error:
+        click.echo(f"{stages[0][0]}: {error.stderr.strip().splitlines()[-1:]}", err=True)
+        return {}
+    measured: dict[str, Any] = json.loads(done.stdout)
+    return measured
+
+
+def run_siconos(problem: lv.Problem, python: str, limit: float) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield (name, measurement) for each of Siconos' solvers: the first tolerance at which the judge accepts."""
+    for contestant in contestants(python):
+        if contestant.name not in SICONOS_SOLVERS or contestant.refuses(problem):
+            continue
+        residual, seconds = math.inf, math.nan
+        for call in contestant.runs(problem, limit):
+            seconds, impulse = call()
+            residual = lv.residual(problem, impulse).relative
+            if residual <= TOL:
+                break
+        yield contestant.name, {"time": seconds, "residual": residual, "solved": residual <= TOL}
+
+
+def measure(
+    problem: lv.Problem, names: list[str], bases: list[Path], limit: float
+) -> dict[str, dict[str, Any]]:
+    """Return {contestant: {time [s], memory [MiB], residual, solved, work}} on one problem."""
+    tasks = [(name, sys.executable, ROOT, CONTESTANTS[name]) for name in names]
+    tasks[1:1] = [
+        (f"auto of {base.name}", str(base / ".venv/bin/python"), base, CONTESTANTS["auto"]) for base in bases
+    ]
+    measured = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        path = Path(temporary) / "problem.npz"
+        problem.save(path)
+        for name, python, folder, stages in tasks:
+            found = run_worker(python, folder, path, stages, limit)
+            if found:
+                found["residual"] = float(lv.residual(problem, np.load(f"{path}.npy")).relative)
+            else:
+                found = {"time": math.nan, "memory": math.nan, "residual": math.inf, "work": {}, "stages": []}
+            measured[name] = found | {"solved": found["residual"] <= TOL}
+    return measured
+
+
+def compute_regret(line: dict[str, Any]) -> tuple[float, str]:
+    """Return the regret of `auto` and the fastest contestant; NaN if `auto` does not solve the problem."""
+    others = {name: found["time"] for name, found in line["runs"].items()
+              if found["solved"] and name in CONTESTANTS and name != "auto"}  # fmt: skip
+    auto = line["runs"]["auto"]
+    if not others:
+        return (1.0 if auto["solved"] else math.nan), "auto" if auto["solved"] else "-"
+    best = min(others, key=lambda name: others[name])
+    return (auto["time"] / others[best] if auto["solved"] else math.nan), best
+
+
+def fit_exponent(rows: Any, times: Any) -> float:
+    """Return the slope of log time over log rows by least squares; NaN for fewer than three sizes."""
+    return float(np.polyfit(np.log(rows), np.log(times), 1)[0]) if len(set(rows)) >= 3 else math.nan
+
+
+def format_run(found: dict[str, Any] | None) -> str:
+    """Return the time [s] of a run, or its residual if it did not solve the problem."""
+    if found is None:
+        return ""
+    return f"{found['time']:.3g}" if found["solved"] else f"({found['residual']:.0e})"
+
+
+def print_tables(lines: list[dict[str, Any]]) -> None:
+    """Print each problem, the regret of `auto`, and the growth exponents on structures at rest."""
+    extra = list(dict.fromkeys(name for line in lines for name in line["runs"] if name not in CONTESTANTS))
+    rows = []
+    for line in lines:
+        auto = line["runs"]["auto"]
+        regret, best = compute_regret(line)
+        rows.append([
+            line["structure"], line["sliding"], line["spread"], line["seed"], line["m"], format_run(auto),
+            f"{auto['memory']:.0f}", auto["work"].get("factorisations", 0), best,
+            format_run(line["runs"].get(best)), f"{regret:.2f}",
+            *(format_run(line["runs"].get(name)) for name in extra),
+        ])  # fmt: skip
+    click.echo(markdown(
+        ["structure", "sliding [m/s]", "mass spread", "seed", "rows", "auto [s]", "memory [MiB]", "factorisations",
+         "best", "best [s]", "regret", *(f"{name} [s]" for name in extra)], rows))  # fmt: skip
+    for label, group in (("all", STRUCTURES), ("held out", HELD_OUT)):
+        regrets = [compute_regret(line)[0] for line in lines if line["structure"] in group]
+        solved = [regret for regret in regrets if regret == regret]
+        if solved:
+            click.echo(f"\nregret, {label}: median {np.median(solved):.2f}, worst {max(solved):.2f}; "
+                       f"{len(regrets) - len(solved)} of {len(regrets)} problems not solved by auto")  # fmt: skip
+    cells = []
+    for name, spread in product(STRUCTURES, sorted({line["spread"] for line in lines})):
+        chosen = [line for line in lines if line["structure"] == name and line["spread"] == spread
+                  and line["sliding"] == 0.0 and line["m"] >= MIN_GROWTH_ROWS]  # fmt: skip
+        points = [
+            (line["m"], line["runs"]["auto"]["time"]) for line in chosen if line["runs"]["auto"]["solved"]
+        ]
+        if points:
+            m, times = zip(*points, strict=True)
+            cells.append([name, f"{spread:g}", min(m), max(m), f"{fit_exponent(m, times):.2f}",
+                          len(chosen) - len(points)])  # fmt: skip
+    if cells:
+        head = [
+            "structure at rest",
+            "mass spread",
+            "rows from",
+            "to",
+            "growth exponent of auto",
+            "not solved",
+        ]
+        click.echo("\n" + markdown(head, cells))
+
+
+def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
+    """Draw the time of `auto` against the number of rows: one panel for bodies at rest, one for bodies that slide."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
+    for axis, title, moving in zip(axes, ("at rest", "sliding"), (False, True), strict=True):
+        for k, name in enumerate(STRUCTURES):
+            points = sorted((line["m"], line["runs"]["auto"]["time"]) for line in lines if line["structure"] == name
+                            and (line["sliding"] > 0.0) == moving and line["runs"]["auto"]["solved"])  # fmt: skip
+            if points:
+                axis.plot(
+                    *zip(*points, strict=True),
+                    "o-" if not moving else "o",
+                    color=f"C{k}",
+                    ms=4,
+                    lw=1,
+                    label=name,
+                )
+        axis.set(xscale="log", yscale="log", xlabel="rows", title=title)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("CPU time of auto to 1e-6 [s]")
+    axes[0].legend(fontsize=8)
+    figure.savefig(path, dpi=150)
+
+
+@click.command("scale")
+@click.option(
+    "--structures", default=",".join(STRUCTURES), show_default=True, help="Names, separated by commas."
+)
+@click.option(
+    "--rows", multiple=True, type=int, help="Approximate number of rows; several times. Default: all sizes."
+)
+@click.option(
+    "--sliding", multiple=True, type=float, default=(0.0, 0.1, 0.5), show_default=True, help="[m/s]"
+)
+@click.option(
+    "--spread", multiple=True, type=float, default=(0.0, 1.0), show_default=True, help="Spread of log mass."
+)
+@click.option("--seed", multiple=True, type=int, default=(7,), show_default=True)
+@click.option(
+    "--solvers", default=",".join(CONTESTANTS), help="Contestants, separated by commas; auto is always run."
+)
+@click.option("--limit", default=20.0, show_default=True, help="Time limit of a solve [s].")
+@click.option("--base", "bases", multiple=True, type=click.Path(path_type=Path, exists=True),
+              help="Built checkout with a .venv, whose auto solves the same problems; several times.")  # fmt: skip
+@click.option("--siconos", envvar="LAVENDER_SICONOS", default="", help="Interpreter that has Siconos.")
+@click.option("--from", "read", multiple=True, type=click.Path(path_type=Path, exists=True),
+              help="Print tables of --out files.")  # fmt: skip
+@click.option("--figure", type=click.Path(path_type=Path), help="Draw time against rows to this file.")
+@out_option("Write every measurement to this JSON file, after each problem.")
+def command(
+    structures: str, rows: tuple[int, ...], sliding: tuple[float, ...], spread: tuple[float, ...],
+    seed: tuple[int, ...], solvers: str, limit: float, bases: tuple[Path, ...], siconos: str, read: tuple[Path, ...],
+    figure: Path | None, out: Path | None,
+) -> None:  # fmt: skip
+    """Measure the cost of exact friction against the number of rows."""
+    names = ["auto", *(name for name in split_names(solvers, CONTESTANTS) if name != "auto")]
+    if siconos:
+        check_siconos(siconos)
+    lines: list[dict[str, Any]] = [line for path in read for line in json.loads(path.read_text())["lines"]]
+    plan = () if read else product(split_names(structures, STRUCTURES), rows or SIZES, sliding, spread, seed)
+    for name, size, speed, deviation, draw in plan:
+        problem = build(name, size, speed, deviation, draw)
+        runs = measure(problem, names, [base.resolve() for base in bases], limit)
+        if siconos and problem.m <= SICONOS_MAX_ROWS:
+            runs |= dict(run_siconos(problem, siconos, limit))
+        line = {"structure": name, "rows": size, "m": problem.m, "sliding": speed, "spread": deviation, "seed": draw,
+                "runs": runs}  # fmt: skip
+        lines.append(line)
+        click.echo(f"{problem.name} {problem.m} rows: " + ", ".join(
+            f"{key} {format_run(found)}" for key, found in runs.items()), err=True)  # fmt: skip
+        if out is not None:
+            write_json(out, lines)
+    print_tables(lines)
+    if figure is not None:
+        draw_figure(lines, figure)
+
+
+def split_names(text: str, known: dict[str, Any]) -> list[str]:
+    """Return the names of a list separated by commas (names with a comma are matched whole), in the order of `known`.
+
+    Raises
+    ------
+    click.BadParameter
+        A name is not known.
+    """
+    rest = text
+    chosen = []
+    for name in sorted(known, key=len, reverse=True):
+        if f",{name}," in f",{rest},":
+            chosen.append(name)
+            rest = f",{rest},".replace(f",{name},", ",,").strip(",")
+    if rest.strip(","):
+        raise click.BadParameter(f"{rest.strip(',')!r} is not known; the names are {'; '.join(known)}")
+    return [name for name in known if name in chosen]
