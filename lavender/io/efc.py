@@ -33,8 +33,10 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
+from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_block_kinds
+from lavender.problem.generalized import Compressed
 from lavender_ext.judge.measure import all_finite
 
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
@@ -52,7 +54,7 @@ CONTACT_FIELDS: dict[str, Any] = {
 CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at a time.
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
 # float32, in which the factors of M are rounded, too.
-MASS_TOLERANCES = {"float64": single.MASS_TOLERANCE, "float32": 2.0**-14}
+MASS_TOLERANCES = {"float64": MASS_TOLERANCE, "float32": 2.0**-14}
 
 
 class Imported(NamedTuple):
@@ -224,18 +226,12 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     InputError
         `model` is not an MjModel, states have the wrong size, a state is not finite, or MuJoCo raises an error.
     CapabilityError
-        The integrator's constraint problem uses a matrix other than M.
+        MuJoCo does not store the stiffness of a flex, which the integrator adds to M; see `from_mujoco`.
     """
     import mujoco as mj
 
     if not isinstance(model, mj.MjModel):
         raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
-    word = mj.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
-    if word not in map(str.lower, single.MASS_MATRIX_INTEGRATORS):
-        raise CapabilityError(
-            f"integrator={word!r} adds damping to M; "
-            f"{', '.join(map(repr, single.MASS_MATRIX_INTEGRATORS))} have M itself"
-        )
     check_choice("errors", errors, ERRORS)
     values = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = values.shape[1]
@@ -251,6 +247,10 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
+    triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+    matrices: dict[
+        int, Compressed
+    ] = {}  # Matrices of the integrator "discrete", which may have other patterns.
     pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
@@ -269,6 +269,13 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             except mj.FatalError as error:
                 raise InputError(f"state {i}: MuJoCo raised an error, {error}") from None
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
+            if is_active(data):
+                try:
+                    matrix = compute_discrete_matrix(mj, model, data, single.CHANGED_ADVICE)
+                except CapabilityError as error:
+                    raise CapabilityError(f"state {i}: {error}") from None
+                matrices[i] = matrix.lower
+                smooth[i] += 0.0 if matrix.change is None else matrix.change
             # MuJoCo's own efc_vel also contains the velocities of moving surfaces.
             mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
             rows.append(i, data, data.nefc, efc_J=jacobian(data))
@@ -288,7 +295,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     parts = run_on_threads(work, threads)
     rows, ptr = _merge_buffers([row_buffer for row_buffer, _ in parts], n)
     contacts, contact_ptr = _merge_buffers([contact_buffer for _, contact_buffer in parts], n)
-    imported = _import_states(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)
+    triangles = (mass, *triangle) if not matrices else _merge_lower_triangles(matrices, mass, triangle)
+    imported = _import_states(model, rows, ptr, contacts, contact_ptr, triangles, free, smooth)
     row_arrays = rows["efc_type"], rows["efc_id"]
     contact_arrays = contacts["dim"], contacts["geom"]
 
@@ -351,6 +359,29 @@ def _merge_buffers(parts: list[_RowBuffer], n: int) -> tuple[dict[str, Any], Any
     return out, ptr
 
 
+def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:
+    """Return (values (n, entries), indices, indptr) of lower triangles, with the union of their patterns.
+
+    Worlds without a matrix in `matrices` keep their row of `mass`, with the pattern `triangle` (indices, indptr).
+    """
+    indices, indptr = triangle
+    nv = len(indptr) - 1
+
+    def positions(columns: Any, first: Any) -> Any:
+        return np.repeat(np.arange(nv), np.diff(first)) * np.int64(nv) + columns
+
+    own = positions(indices, indptr)
+    places = {i: positions(columns, first) for i, (first, columns, _) in matrices.items()}
+    union = np.unique(np.concatenate([own, *places.values()]))
+    values = np.zeros((len(mass), len(union)))
+    values[:, np.searchsorted(union, own)] = mass
+    for i, place in places.items():
+        values[i] = 0.0
+        values[i, np.searchsorted(union, place)] = matrices[i][2]
+    rows, columns = np.divmod(union, nv)
+    return values, columns, np.searchsorted(rows, np.arange(nv + 1))
+
+
 def _import_states(
     model: Any, rows: Any, ptr: Any, contact: Any, contact_ptr: Any, mass: Any, before: Any, smooth: Any
 ) -> Imported:
@@ -371,7 +402,7 @@ def _import_states(
         target, compliance, lam = target * s, compliance * s * s, lam / s
     batch = Batch(
         jac,
-        (mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))),
+        mass,
         before + dt * smooth,
         target=target,
         cones=cones,

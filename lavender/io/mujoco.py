@@ -13,8 +13,9 @@ Multiplication by the time step dt gives the same problem in impulses and veloci
 
     lambda = dt f      A = J M^-1 J^T + diag(R)      b = dt (aref - J a0)      w = A lambda - b = dt (J a + R f - aref)
 
-The problem holds J and M unchanged (`Problem.generalized`), and R as its compliance. Rows keep MuJoCo's order. The
-constraints become these blocks:
+The problem holds J and M unchanged (`Problem.generalized`), and R as its compliance. With `integrator="discrete"`, M
+is MuJoCo's matrix M + h D + h^2 K of dampings D and stiffnesses K (`lavender.io.mujoco_discrete`). Rows keep MuJoCo's
+order. The constraints become these blocks:
 
 | MuJoCo | block |
 |---|---|
@@ -35,14 +36,14 @@ Differences from rigid contact with Coulomb friction:
   aref.
 - MuJoCo's friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` returns the problem
   with Coulomb's law if no contact has more than two tangents.
-- MuJoCo evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
-  integrator without implicit damping. The pass of `noslip_iterations` follows the solve and is not part of the
-  problem.
+- MuJoCo evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the
+  integrators "discrete" and, without implicit damping, "Euler". The pass of `noslip_iterations` follows the solve and
+  is not part of the problem.
 
 The data are checked for consistency: every index before it is used; M a0 must equal the smooth force and 1 / R must
-equal efc_D; J must reproduce efc_vel, efc_b and qfrc_constraint. Data of a problem with a matrix other than M are
-rejected; the error names the option that causes it. The checks do not depend on the answer of MuJoCo's solver: if the
-solver stopped before convergence, the judge reports the error of `impulse`.
+equal efc_D; J must reproduce efc_vel, efc_b and qfrc_constraint. Data of a problem with another matrix are rejected.
+The checks do not depend on the answer of MuJoCo's solver: if the solver stopped before convergence, the judge reports
+the error of `impulse`.
 """
 
 from __future__ import annotations
@@ -57,15 +58,13 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray, as_array, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
+from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
 from lavender_ext.io import mujoco_rows
 
-# Largest accepted difference of M a0 and the smooth force (the force without constraints), relative to their size: 64
-# roundings. A larger difference means that MuJoCo computed a0 with a matrix other than M.
-MASS_TOLERANCE = 2.0**-46
 COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
 # Largest accepted difference of a product with J from MuJoCo's stored result, relative to the size of its terms.
 # Adding 1,000 terms in another order stays below it; data that were changed exceed it by far.
@@ -76,8 +75,6 @@ MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
 # [bytes] Lower bounds of the memory that MuJoCo allocates for a row, a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
-# Integrators with a constraint problem that uses M and not, for example, M + dt D with joint damping D.
-MASS_MATRIX_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = (
     "The model was changed, or MjData belongs to another model: give a model and data made from it"
@@ -138,15 +135,15 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         The arguments are not a model and its data; `mj_forward` was not called; the time step is not above 0; numbers
         are not finite; indices (`efc_id`, `contact.dim`, `efc_J_colind`, ...) are out of range.
     CapabilityError
-        The data do not belong to the problem of J, M and R: the integrator adds damping to M
-        (`integrator="discrete"`), `opt.jacobian` changed since the forward pass, a copy lacks needed arrays, or, after
-        `mj_step`, joints of one body have dependent axes. It is not raised if MuJoCo's solver stopped before
+        The data do not belong to the problem of J, M and R: `opt.jacobian` changed since the forward pass, a copy lacks
+        needed arrays, MuJoCo does not store the stiffness of a flex (`integrator="discrete"` without Newton's method),
+        or, after `mj_step`, joints of one body have dependent axes. It is not raised if MuJoCo's solver stopped before
         convergence: the problem does not depend on the answer.
     """
     seen, m, contacts, smooth = _check_model(model, data)
     opt, like = model.opt, seen.first_operator
     dt = _get_timestep(opt)
-    mass = _read_mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
+    mass, change = _read_mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
     cones, scale, key = _make_blocks(seen, data, contacts, dt)
     jac = _read_jacobian(seen, model, data, m, scale)
     rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.compute_problem_numbers(
@@ -163,6 +160,9 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
     if like is None:
         seen.first_operator = general.operator
+    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
+        rhs = mark_read_only(rhs - dt * general.velocity_of(change))
+        general = general.with_jacobian(v_free=v_free + dt * change)
     build = (
         Problem._from_engine_arrays
         if is_finite and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
@@ -207,9 +207,12 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """Return MuJoCo's `qacc` (nv,) for impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
     seen, m, _, smooth = _check_model(model, data)
     lam = as_array("impulse", impulse, (m,), unit="N s")
-    force = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _get_timestep(model.opt)
-    change = np.zeros_like(force)
-    seen.mj.mj_solveM(model, data, change, np.ascontiguousarray(force))
+    force = jacobian(model, data).T @ (scaling(model, data) * lam) / _get_timestep(model.opt)
+    if is_active(data):
+        matrix = compute_discrete_matrix(seen.mj, model, data, CHANGED_ADVICE)
+        return smooth + matrix.solve(force) + (0.0 if matrix.change is None else matrix.change)
+    change = np.zeros((1, seen.n))
+    seen.mj.mj_solveM(model, data, change, force[None, :])
     return np.array(smooth, float) + change[0]
 
 
@@ -281,8 +284,10 @@ def _get_timestep(opt: Any) -> float:
     return dt
 
 
-def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> Any:
-    """Return (indptr, indices, data) of M's lower triangle; equal index arrays of the operator `like` are reused.
+def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> tuple[Any, Any]:
+    """Return the lower triangle of the step's matrix and the correction of a0 (nv,) or None; see `DiscreteMatrix`.
+
+    The index arrays of the operator `like` are reused if they are equal.
 
     Raises
     ------
@@ -301,18 +306,16 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
         raise InputError(
             f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
         )
+    if is_active(data):
+        matrix = compute_discrete_matrix(seen.mj, model, data, CHANGED_ADVICE)
+        return matrix.lower, matrix.change
     mass, gap = result
     if not gap <= MASS_TOLERANCE:
-        number = int(model.opt.integrator)
-        names = [name for name, value in seen.mj.mjtIntegrator.__members__.items() if int(value) == number]
-        word = names[0].removeprefix("mjINT_").lower() if names else str(number)
-        why = f"integrator={word!r} adds damping to it; {', '.join(map(repr, MASS_MATRIX_INTEGRATORS))} have M itself"
         raise CapabilityError(
             f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: the problem was built with "
-            "another matrix than M. "
-            f"{CHANGED_ADVICE if word in map(str.lower, MASS_MATRIX_INTEGRATORS) else why}"
+            f"another matrix than M. {CHANGED_ADVICE}"
         )
-    return mass
+    return mass, None
 
 
 def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -> Any:

@@ -156,25 +156,6 @@ def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
     assert list(problem.names) == names
 
 
-def test_an_integrator_that_puts_damping_into_m_is_refused():
-    if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
-        pytest.skip("this MuJoCo has no such integrator")
-    text = scene()
-    model = mj.MjModel.from_xml_string(text.replace('name="door"', 'name="door" damping="2"'))
-    for integrator, refused in (("DISCRETE", True), ("IMPLICITFAST", False), ("EULER", False)):
-        data = mj.MjData(model)
-        model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
-        data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
-        mj.mj_forward(model, data)
-        if refused:
-            with pytest.raises(
-                lv.CapabilityError, match=r"integrator='discrete'.*'Euler', 'RK4', .* have M itself"
-            ):
-                lv.io.from_mujoco(model, data)
-        else:
-            assert lv.io.from_mujoco(model, data).m > 0
-
-
 @pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
 @pytest.mark.parametrize("solver", ["NEWTON", "CG", "PGS"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
@@ -199,14 +180,6 @@ def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_ju
     mj.mj_step(model, data)
     if integrator != "RK4":  # whose last forward pass is that of another moment
         assert np.array_equal(lv.io.from_mujoco(model, data).b, problem.b)
-
-
-def test_an_integrator_that_is_none_is_told_by_its_number():
-    model, data = state()
-    model.opt.integrator = 7
-    data.qacc_smooth[:] = 2.0 * data.qacc_smooth
-    with pytest.raises(lv.CapabilityError, match="integrator='7'"):
-        lv.io.from_mujoco(model, data)
 
 
 def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
