@@ -88,10 +88,11 @@ def record(
     """Step a MuJoCo simulation and write the problem of every `every`-th step to a file.
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each
-    file: file, step, rows, the engine's iterations, the time of its constraint solver [s], and the judge's result:
-    residual, velocity error [m/s], worst row, round-off floor of the precision, and verdict. A step in which MuJoCo's
-    solver stopped before convergence is written with that verdict. A step that cannot be exported has no file; its
-    line holds the reason as `left_out`, which is reported with every measurement of the other steps.
+    file: file, step, rows, the iterations of the engine's solver and of noslip (in all islands; null if MuJoCo has more
+    islands than it counts, 20), the time of both [s], and the judge's result: residual, velocity error [m/s], worst
+    row, round-off floor of the precision, and verdict. A step in which MuJoCo's solver stopped before convergence is
+    written with that verdict. A step that cannot be exported has no file; its line holds the reason as `left_out`,
+    which is reported with every measurement of the other steps.
 
     Parameters
     ----------
@@ -196,9 +197,20 @@ def _solve_step(
     (Problem, (m,) N s, dict) or None
         The problem, MuJoCo's impulse, and the record of both.
     """
+    # The same solve from the same warm start, without noslip, has the iterations of the solver alone.
+    noslip, iterations = int(model.opt.noslip_iterations), None
+    if noslip > 0:
+        model.opt.noslip_iterations = 0
+        try:
+            mj.mj_fwdConstraint(model, data)
+        finally:
+            model.opt.noslip_iterations = noslip
+        iterations = count_iterations(data)
     start = perf_counter()
     mj.mj_fwdConstraint(model, data)
     seconds = perf_counter() - start
+    total = count_iterations(data)
+    iterations = iterations if noslip > 0 else total
     if int(data.nefc) == 0:
         return None
     problem = adapter.from_mujoco(model, data, name=name)
@@ -206,12 +218,18 @@ def _solve_step(
     impulse = adapter.impulse(model, data)
     judged = residual(problem, impulse, threshold=threshold)
     facts = {
-        "rows": problem.m, "iterations": int(np.sum(data.solver_niter)), "seconds": seconds,
+        "rows": problem.m, "iterations": iterations, "seconds": seconds,
+        "noslip_iterations": None if iterations is None or total is None else total - iterations,
         "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": precision, "threshold": threshold,
         "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
     }  # fmt: skip
     return problem, impulse, facts
+
+
+def count_iterations(data: Any) -> int | None:
+    """Return MuJoCo's iterations in all islands, with those of noslip; None if it has not counted all islands."""
+    return int(np.sum(data.solver_niter)) if data.nisland <= len(data.solver_niter) else None
 
 
 def record_file(

@@ -43,15 +43,51 @@ def test_a_step_on_which_mujoco_stopped_before_convergence_is_kept_and_told_in_m
     assert str(found).endswith(f"the worst {said}, {where}")
 
 
-def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
-    if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
-        pytest.skip("this MuJoCo has no such integrator")
-    text = scene()
-    model = mj.MjModel.from_xml_string(text.replace('name="door"', 'name="door" damping="2"'))
-    model.opt.integrator = mj.mjtIntegrator.mjINT_DISCRETE
-    found = lv.io.record(model, mj.MjData(model), tmp_path, 20, every=10)
+def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypatch):
+    def refuse(model, data, name):
+        raise lv.CapabilityError(f"{name} has a constraint of an unknown type")
+
+    monkeypatch.setattr(recording.adapter, "from_mujoco", refuse)
+    found = lv.io.record(*state(steps=1), tmp_path, 20, every=10)
     assert (len(found.files), len(found.left_out)) == (0, 2)
-    assert "discrete" in str(found)
+    assert "unknown type" in str(found)
+
+
+def make_row_of_boxes(n, options=""):
+    """Return a model of n sliding boxes that do not touch each other, and its data after some steps."""
+    boxes = "".join(
+        f'<body pos="{0.5 * i} 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(n)
+    )
+    model = mj.MjModel.from_xml_string(
+        f'<mujoco><option cone="elliptic" {options}/><worldbody><geom type="plane" size="99 9 .1"/>{boxes}'
+        "</worldbody></mujoco>"
+    )
+    data = mj.MjData(model)
+    data.qvel[::6] = 0.3
+    return model, data
+
+
+@pytest.mark.parametrize(("n", "is_known"), [(19, True), (25, False)])
+def test_record_of_more_islands_than_mujoco_counts_has_no_iterations(tmp_path, n, is_known):
+    model, data = make_row_of_boxes(n)
+    lv.io.record(model, data, tmp_path, 10, every=10)
+    (line,) = map(json.loads, (tmp_path / "engine.jsonl").read_text().splitlines())
+    assert data.nisland == n
+    assert line["iterations"] == (np.sum(data.solver_niter) if is_known else None)
+    assert line["noslip_iterations"] == (0 if is_known else None)
+
+
+def test_record_with_noslip_separates_its_iterations(tmp_path):
+    lines = []
+    for options in ("", 'noslip_iterations="5" noslip_tolerance="0"'):
+        model, data = make_row_of_boxes(2, options)
+        mj.mj_resetData(model, data)  # At rest, noslip changes no velocity and so no later step.
+        lv.io.record(model, data, tmp_path / f"n{len(lines)}", 1)
+        (line,) = map(json.loads, (tmp_path / f"n{len(lines)}" / "engine.jsonl").read_text().splitlines())
+        lines.append(line)
+    assert np.sum(data.solver_niter) == lines[1]["iterations"] + lines[1]["noslip_iterations"]
+    assert lines[0]["iterations"] == lines[1]["iterations"] > 0
+    assert (lines[0]["noslip_iterations"], lines[1]["noslip_iterations"]) == (0, 10)
 
 
 @pytest.mark.parametrize("name", ["mj_step", "mj_forward"])
