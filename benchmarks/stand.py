@@ -148,8 +148,6 @@ _ELLIPTIC = {"cone": "elliptic"}
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant("lavender", substeps=True),
     "newton": Contestant("lavender newton", sweeps="", options={"solver": "newton"}),
-    "soft_step": Contestant("lavender soft_step", substeps=True, options={"stepper": "soft_step"}),
-    "avbd": Contestant("lavender avbd", substeps=True, options={"stepper": "avbd"}),
     "lavendersim": Contestant("lavendersim", "lavender_sim", "lavendersim", 22),
     "mujoco_newton": Contestant("mujoco Newton", "mujoco", "mujoco", sweeps="", options=_ELLIPTIC),
     "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options=_ELLIPTIC),

@@ -25,9 +25,7 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
 @click.command()
 @click.argument("scene")
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
-@click.option(
-    "--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64 (other steppers: 1 to 64)."
-)
+@click.option("--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64.")
 @click.option(
     "--warm-start/--no-warm-start",
     default=None,
@@ -36,7 +34,7 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
 @click.option(
     "--order",
     help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
-    "Default: the stepper's.",
+    "Default: alternating.",
 )
 @click.option("--solver", help="Solver of each step, by name. Default: sequential_impulses.")
 @click.option(
@@ -45,7 +43,6 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
     metavar="M/S",
     help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
 )
-@click.option("--stepper", help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
     "parameters",

@@ -152,7 +152,7 @@ def engine_image(simulation: Simulation) -> bytes:
     Parameters
     ----------
     simulation : Simulation
-        A simulation of any scene; the image includes its stepper, sweeps and order.
+        A simulation of any scene; the image includes its sweeps and order.
 
     Returns
     -------

@@ -45,9 +45,7 @@ cpdef enum:
     H_PROJECTED = 15        # position sweeps done in the last substep
     H_LOST = 16             # first body with a state that is not finite, or -1
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
-    H_STEPPER = 18          # method between collision detection and integration, see below
-    H_RELAXING = 19         # number of relaxing sweeps of SOFT_STEP, which follow the sweeps with bias and have none
-    H_FRICTION_SHAPE = 20   # 1: each tangent is bounded separately (box friction)
+    H_FRICTION_SHAPE = 18   # 1: each tangent is bounded separately (box friction)
     N_HEAD = 24
 
 # H_ORDER: sweep order of the blocks; joints and contacts are ordered separately
@@ -61,13 +59,6 @@ cpdef enum:
     COLORED = 6
     ALTERNATING = 7         # as given; in odd substeps contacts are built from the last pair to the first
 
-# H_STEPPER
-cpdef enum:
-    IMPULSES = 0            # speculative contacts, sweeps over velocities, position projection
-    SOFT_STEP = 1           # soft contacts and joints, then relaxing sweeps: engine/soft_step.pxd
-    XPBD = 2                # position corrections, velocities from positions: engine/xpbd.pxd
-    AVBD = 3                # block descent over bodies, augmented Lagrangian: engine/avbd.pxd
-
 # setting[]: real settings; the engine writes the entries from S_OUT to S_JOINT_ERROR
 cpdef enum:
     S_H = 0                 # s, substep
@@ -79,14 +70,11 @@ cpdef enum:
     S_MAX_PUSH = 8          # m, largest position error corrected per substep
     S_BOUNCE = 9            # m/s, restitution is 0 at closing speeds below this
     S_MATCH = 10            # m, a cached contact farther away than this is not reused
-    S_PUSH = 11             # m/s, maximum separation speed of penetrating bodies under SOFT_STEP
-    S_OUT = 12              # eight solver statistics, see engine/substep.pyx
-    S_DEPTH = 20            # m, deepest penetration
-    S_JOINT_ERROR = 21      # m or rad, largest joint error
-    S_HERTZ = 22            # 1/s, contact frequency of SOFT_STEP; stabilisation alpha [-] of AVBD
-    S_RATIO = 23            # -, damping ratio of SOFT_STEP; stiffness growth beta of AVBD
-    S_ROLLING = 24          # m, mu_r of every contact with friction
-    N_SETTINGS = 25
+    S_OUT = 11              # eight solver statistics, see engine/substep.pyx
+    S_DEPTH = 19            # m, deepest penetration
+    S_JOINT_ERROR = 20      # m or rad, largest joint error
+    S_ROLLING = 21          # m, mu_r of every contact with friction
+    N_SETTINGS = 22
 
 # The broad phase stops if more than MAX_PAIRS boxes overlap; it then reports PAIR_COUNT_OVERFLOW as the needed capacity.
 cpdef enum:

@@ -126,20 +126,13 @@ cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
         copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)
 
 
-cdef inline int32_t advance_bodies(engine_t* e, const double* by, int32_t shifted) noexcept nogil:
-    """Set v = v* + dv, advance the poses over h by v* + `by`, and add the shift of the position projection.
-
-    by : (nd, 6) or NULL
-        Velocity change that moves the poses. If it is not dv, a rotating body keeps the angular momentum of v. NULL: the
-        poses are already up to date.
+cdef inline int32_t advance_bodies(engine_t* e, int32_t shifted) noexcept nogil:
+    """Set v = v* + dv, advance the poses over h by v, and add the shift of the position projection.
 
     Returns the first body with a state out of range or not finite, or -1.
     """
     cdef int32_t i, k, b, lost = -1
     cdef double h = e.setting[S_H]
-    cdef double moving[6]
-    cdef double r[9]
-    cdef double momentum[3]
     cdef double* v
     cdef double* x
     cdef double* q
@@ -150,20 +143,11 @@ cdef inline int32_t advance_bodies(engine_t* e, const double* by, int32_t shifte
         q = e.q + 4 * b
         for k in range(6):
             v[k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
-        if by != NULL:
-            for k in range(6):
-                moving[k] = e.v_free[6 * i + k] + by[6 * i + k]
-            add_scaled3(x, h, moving, x)
-            if e.uneven[b] and by == e.dv:
-                advance_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-            elif e.uneven[b]:
-                compute_rotation_matrix(q, r)
-                multiply_by_world_tensor(r, e.inertia + 9 * b, v + 3, momentum)
-                advance_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-                compute_rotation_matrix(q, r)
-                multiply_by_world_tensor(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
-            elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
-                rotate_quaternion(q, moving + 3, h)
+        add_scaled3(x, h, v, x)
+        if e.uneven[b]:
+            advance_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+        elif v[3] != 0.0 or v[4] != 0.0 or v[5] != 0.0:
+            rotate_quaternion(q, v + 3, h)
         if shifted:
             add_scaled3(x, 1.0, e.shift + 6 * i, x)
             rotate_quaternion(q, e.shift + 6 * i + 3, 1.0)

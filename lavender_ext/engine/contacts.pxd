@@ -33,8 +33,8 @@ from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_con
                                      reciprocal_or_zero,
                                      compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
+from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
+                                         H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_WARM_START,
                                          N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_body
@@ -134,8 +134,6 @@ cdef inline void warm_start_contact(engine_t* e, int32_t c, int32_t entry, int32
     if n_angular & 2:
         lam[nt + n_angular - 1] = dot3(e.cache_roll + 3 * entry, e.tangent + 3 * c)
         lam[nt + n_angular] = dot3(e.cache_roll + 3 * entry, t2)
-    if e.head[H_STEPPER] == AVBD:
-        e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
 
 cdef inline double get_pair_restitution(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
@@ -285,7 +283,6 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
                 e.rolling[block] = e.setting[S_ROLLING] if n_angular & 2 else 0.0
             for k in range(1 + nt + n_angular):
                 e.impulse[row + k] = 0.0
-            e.push[e.size[N_JOINT_ROW] + c] = 0.0
             row += 1 + nt + n_angular
             c += 1
             e.ptr[block + 1] = row
@@ -329,8 +326,6 @@ cdef inline void store_contact_cache(engine_t* e) noexcept nogil:
         elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
                 e.cache_roll[3 * at + k] = 0.0
-        if e.head[H_STEPPER] == AVBD:                   # AVBD has no spin rows; this entry then holds the contact's stiffness.
-            p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):
             e.cache_local[6 * at + k] = e.local[6 * c + k]
     e.head[H_CACHED] = n

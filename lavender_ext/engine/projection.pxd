@@ -36,34 +36,10 @@ cdef inline double contact_normal_velocity(const engine_t* e, const double* v, i
     return dot3(e.normal + 3 * c, u)
 
 
-cdef inline double contact_displacement_along(const engine_t* e, int32_t c, const double* z, const double* axis,
-                                              double* turn) noexcept nogil:
-    """Return J z of a contact along an axis, a velocity if z (nd, 6) holds velocities; turn (2, 3): arm x axis of a and b."""
-    cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
-    cdef double s = 0.0
-    cross(e.arm_a + 3 * c, axis, turn)
-    cross(e.arm_b + 3 * c, axis, turn + 3)
-    if b >= 0:
-        s = dot3(z + 6 * b, axis) + dot3(z + 6 * b + 3, turn + 3)
-    if a >= 0:
-        s -= dot3(z + 6 * a, axis) + dot3(z + 6 * a + 3, turn)
-    return s
-
-
 cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
     """Apply an impulse (3) [N s] at a contact to the velocities v (nd, 6)."""
     apply_impulse_to_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
                 e.arm_b + 3 * c, impulse, NULL)
-
-
-cdef inline void set_normal_impulse(engine_t* e, int32_t c, double impulse) noexcept nogil:
-    """Set a contact's normal impulse [N s], clamped at 0, and update dv."""
-    cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
-    cdef double p[3]
-    impulse = impulse if impulse > 0.0 else 0.0
-    scale3(impulse - e.impulse[row], e.normal + 3 * c, p)
-    e.impulse[row] = impulse
-    apply_contact_impulse(e, e.dv, c, p)
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:

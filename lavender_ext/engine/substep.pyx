@@ -7,11 +7,10 @@
     finish      shift of the position projection, v = v* + dv, poses, cache
 
 `prepare_substep` performs the first three stages and does not change the state; if a capacity is too small, it reports the
-needed capacity. Between `prepare_substep` and `finish_substep` any solver may replace `run_stepper`: it reads the velocity
+needed capacity. Between `prepare_substep` and `finish_substep` any solver may replace `solve_substep`: it reads the velocity
 problem from the arrays and writes the impulses back.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
-from libc.string cimport memcpy
 
 import numpy as np
 
@@ -24,21 +23,18 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, fin
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
-                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
+from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
+                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
                                          H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
-                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SOFT_STEP, SYMMETRICALLY, S_OUT,
-                                         TOP_DOWN, XPBD, bind_engine_arrays, engine_t)
-from lavender_ext.engine.avbd cimport run_avbd_substep
+                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT,
+                                         TOP_DOWN, bind_engine_arrays, engine_t)
 from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport build_contacts, store_contact_cache
 from lavender_ext.engine.joints cimport build_joint_rows
 from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
-from lavender_ext.engine.soft_step cimport set_rows_without_bias, apply_restitution, set_soft_constraint_rows
 from lavender_ext.engine.view cimport bind_substep_problem
-from lavender_ext.engine.xpbd cimport run_xpbd_substep
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
@@ -54,7 +50,7 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
     cdef blocks_t p
     cdef rows_t r
-    cdef int32_t pairs, contacts, i
+    cdef int32_t pairs, contacts
     e.head[H_SOLVED] = 0
     # bodies and pairs
     begin_body_substep(e)
@@ -66,15 +62,10 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     bind_substep_problem(e, &p, &r)
     if e.size[N_JOINT] > 0:
         build_joint_rows(e)
-    if e.head[H_STEPPER] == SOFT_STEP:
-        for i in range(e.size[CAP_CONTACT] * e.size[ROWS_PER_CONTACT]):
-            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # Not 0 if the last substep stopped between prepare and solve.
     contacts = build_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
         return NEED_CAPACITY
-    if e.head[H_STEPPER] == SOFT_STEP:
-        set_soft_constraint_rows(e)
     return OK
 
 
@@ -178,28 +169,12 @@ cdef inline void run_velocity_sweeps(engine_t* e, const blocks_t* p, const rows_
         sweep_joints_then_contacts(e, p, r, sweeps, curve, scratch)
 
 
-cdef inline void run_position_stepper(engine_t* e) noexcept nogil:
-    """Run a stepper over positions (XPBD, AVBD); its velocity residuals are undefined and set to NaN."""
-    cdef int32_t k
-    cdef uint64_t nan = 0x7FF8000000000000              # NaN as bits, since the sign of 0/0 depends on the processor.
-    if e.head[H_STEPPER] == XPBD:
-        set_sweep_order_of_blocks(e)
-        run_xpbd_substep(e)
-    else:
-        run_avbd_substep(e)
-    for k in range(4, 8):
-        memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
-
-
-cdef inline void run_stepper(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
-    """Run the stepper's solve, before the poses are updated; sweeps = 0: warm start and its error only."""
+cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
+    """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only."""
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     bind_substep_problem(e, &p, &r)
-    if sweeps and (e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD):
-        run_position_stepper(e)
-        return
     # warm start and error before the first sweep
     apply_warm_start(e, &p, &r)
     measure_contact_errors(e, out + 4, out + 6)
@@ -207,12 +182,7 @@ cdef inline void run_stepper(engine_t* e, int32_t sweeps, double* workspace, dou
         record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
         return
-    # sweeps, and for SOFT_STEP the relaxing sweeps and restitution
     run_velocity_sweeps(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
-    if e.head[H_STEPPER] == SOFT_STEP:
-        set_rows_without_bias(e)
-        run_velocity_sweeps(e, &p, &r, e.head[H_RELAXING], workspace, NULL, NULL)
-        apply_restitution(e)
     measure_contact_errors(e, out + 5, out + 7)
 
 
@@ -224,9 +194,8 @@ cdef inline int32_t first_dynamic_body_of_pair(const engine_t* e, const int32_t*
 cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
     """Return a dynamic body of the first block with an impulse or error that is not finite, or -1 if all are finite."""
     cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
-    cdef int32_t n_statistics = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
     if (all_finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and all_finite(e.gap, c)
-            and all_finite(e.setting + S_OUT, n_statistics)):
+            and all_finite(e.setting + S_OUT, 8)):
         return -1
     for i in range(kj):
         if not all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
@@ -241,7 +210,6 @@ cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
 cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     """Write the statistics, store the contact cache, project and advance the bodies; return OK or NOT_FINITE."""
     cdef int32_t i, shifted, nonfinite_body
-    cdef const double* by = e.dv
     cdef double* out = e.setting + S_OUT
     # statistics
     out[0] = e.head[H_ITERATIONS]
@@ -250,15 +218,11 @@ cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     out[3] = e.head[H_MATCHES]
     for i in range(e.size[N_JOINT_ROW]):
         e.joint_impulse[i] = e.impulse[i]
-    if e.head[H_STEPPER] == SOFT_STEP:
-        by = e.shift
-    elif e.head[H_STEPPER] == XPBD:
-        by = NULL
     # cache, projection, integration
     nonfinite_body = find_nonfinite_body(e)
     store_contact_cache(e)
     shifted = project_positions(e)
-    e.head[H_LOST] = advance_bodies(e, by, shifted)
+    e.head[H_LOST] = advance_bodies(e, shifted)
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
     e.head[H_SOLVED] = 1
@@ -277,11 +241,11 @@ cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_
 
 cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                   int32_t sweeps) noexcept nogil:
-    """Run the stepper on the prepared problem; sweeps = 0 only applies and measures the warm start."""
+    """Solve the prepared problem; sweeps = 0 only applies and measures the warm start."""
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    run_stepper(&e, sweeps, NULL, NULL, NULL)
+    solve_substep(&e, sweeps, NULL, NULL, NULL)
 
 
 cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -293,7 +257,7 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    run_stepper(&e, 1, NULL, curve, scratch)
+    solve_substep(&e, 1, NULL, curve, scratch)
 
 
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
@@ -316,7 +280,7 @@ cdef inline int32_t run_substeps(engine_t* e, int32_t n, double* workspace, int3
         status = prepare_substep(e)
         if status != OK:
             return status
-        run_stepper(e, 1, workspace, NULL, NULL)
+        solve_substep(e, 1, workspace, NULL, NULL)
         status = finish_substep(e)
         done[0] += 1
         if status != OK:
@@ -372,16 +336,16 @@ cdef class Buffers:
         return status
 
     def solve(self, bint sweeps=True):
-        """Run the stepper on the prepared problem; without `sweeps` only apply and measure the warm start."""
+        """Solve the prepared problem; without `sweeps` only apply and measure the warm start."""
         with nogil:
-            run_stepper(&self.e, sweeps, NULL, NULL, NULL)
+            solve_substep(&self.e, sweeps, NULL, NULL, NULL)
 
     def sweep_and_record_errors(self, double[:, ::1] curve):
         """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            run_stepper(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
+            solve_substep(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
 
     def apply_impulses(self):
         """Compute dv and the final error of impulses that another solver has written."""

@@ -92,7 +92,7 @@ CALLS = {
     "Scene.with_parameters": Call(lv.Scene("stack").with_parameters, {"dt": 0.01, "solver_iterations": 8}),
     "Simulation": Call(
         lv.Simulation,
-        {"scene": "stack", "stepper": "impulses", "report_residual": True, "report_motion": True},
+        {"scene": "stack", "report_residual": True, "report_motion": True},
     ),
     "Simulation.film": Call(on_simulation("film"), {"steps": 1}),
     "Simulation.reset": Call(on_simulation("reset"), {"seed": 1}),

@@ -26,7 +26,7 @@ CARRIED = (
     "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
 )  # fmt: skip
 GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
-FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing", "friction_shape")
+FIXED_HEAD = ("position_iterations", "order", "seed", "friction_shape")
 WRITTEN_SETTINGS = {"out": 8, "depth": 1, "joint_error": 1}  # Entries of `setting` that the engine writes.
 # Largest accepted deviation of a squared quaternion norm from 1 [-]; quaternions are normalised in every substep.
 QUATERNION_TOLERANCE = 1e-9

@@ -42,8 +42,6 @@ class Simulation(Stepping):
     ----------
     scene : Scene or str
         A scene, or the name of one of the gallery.
-    stepper : str, optional
-        A name of `lavender.sim.scene.steppers`, used with its default options instead of the scene's stepper.
     report_residual : bool, default False
         Compute the judge's residual of all rows of the last substep as `info["residual"]`. It costs about as much as a
         step.
@@ -72,11 +70,10 @@ class Simulation(Stepping):
     def constraint_problem(self) -> Problem:
         """Return the velocity problem of the next substep, with its warm start as `guess`; the state is unchanged.
 
-        With the stepper `impulses`, `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n =
-        `solver_iterations` returns the impulses of that substep bit for bit. Pass the scene's `order` to it, unless
-        the order is `alternating`: the contacts of the problem are then already in the order of the sweep. The
-        observation of a step contains the impulses of its last substep. Other steppers do not solve this velocity
-        problem, so no solver returns their impulses.
+        `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n = `solver_iterations` returns the
+        impulses of that substep bit for bit. Pass the scene's `order` to it, unless the order is `alternating`: the
+        contacts of the problem are then already in the order of the sweep. The observation of a step contains the
+        impulses of its last substep.
         """
         state = self.state.copy()
         if self._restored:

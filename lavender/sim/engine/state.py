@@ -14,7 +14,6 @@ from lavender.sim.engine.values import SolverValues
 from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.sim.scene.parts import Body, Joint
 from lavender.sim.scene.scene import SCENE_ORDERS, Parameters
-from lavender.sim.scene.steppers import get_stepper
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import (
     BOX,
@@ -167,7 +166,7 @@ class State:
         Raises
         ------
         InputError
-            The stepper does not support the scene, or the buffers would exceed `MAX_BUFFER_BYTES`.
+            A scene of box friction has spin or rolling friction, or the buffers would exceed `MAX_BUFFER_BYTES`.
         """
         p, bodies, joints = scene.parameters, scene.bodies, scene.joints
         n = len(bodies)
@@ -203,7 +202,6 @@ class State:
         size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
         size[CAP_CONTACT] = 4 * n_shapes if n_shapes > 1 else 0
         state = cls(size)
-        get_stepper(p.stepper).check_scene_properties(spin, bool((restitution > 0.0).any()), rolling)
         _put_parameters(state, p)
         a: dict[str, Any] = state.a
         _put_bodies(a, bodies, uneven)
@@ -234,14 +232,6 @@ def _put_parameters(state: State, p: Parameters) -> None:
     head[HEAD["seed"]] = p.seed
     head[HEAD["friction_shape"]] = p.friction_shape == "box"
     head[HEAD["lost"]] = -1
-    stepper = get_stepper(p.stepper)
-    head[HEAD["stepper"]] = stepper.number
-    for name, value in p.stepper_options.items():
-        option = stepper.options[name]
-        if option.is_integer:
-            head[HEAD[option.slot]] = value
-        else:
-            setting[SETTING[option.slot]] = value
     setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
 
 

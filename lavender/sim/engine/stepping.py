@@ -23,8 +23,7 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.problem import build_problem, summarise_motion, summarise_residual
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
-from lavender.sim.scene.scene import Parameters
-from lavender.sim.scene.steppers import get_stepper
+from lavender.sim.scene.scene import MAX_SWEEPS, MIN_SWEEPS, Parameters
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
 from lavender.solvers.warm_start import make_warm_start_claim
@@ -87,7 +86,6 @@ class Stepping:
         self,
         scene: Scene | str,
         *,
-        stepper: str | None = None,
         report_residual: bool = False,
         report_motion: bool = False,
     ) -> None:
@@ -100,8 +98,6 @@ class Stepping:
                 "the scene has no bodies; at least one is needed: add some with add_box, add_sphere or "
                 "add_plane"
             )
-        if stepper is not None and get_stepper(stepper).name != scene.parameters.stepper:
-            scene = scene.with_parameters(stepper=stepper, stepper_options={})
         self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
         self.report_residual = check_flag("report_residual", report_residual)
         self.report_motion = check_flag("report_motion", report_motion)
@@ -118,7 +114,7 @@ class Stepping:
         self.state = State.from_scene(scene)
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
-        self._sweeps = get_stepper(p.stepper).sweeps if self._own_sweeps else (1, 2**31 - 1)
+        self._sweeps = (MIN_SWEEPS, MAX_SWEEPS) if self._own_sweeps else (1, 2**31 - 1)
         # If `newton` has no option but the tolerance, its first phase runs on the engine's own arrays.
         tol = p.solver_options.get("tol", TOL)
         self._warm_tol = 0.0
@@ -176,8 +172,7 @@ class Stepping:
         Raises
         ------
         InputError
-            `n` is not an integer from 4 to 64 for sequential_impulses (1 to 64 with steppers other than "impulses"),
-            or of 1 or more for other solvers.
+            `n` is not an integer from 4 to 64 for sequential_impulses, or of 1 or more for other solvers.
         """
         self.state.head[HEAD["iterations"]] = check_int("solver_iterations", n, *self._sweeps)
 

@@ -38,7 +38,6 @@ from lavender.sim.scene.parts import (
     choose_inertia,
     normalise,
 )
-from lavender.sim.scene.steppers import StepperSpec, get_stepper
 from lavender.solvers.registry import SolverSpec, get
 
 SCENE_ORDERS = (
@@ -58,6 +57,7 @@ PARAMETER_RANGES: dict[str, dict[str, float]] = {
 }
 # Largest number of substeps that is computed from `max_substep`; more must be given as `substeps`.
 MAX_DEFAULT_SUBSTEPS = 10_000
+MIN_SWEEPS, MAX_SWEEPS = 4, 64  # Range of `solver_iterations` of sequential impulses.
 # Default of `max_substep` for sequential impulses [s]: four warm-started sweeps keep a stack stable up to it.
 DEFAULT_MAX_SUBSTEP = 1.0 / 240.0
 MAX_BODIES = 2**24 - 1  # The key of a contact has 24 bits for each body.
@@ -85,13 +85,8 @@ class Parameters:
         Default: 16 sweeps, or the default of the registered solver.
     warm_start : bool
         Start the solver from the impulses of the contact cache.
-    stepper : str
-        Name of a stepper of `lavender.sim.scene.steppers`.
-    stepper_options : mapping of str to float
-        Options of the stepper; after construction it contains all of them.
     order : str, optional
-        Sweep order. Default: the stepper's for sequential impulses ("alternating" for "impulses"), "given" for other
-        solvers.
+        Sweep order. Default: "alternating" for sequential impulses, "given" for other solvers.
     friction, restitution : float, -
         Values for bodies that have none of their own.
     patch_radius : float, m
@@ -100,8 +95,8 @@ class Parameters:
         mu_r of every contact with friction: the rolling moment does not exceed mu_r lambda_n; 0: no rolling friction.
     friction_shape : {"disk", "box"}
         With "box", each tangent has its own bound, as in many engines; there is then no torsional friction.
-    position_iterations : int, optional
-        Default: 2 for "impulses", 0 for the other steppers, which have no position projection.
+    position_iterations : int
+        Largest number of sweeps of the position projection in a substep.
     seed : int
     on_failure : {"use", "keep", "damp", "raise"}
         Treatment of a failed solve: use its impulses, keep the warm start, use the mean of both, or raise SolveFailed.
@@ -121,15 +116,13 @@ class Parameters:
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     solver_iterations: int | None = None
     warm_start: bool = True
-    stepper: str = "impulses"
-    stepper_options: Mapping[str, Any] = field(default_factory=dict)
     order: str = None  # type: ignore[assignment]
     friction: float = 0.5
     restitution: float = 0.0
     patch_radius: float = 0.0
     rolling_radius: float = 0.0
     friction_shape: str = "disk"
-    position_iterations: int = None  # type: ignore[assignment]
+    position_iterations: int = 2
     seed: int = 0
     on_failure: str = "use"
     slop: float = 1e-3
@@ -153,14 +146,11 @@ class Parameters:
                 )
             gravity = (0.0, 0.0, -size)
         put(self, "gravity", tuple(check_numbers("gravity", gravity, 3).tolist()))
-        for name in ("solver_options", "stepper_options"):
-            options = getattr(self, name)
-            if not isinstance(options, Mapping):
-                raise InputError(f"{name} is {options!r}; a mapping is needed")
+        if not isinstance(self.solver_options, Mapping):
+            raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
-        own, stepper = self.solver == "sequential_impulses", get_stepper(self.stepper)
-        put(self, "solver_iterations", self._check_sweeps(get(self.solver), stepper))
-        put(self, "stepper_options", stepper.complete_options(self.stepper_options))
+        own = self.solver == "sequential_impulses"
+        put(self, "solver_iterations", self._check_sweeps(get(self.solver)))
         max_substep: Any = self.max_substep
         if max_substep is None:
             max_substep = DEFAULT_MAX_SUBSTEP if own else self.dt
@@ -169,46 +159,29 @@ class Parameters:
         put(self, "warm_start", check_bool("warm_start", self.warm_start))
         order: Any = self.order
         if order is None:
-            put(self, "order", stepper.order if own else "given")
+            put(self, "order", "alternating" if own else "given")
         check_name("order", self.order, SCENE_ORDERS)
         if self.order != "given" and not own:
             raise InputError(
                 f"order={self.order!r} is used only by sequential_impulses, and the solver is "
                 f"{self.solver!r}: leave order out, or give solver_options of {self.solver!r}"
             )
-        if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
-            raise InputError(
-                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or give "
-                "stepper='impulses'"
-            )
-        projections: Any = self.position_iterations
-        if projections is None:
-            projections = stepper.position_iterations
-        put(self, "position_iterations", check_int("position_iterations", projections, 0, 1000))
-        if self.position_iterations and not stepper.position_iterations:
-            raise InputError(
-                f"position_iterations is {projections}, but stepper {stepper.name!r} does not project "
-                "positions: leave position_iterations out, or give another stepper"
-            )
+        check_shape("friction_shape", self.friction_shape)
+        put(self, "position_iterations", check_int("position_iterations", self.position_iterations, 0, 1000))
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
 
-    def _check_sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
+    def _check_sweeps(self, spec: SolverSpec) -> int:
         """Return the checked `solver_iterations`, or their default."""
         sweeps = self.solver_iterations
         if self.solver != "sequential_impulses":
-            if not stepper.solvers:
-                raise InputError(
-                    f"stepper {stepper.name!r} does not use the solver {self.solver!r}: leave solver= out, "
-                    "or give stepper='impulses'"
-                )
             return check_int("solver_iterations", spec.max_iter if sweeps is None else sweeps, 1)
         if self.solver_options:
             raise InputError(
                 f"solver_options are {sorted(self.solver_options)}, but the solver is sequential_impulses, "
                 "which has no options: give order= and seed= of the scene, or another solver="
             )
-        return 16 if sweeps is None else check_int("solver_iterations", sweeps, *stepper.sweeps)
+        return 16 if sweeps is None else check_int("solver_iterations", sweeps, MIN_SWEEPS, MAX_SWEEPS)
 
     def _choose_substeps(self) -> int:
         """Return the checked number of substeps, or the smallest number that respects `max_substep`."""
@@ -637,12 +610,7 @@ class Scene:
 
         It contains bodies, joints and parameters, without the initial state, the sweep budget and the warm-start mode.
         """
-        free: tuple[str, ...] = ("solver_iterations", "warm_start")
-        if self.parameters.stepper == "impulses":
-            free += (
-                "stepper",
-                "stepper_options",
-            )  # The default stepper is left out of the hash, so that snapshots of versions without steppers fit.
+        free = ("solver_iterations", "warm_start")
         head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
         parts: list[Any] = [head]
         for b in self.bodies:

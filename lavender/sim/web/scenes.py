@@ -265,7 +265,7 @@ def describe_layout() -> dict[str, Any]:
     -------
     dict
         arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders:
-        name -> number; steppers: name -> entries that it sets.
+        name -> number.
     """
     return {
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
@@ -275,17 +275,7 @@ def describe_layout() -> dict[str, Any]:
         "joint": JOINT,
         "joint_kinds": JOINT_KINDS,
         "orders": ORDER_NUMBER,
-        "steppers": {name: _encode_stepper(name) for name in ("impulses", "soft_step")},
     }
-
-
-def _encode_stepper(name: str) -> dict[str, dict[str, Any]]:
-    """Return the entries of `head` and `setting` that a stepper sets."""
-    state = Simulation(Scene("stack", stepper=name)).snapshot()
-    first = compute_array_offsets(state.size)
-    head, setting = state.index[first["head"] :], state.real[first["setting"] :]
-    numbers = {slot: int(head[HEAD[slot]]) for slot in ("stepper", "relaxing", "position_iterations")}
-    return {"head": numbers, "setting": {p: float(setting[SETTING[p]]) for p in ("hertz", "ratio", "push")}}
 
 
 def describe_snapshot(start: Snapshot) -> dict[str, Any]:

@@ -1,8 +1,7 @@
-"""Ways to go on with a run that have the bits of the run: one table, beside scenes of every kind and stepper."""
+"""Ways to go on with a run that have the bits of the run: one table, beside scenes of every kind."""
 
 import copy
 import pickle
-from itertools import product
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from worked import after
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.state import State
-from lavender.sim.scene.steppers import STEPPERS
 from lavender_ext.host import memory
 
 SCENES = {
@@ -107,13 +105,9 @@ WAYS = {  # steps that were done before
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "stepper"),
-    [*product(SCENES, ["impulses"]), *product(["card_house", "bridge"], list(STEPPERS)[1:])],
-)
-def test_every_way_to_go_on_has_the_bits_of_the_run(name, stepper, tmp_path):
-    order = {"order": "random"} if stepper == "impulses" else {}
-    scene = lv.Scene(name, stepper=stepper, seed=3, **order, **SCENES[name])
+@pytest.mark.parametrize("name", SCENES)
+def test_every_way_to_go_on_has_the_bits_of_the_run(name, tmp_path):
+    scene = lv.Scene(name, seed=3, order="random", **SCENES[name])
     for way, (before, make) in WAYS.items():
         sim = after(before, scene)
         if before:

@@ -7,7 +7,6 @@ from worked import after
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
-from lavender.sim.scene.steppers import STEPPERS
 
 CASES = [
     ("stack", {}),
@@ -27,7 +26,6 @@ CASES = [
     ("pile", {"n": 60, "friction": 0.0}),
     ("newtons_cradle", {}),
     ("four_bar", {}),
-    *(("pyramid", {"base": 4, "stepper": name}) for name in STEPPERS if name != "impulses"),
 ]
 
 
@@ -51,7 +49,7 @@ def same(a, b):
     [*CASES, *((name, {"order": order, "seed": 3}) for name in ("pyramid", "bridge") for order in ORDERS)],
 )
 def test_packed_contacts_change_no_bit(name, more):
-    """Nor do stages one by one, of whatever stepper."""
+    """Nor do stages one by one."""
     sim = lv.Simulation(lv.Scene(name, **more))
     for sweeps in 8 * (4, 16, 33):
         sim.set_solver_iterations(sweeps)

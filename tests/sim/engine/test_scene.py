@@ -173,9 +173,6 @@ def test_bad_parts_are_refused_and_nothing_is_added(build, message):
         ({"max_substep": 1e-60}, "substeps"),
         ({"dt": 50.0}, "substeps"),  # 12,000 of 1/240 s are no step that anybody has asked for
         ({"dt": 1e60}, "substeps"),
-        ({"stepper": "softstep"}, "soft_step"),
-        ({"stepper_options": 3}, "mapping"),
-        ({"stepper": "soft_step", "position_iterations": 2}, "position_iterations"),
         ({"friction_shape": "square"}, "friction_shape"),
         ({"solver": "pgz"}, "did you mean 'pgs'"),
         ({"order": "bottomup"}, "bottom_up"),
@@ -277,7 +274,7 @@ def test_what_is_added_to_a_scene_is_in_its_copies_and_not_in_the_simulations_be
     changed = scene.with_parameters(slop=2e-3)
     changed.add_joint("ball", -1, 3, anchor=(5.0, 0.0, 3.0))
     assert (scene.n_bodies, changed.n_bodies, changed.bodies[3]) == (4, 4, scene.bodies[3])
-    assert len(lv.Simulation(scene, stepper="soft_step").step()[0]["positions"]) == 4
+    assert len(lv.Simulation(scene).step()[0]["positions"]) == 4
     with pytest.raises(lv.InputError, match="by number"):
         changed.with_parameters(n=5)
 

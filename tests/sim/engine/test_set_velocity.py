@@ -5,7 +5,6 @@ import pytest
 from test_engine_bits import trajectory
 
 import lavender as lv
-from lavender.sim.scene.steppers import STEPPERS
 
 LINEAR, ANGULAR = (0.3, -0.2, 1.5), (0.4, 2.0, -0.1)  # m/s, rad/s
 
@@ -23,7 +22,7 @@ def boxes(velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), **paramete
 @pytest.mark.parametrize("body", [2, "box 1"])
 @pytest.mark.parametrize(
     "parameters",
-    [*({"stepper": name} for name in STEPPERS), {"solver": "newton"}, {"restitution": 0.5}],
+    [{}, {"solver": "newton"}, {"restitution": 0.5}],
     ids=lambda parameters: str(*parameters.values()),
 )
 def test_a_run_has_the_bits_of_a_scene_that_begins_with_this_velocity(parameters, body):

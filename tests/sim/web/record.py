@@ -46,10 +46,7 @@ SCENES = [
     ("bridge", {"order": "colored"}, {}),
     ("four_bar", {"order": "reverse", "motor": 2.0}, {}),
     ("newtons_cradle", {}, {}),
-    ("pyramid", {"base": 4, "stepper": "soft_step", "restitution": 0.3}, {}),
-    ("bridge", {"stepper": "soft_step", "solver_iterations": 2}, {}),
-    ("bridge", {"n": 5, "stepper": "xpbd"}, {}),
-    ("bridge", {"n": 5, "stepper": "avbd"}, {}),
+    ("pyramid", {"base": 4, "restitution": 0.3}, {}),
     ("pile", {"n": 30, "kind": "mixed", "friction_shape": "box"}, {}),
 ]
 

@@ -185,7 +185,7 @@ def module_file(module, newton_module, tmp_path_factory):
 def test_node_finds_every_bit_the_same(module_file, recording):
     done = node(CHECK, module_file, recording)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "all the same: 19 scenes, 5700 steps, 640 solves by newton" in done.stdout
+    assert "all the same: 16 scenes, 4800 steps, 640 solves by newton" in done.stdout
 
 
 @pytest.mark.parametrize(

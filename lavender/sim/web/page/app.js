@@ -138,7 +138,7 @@ class App {
     }
     ["a", "b"].forEach((key, i) => {
       const [sweeps, warm, order, ...more] = (given.get(key) ?? "").split(",");
-      const solver = more.find((word) => ["newton", "soft_step"].includes(word)) ?? "sweeps";
+      const solver = more.includes("newton") ? "newton" : "sweeps";
       const changes = { solver, box: Number(more.includes("box")) };
       if (Number(sweeps) >= 4 && Number(sweeps) <= 64) {
         changes.iterations = Math.round(Number(sweeps));

@@ -117,7 +117,6 @@ export class Simulation {
     this.scene = scene;
     this.substeps = scene.substeps;
     this.newton = null;
-    this.stepper = "impulses";
     this.short = 0; // Number of substeps in which Newton's method did not reach TOL.
     this.solved = 0; // Number of substeps that it solved.
     this.steps = 0;
@@ -233,16 +232,10 @@ export class Simulation {
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 
-  // Select the solver from the next step on: a Newton of the same kernels, or null for the sweeps of the named stepper. The
-  // number of substeps is the one that Python uses for it.
-  use(newton, stepper = "impulses") {
+  // Select the solver from the next step on: a Newton of the same kernels, or null for the sweeps. The number of substeps is
+  // the one that Python uses for it.
+  use(newton) {
     this.newton = newton;
-    this.stepper = stepper;
-    for (const [name, numbers] of Object.entries(this.k.layout.steppers[stepper])) {
-      for (const [place, value] of Object.entries(numbers)) {
-        this.array(name)[this.k.layout[name][place]] = value;
-      }
-    }
     this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
     this.array("setting")[this.k.layout.setting.h] = this.scene.dt / this.substeps;
   }
@@ -331,7 +324,6 @@ export class Simulation {
       first: this.first,
       lost: this.lost,
       newton: this.newton,
-      stepper: this.stepper,
       counts: [this.short, this.solved],
       real: this.k.f64(this.real, this.lengths[0]).slice(),
       index: this.k.i32(this.index, this.lengths[1]).slice(),
@@ -350,7 +342,6 @@ export class Simulation {
     this.first = snapshot.first;
     this.lost = snapshot.lost;
     this.newton = snapshot.newton;
-    this.stepper = snapshot.stepper;
     this.substeps = this.newton ? this.scene.newton_substeps : this.scene.substeps;
     [this.short, this.solved] = snapshot.counts;
   }

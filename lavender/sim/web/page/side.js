@@ -81,7 +81,7 @@ export class Side {
   choose(solver) {
     this.wanted = solver;
     if (solver !== "newton") {
-      this.simulation.use(null, solver === "soft_step" ? solver : "impulses");
+      this.simulation.use(null);
     } else if (this.app.newton instanceof WebAssembly.Module) {
       this.simulation.use(new Newton(this.app.newton, this.simulation.k));
     } else {
@@ -178,7 +178,7 @@ export class Side {
   restore() {
     const { state, history, curve, fresh } = this.kept;
     this.simulation.restore(state);
-    this.wanted = state.newton ? "newton" : state.stepper === "soft_step" ? "soft_step" : "sweeps";
+    this.wanted = state.newton ? "newton" : "sweeps";
     this.history = { ...history, time: [...history.time], values: [...history.values] };
     this.curve = curve;
     this.fresh = fresh;
@@ -222,9 +222,6 @@ export class Side {
   work() {
     const { newton, substeps, short, solved, settings } = this.simulation;
     const parts = substeps === 1 ? "in one step" : `in each of ${substeps} substeps`;
-    if (this.wanted === "soft_step") {
-      return `soft step: ${settings.iterations} sweeps and one that relaxes ${parts}`;
-    }
     if (!newton) {
       return `sweeps: ${settings.iterations} ${parts}`;
     }

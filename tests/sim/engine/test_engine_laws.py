@@ -1,0 +1,162 @@
+"""Closed forms and conservation laws of the engine's step, bits under units of mass, and the eight published values."""
+
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from worked import after, energy
+
+import lavender as lv
+from lavender.sim.scene import SCENES
+
+G = 9.81
+
+
+def run(scene, steps):
+    sim = lv.Simulation(scene)
+    for _ in range(steps):
+        seen, _, lost, _, _ = sim.step()
+        assert not lost
+    return sim, seen
+
+
+def test_soft_joint_under_a_weight_stretches_by_the_closed_form():
+    hertz = 2.0
+    scene = lv.Scene(dt=1 / 480)
+    ball = scene.add_sphere(0.1, 2.0, position=(0, 0, 0))
+    scene.add_joint("distance", -1, ball, anchor_a=(0, 0, 1.0), hertz=hertz, damping=1.0)
+    _, seen = run(scene, 1440)
+    assert -seen["positions"][0][2] == pytest.approx(G / (2 * math.pi * hertz) ** 2, rel=0.01)
+    assert np.abs(seen["velocities"]).max() < 1e-3
+
+
+def test_ball_on_a_rod_swings_with_the_period_of_the_pendulum():
+    # Small swings of a point mass on a rod of 1 m, measured between the zeros of its position.
+    scene = lv.Scene(dt=1 / 240)
+    ball = scene.add_sphere(0.01, 1.0, position=(math.sin(0.1), 0, 1 - math.cos(0.1)))
+    scene.add_joint("distance", -1, ball, anchor_a=(0, 0, 1.0))
+    sim, x = lv.Simulation(scene), []
+    for _ in range(1200):
+        x.append(sim.step()[0]["positions"][0][0])
+    zeros = np.flatnonzero(np.diff(np.sign(x)))
+    period = 2 * np.diff(zeros).mean() / 240
+    assert period == pytest.approx(2 * math.pi * math.sqrt(1 / G) * (1 + 0.1**2 / 16), rel=0.01)
+
+
+def test_stacked_boxes_stay_in_place_for_ten_seconds():
+    scene = lv.Scene("stack", dt=1 / 60)
+    _, seen = run(scene, 600)
+    assert np.abs(seen["positions"][1:, :2]).max() < 0.01
+    np.testing.assert_allclose(seen["positions"][1:, 2], np.arange(scene.n_bodies - 1) + 0.5, atol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_thrown_bodies_gain_no_energy_and_do_not_pass_through_the_ground(seed):
+    rng = np.random.default_rng(seed)
+    scene = lv.Scene(dt=1 / 240, friction=rng.uniform())
+    scene.add_plane()
+    for i in range(8):
+        more = {"position": (*rng.uniform(-0.6, 0.6, 2), 1.0 + 1.5 * i), "mass": 10.0 ** rng.uniform(-1, 1)}
+        more |= {"velocity": rng.normal(scale=2.0, size=3), "angular_velocity": rng.normal(scale=3.0, size=3)}
+        if rng.integers(2):
+            scene.add_sphere(rng.uniform(0.1, 0.4), **more)
+        else:
+            turned = rng.normal(size=4)
+            scene.add_box(rng.uniform(0.2, 0.8, 3), quaternion=turned / np.linalg.norm(turned), **more)
+    sim = lv.Simulation(scene)
+    start = energy(scene, sim.reset()[0])
+    for _ in range(600):
+        seen, _, lost, _, _ = sim.step()
+        assert not lost
+        assert energy(scene, seen) < 1.001 * start
+    assert seen["positions"][1:, 2].min() > 0.05
+
+
+SMALL = {"pyramid": {"base": 4}, "pile": {"n": 20}, "chain": {"n": 8}, "bridge": {"n": 6}}
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+def test_scene_without_motors_does_not_gain_energy(name):
+    scene = lv.Scene(name, **SMALL.get(name, {}))
+    sim = lv.Simulation(scene)
+    start = energy(scene, sim.reset()[0])
+    gained = max(energy(scene, sim.step()[0]) - start for _ in range(120))
+    # The position projection lifts bodies by a fraction of the slop, and sums are rounded.
+    assert gained <= 1e-5 * abs(start)
+
+
+@pytest.mark.parametrize("name", ["card_house", "bridge", "chain"])
+def test_motion_has_the_same_bits_for_every_unit_of_mass(name):
+    """Units of mass are powers of four, whose square roots are exact."""
+    own = lv.Scene(name)
+    seen = run(own, 20)[1]
+    for unit in (2.0**-40, 2.0**12, 2.0**40):
+        other = lv.Scene(name)
+        other.bodies[:] = [replace(b, mass=unit * b.mass, inertia=unit * b.inertia) for b in own.bodies]
+        scaled = run(other, 20)[1]
+        for key in ("positions", "quaternions", "velocities"):
+            assert seen[key].tobytes() == scaled[key].tobytes(), key
+        assert (unit * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
+
+
+def test_solver_values_equal_those_of_the_judge_on_the_exported_problem():
+    sim, seen = run(lv.Scene("stack", substeps=1), 10)
+    assert list(seen["solver"][:4]) == [16.0, 1.0, 24.0, 24.0]
+    assert np.isfinite(seen["solver"]).all()
+    problem = sim.constraint_problem()
+    values = dict(zip(lv.SOLVER_FIELDS, sim.step()[0]["solver"], strict=True))
+    judged, normal = lv.residual(problem, problem.guess), problem.cones.ptr[:-1]
+    # w is a difference of velocities near 0.1 m/s, so it carries their rounding, about 1e-16 m/s.
+    assert values["residual_initial"] == pytest.approx(
+        np.abs(judged.error[normal]).max(), rel=1e-9, abs=1e-14
+    )
+    assert values["violation_initial"] == pytest.approx(-judged.slack[normal].min(), rel=1e-9, abs=1e-14)
+
+
+def test_exported_problem_solved_by_sequential_impulses_has_the_bits_of_the_step():
+    sim = after(30, "pyramid", base=3, substeps=1, solver_iterations=7, order="given")
+    problem = sim.constraint_problem()
+    solution = lv.solve(problem, "sequential_impulses", tol=0, max_iter=7, order="given")
+    assert sim.step()[0]["contacts"]["impulses"].ravel().tobytes() == solution.impulse.tobytes()
+
+
+def test_sweeps_outside_four_to_sixty_four_raise():
+    for n in (4, 64):
+        lv.Simulation(lv.Scene("stack", solver_iterations=n)).set_solver_iterations(n)
+    for n in (3, 65):
+        with pytest.raises(lv.InputError, match="solver_iterations"):
+            lv.Scene("stack", solver_iterations=n)
+        with pytest.raises(lv.InputError, match="solver_iterations"):
+            lv.Simulation("stack").set_solver_iterations(n)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box"])
+def test_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
+    """The bound on the motion of a substep is half of the body's thickness plus the margin, at any initial distance."""
+    h, margin = 1 / 240, 0.01
+    passed = {0.3: 0, 0.98: 0, 1.9: 0}  # Fractions of the bound; above 1 nothing is promised, and some pass.
+    for share, size, wall in product(passed, (0.02, 0.2), (0.001, 0.1, None)):
+        far = share * (0.5 * size + margin)  # m per substep
+        for phase in (0.0, 0.2, 0.4, 0.6, 0.8, 0.999):
+            scene = lv.Scene(dt=h, substeps=1, gravity=0.0, margin=margin)
+            if wall is None:
+                scene.add_plane()
+            else:
+                scene.add_box((2, 2, wall), position=(0, 0, -wall / 2), static=True)
+            place = {
+                "position": (0.01, 0.02, 0.5 * size + margin + phase * far),
+                "velocity": (0, 0, -far / h),
+            }
+            if shape == "sphere":
+                scene.add_sphere(size / 2, **place)
+            else:
+                scene.add_box((size,) * 3, **place)
+            sim = lv.Simulation(scene)
+            for _ in range(12):
+                seen = sim.step()[0]
+                speed = np.linalg.norm(seen["velocities"][1][:3])
+                assert speed <= far / h * (1 + 1e-9), "a wall at rest adds no speed"
+            passed[share] += bool(seen["positions"][1][2] <= 0.0)
+    assert passed[0.3] == passed[0.98] == 0 < passed[1.9]
