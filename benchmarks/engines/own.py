@@ -1,4 +1,4 @@
-"""LavenderSim with the stepper of the scene's parameters."""
+"""LavenderSim as an engine of the comparison."""
 
 from __future__ import annotations
 

@@ -43,7 +43,6 @@ RENAMED_OPTIONS = {
     "--ahead": "--horizon",
     "--campaign": "--workers",
     "--every": "--record-every",
-    "--for": "--records",
     "--fresh": "--no-reuse",
     "--levels": "--tolerances",
     "--pass-limit": "--sequence-time-limit",

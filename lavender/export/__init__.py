@@ -4,7 +4,7 @@ The command `lavender export c DIR` writes the library; from Python, `write` doe
 is the path of the header, and `engine_image` returns a simulation in the format of `lav_engine_open`.
 """
 
+from lavender.export.image import engine_image
 from lavender.export.library import HEADER, source, write
-from lavender.export.view import engine_image
 
 __all__ = ["HEADER", "engine_image", "source", "write"]

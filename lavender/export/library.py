@@ -50,22 +50,20 @@ def _collect_existing_files(folder: Path) -> Iterator[Path]:
     )
 
 
-def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False) -> list[Path]:
+def write(out: Path, *, replace: bool = False) -> list[Path]:
     """Write the C library into a folder.
 
     Parameters
     ----------
     out : Path
         Folder, which is created if it does not exist. Files with other names in it are kept.
-    more : mapping, optional
-        Contents of additional files by name; they are not listed in SHA256SUMS.
     replace : bool
         Whether to replace existing files whose contents differ.
 
     Returns
     -------
     list of Path
-        The written files; SHA256SUMS and `more` are the last ones.
+        The written files; SHA256SUMS is the last one.
 
     Raises
     ------
@@ -85,10 +83,10 @@ def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: 
         f"{hashlib.sha256(contents[name].encode()).hexdigest()}  {name}\n" for name in sorted(contents)
     )
     contents["SHA256SUMS"] = sums
-    return _write_files(out, {**contents, **(more or {})}, replace)
+    return _write_files(out, contents, replace)
 
 
-def _write_files(out: Path, contents: Mapping[str, str | bytes], replace: bool) -> list[Path]:
+def _write_files(out: Path, contents: Mapping[str, str], replace: bool) -> list[Path]:
     """Write files by their names below a folder.
 
     Raises
@@ -96,7 +94,7 @@ def _write_files(out: Path, contents: Mapping[str, str | bytes], replace: bool) 
     InputError
         A file exists with other contents, and `replace` is false. No file is written.
     """
-    files = {out / name: x.encode() if isinstance(x, str) else x for name, x in contents.items()}
+    files = {out / name: text.encode() for name, text in contents.items()}
     for path, data in files.items():
         if path.exists() and not replace and path.read_bytes() != data:
             raise InputError(f"{path} exists with other contents: give --replace, or another folder")

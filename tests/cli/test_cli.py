@@ -167,7 +167,6 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("audit", "a.xml", "--accept", "1e-3"), "Did you mean '--max-velocity-error'?"),
         (("tune", "a.xml", "--ahead", "5"), "Did you mean '--horizon'?"),
         (("tune", "a.xml", "--rounds", "5"), "Did you mean '--repeats'?"),
-        (("export", "c", "lib", "--for", "records.jsonl"), "Did you mean '--records'?"),
         (
             ("report", "a.jsonl", "--tolerances", "1e-3"),
             "--tolerances has no effect if records are shown again",

@@ -23,7 +23,6 @@ from lavender import export as export
 from lavender.base.errors import InputError
 from lavender.cli import measuring
 from lavender.cli.bench import mujoco
-from lavender.export import vectors
 from lavender.lab.bench import Event, simulators
 from lavender.lab.report import motion_tables
 from lavender.lab.suite import steps
@@ -113,48 +112,6 @@ def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
     assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "nncg" in shown
     plan = json.loads(lavender("explain", "stack(n=200)", "--json", "--tol", "1e-9")[1])
     assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "direct"
-
-
-def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path, monkeypatch):
-    monkeypatch.setattr(export.library, "source", lambda: "of another test")
-    rng = np.random.default_rng(0)
-    b = rng.normal(size=(9, 9))
-    mine = lv.Problem.lcp(b @ b.T + np.eye(9), np.ones(9))
-    mine.save(tmp_path / "ring.npz")  # the name of a case of the suite, too
-    records, out = tmp_path / "records.jsonl", tmp_path / "library"
-    bench.run(
-        [tmp_path / "ring.npz"], ["direct"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records
-    )
-    command = ("export", "c", out, "--records", records, "--solver", "direct")
-    assert lavender(*command)[0] == 0
-    assert vectors.pack_problem(mine) in (out / "vectors.bin").read_bytes()
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    lv.Problem.lcp(2.0 * mine.dense(), np.ones(9)).save(tmp_path / "ring.npz")
-    code, _, err = lavender(*command)
-    assert code == cli.EXIT_BAD_INPUT and "now holds another problem" in err
-    mine.save(tmp_path / "ring.npz")
-    before["vectors.bin"] = b"mine"
-    (out / "vectors.bin").write_bytes(b"mine")
-    (out / "chosen.h").unlink()
-    del before["chosen.h"]
-    code, _, err = lavender(*command)
-    assert code == cli.EXIT_BAD_INPUT and "--replace" in err
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-
-
-def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp_path, monkeypatch):
-    monkeypatch.setattr(export.library, "source", lambda: "of another test")
-    steps, out = tmp_path / "steps", tmp_path / "out"
-    assert lavender("run", "stack", "--steps", 6, "--record", steps)[0] == 0
-    words = ("--solvers", "newton", "anderson", *QUICK, "--out", out)
-    code, _, err = lavender("report", steps, *words)
-    assert code == 0, err
-    code, _, err = lavender("export", "c", tmp_path / "c", "--records", out)
-    assert code == 0, err
-    assert (tmp_path / "c" / "chosen.h").read_text().count("LAV_") >= 1
-    assert (
-        tmp_path / "c" / "vectors.bin"
-    ).stat().st_size > 1000  # bytes: a problem of the steps and its impulse
 
 
 def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):

@@ -446,7 +446,7 @@ COMMANDS = [
      "--repeats", "1", "--out", "report", "--paper"),
     ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
     ("solve", "stack(n=2)", "--output", "solution.npz"),
-    ("export", "c", "c", "--records", "report"),
+    ("export", "c", "c"),
     ("web", "page", "page"),
     ("problems", "@hard", "--page", "set.md"),
 ]  # fmt: skip

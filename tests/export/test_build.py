@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import random_problems as rp
+import vectors
 from clib import functions, run
 from test_same_bits import kinds_of, of_matrix
 from tower import self_test_problem
 
 import lavender as lv
-from lavender import bench
 from lavender import export as export
 from lavender.base.errors import LavenderError
-from lavender.export import vectors
 from lavender.sim.web import extract_c
 
+CHECK = Path(__file__).parent / "parity" / "check.c"
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 # The first and the last that are promised; the library is compiled as C11 wherever it is run.
 LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17": ["-std=c++17", "-x", "c++"]}
@@ -137,7 +137,7 @@ def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
         pytest.skip(f"no {name} with -fsanitize={what}")
     write_vectors(tmp_path)
     run(name, *flags, "-c", folder / "lavender.c", "-o", tmp_path / "lavender.o")
-    for source in (folder / "tower.c", export.library.HERE / "capi" / "check.c"):
+    for source in (folder / "tower.c", CHECK):
         run(name, *flags, source, tmp_path / "lavender.o", "-lm", "-o", tmp_path / source.stem)
         run(tmp_path / source.stem, cwd=tmp_path, env={"ASAN_OPTIONS": "detect_leaks=0"})
 
@@ -161,8 +161,7 @@ def write_vectors(out):
 
 def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler, tmp_path):
     count = write_vectors(tmp_path)
-    check = export.library.HERE / "capi" / "check.c"
-    link = [check, shared, f"-Wl,-rpath,{shared.parent}"]
+    link = [CHECK, shared, f"-Wl,-rpath,{shared.parent}"]
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
     assert (
@@ -176,76 +175,22 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     assert done.returncode == 1 and "DIFFERS" in done.stdout
 
 
-def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
-    records, problem = tmp_path / "records.jsonl", tmp_path / "mine.npz"
-    lv.Problem.lcp(np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(2)).save(problem)
-    for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
-        bench.run([problem], [solver], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=repeats), records)
-    assert "LAV_NNCG" in vectors.make_export_files(records, None, 1)["chosen.h"]
-    with pytest.raises(
-        lv.InputError, match="reached no tolerance in these records; give --solver with one of: nncg"
-    ):
-        vectors.make_export_files(records, "direct", 1)
-
-
 def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_path, monkeypatch):
     page = (Path(__file__).resolve().parents[2] / "docs" / "c.md").read_text()
-    program, steps = re.findall(r"^```c\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (program,) = re.findall(r"^```c\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     (python,) = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    records = tmp_path / "records.jsonl"
-    bench.run(["granularF(n=3)"], ["auto"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records)
-    (tmp_path / "chosen.h").write_text(vectors.make_export_files(records, None, 1)["chosen.h"])
     (tmp_path / "drop.c").write_text(program)
-    call = "  if (solve(chosen, q, impulse, &result) || !(result.verdict.relative < 1e-6)) return 2;\n"
-    whole = program.replace("int main(", steps + "\nint main(").replace(
-        "  free(solver.memory);", call + "  free(solver.memory);"
-    )
-    more = "  solver_t chosen[STEPS] = {{NULL, NULL, 0}};\n  double impulse[3 * MOST];\n  lav_problem q;\n"
-    (tmp_path / "both.c").write_text(whole.replace("  lav_problem q;\n", more, 1))
     link = [shared, f"-Wl,-rpath,{shared.parent}", "-lm", "-I", folder]
-    for name in ("drop", "both"):
-        run(
-            compiler,
-            "-std=c99",
-            *WARNINGS,
-            "-ffp-contract=off",
-            tmp_path / f"{name}.c",
-            *link,
-            "-o",
-            tmp_path / name,
-        )
+    flags = ("-std=c99", *WARNINGS, "-ffp-contract=off")
+    run(compiler, *flags, tmp_path / "drop.c", *link, "-o", tmp_path / "drop")
     (tmp_path / "steps").mkdir()
     assert run(tmp_path / "drop", tmp_path / "steps").startswith("converged")
-    run(tmp_path / "both")
     found = [lv.load(path) for path in sorted((tmp_path / "steps").glob("*.npz"))]
     assert len(found) == 240 and lv.solve(found[-1], "newton").success
     monkeypatch.chdir(shared.parent)
     said = []
     exec(python, {"print": said.append})
     np.testing.assert_allclose(said[0], [0.5, 0.0], atol=1e-15)
-
-
-def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, compiler, tmp_path):
-    records = tmp_path / "records.jsonl"
-    # A busy machine does not solve the last problem in the default limit of 1 s.
-    plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1, time_limit=60.0)
-    sizes = ("granularF(n=3)", "granular(n=3)", "granularF(n=6)")  # the last needs more than sweeps
-    bench.run(sizes, ["auto"], plan, records)
-    made = vectors.make_export_files(records, None, 2)
-    header = made["chosen.h"]
-    assert "to a relative residual of 1e-06" in header and "1e-09" not in header
-    assert "LAV_ANDERSON" in header
-    for name, text in made.items():
-        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    (tmp_path / "vectors.bin").write_bytes(vectors.make_export_files(records, None, 3)["vectors.bin"])
-    (tmp_path / "use.cpp").write_text(
-        '#include "chosen.h"\nint main() { return lav_chosen[0].options.convex; }\n'
-    )
-    run(compiler, "-std=c++11", "-x", "c++", *WARNINGS, "-I", folder, "-fsyntax-only", tmp_path / "use.cpp")
-    link = [shared, f"-Wl,-rpath,{shared.parent}", "-o", tmp_path / "check"]
-    run(compiler, "-std=c11", *WARNINGS, "-I", folder, tmp_path / "check.c", *link)
-    said = run(tmp_path / "check", cwd=tmp_path).splitlines()
-    assert len(said) == 3 and all(line.startswith("met ") for line in said)
 
 
 KERNEL = """

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from invalid_values import draw_examples
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
+from vectors import ARRAYS, METHODS
 
 import lavender as lv
 from lavender.export import HEADER
 from lavender.export.header import parse_enum_constants, parse_struct_fields
-from lavender.export.view import ARRAYS, METHODS
 
 ERRORS = {
     value: name

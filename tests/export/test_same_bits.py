@@ -9,10 +9,9 @@ import pytest
 import random_problems as rp
 from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
+from vectors import OTHER_BITS, NotSupported, is_accepted_by_library, make_test_vector, run_compiled_newton
 
 import lavender as lv
-from lavender.export.vectors import make_test_vector, run_compiled_newton
-from lavender.export.view import OTHER_BITS, NotSupported, is_accepted_by_library
 
 
 def problems():

@@ -118,12 +118,7 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
                 )
             )
             hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
-            in_c = (f"# in C: {statement.in_c}",) * bool(statement.in_c)
-            code = (
-                (*statement.code, *in_c)
-                if complete
-                else (statement.call_line + hint,) * bool(statement.call_line)
-            )
+            code = statement.code if complete else (statement.call_line + hint,) * bool(statement.call_line)
             lines += [Text(f"    {line}") for line in code]
     warnings = (report.stopped_warning, report.busy_warning or report.load_warning)
     lines += [Text(warning, style="yellow") for warning in warnings if warning]

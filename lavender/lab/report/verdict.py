@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from shlex import quote
 
 from lavender.base.deadline import format_seconds
 from lavender.io.stored import SUFFIXES
@@ -36,7 +35,6 @@ from lavender.lab.report.figures import is_plug_in
 from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_left_out_count, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
-from lavender.solvers.registry import specs
 
 MAX_PLUG_INS = 2  # The sentence on plug-ins names up to this many; if there are more, it names only the best.
 
@@ -49,14 +47,12 @@ class Statement:
     ----------
     text : the sentence
     code : lines of Python, as they were timed
-    in_c : command that exports the call to C, or the reason why it cannot be exported
     requested : whether the sentence is about a time or a number of sweeps that the user requested
     one_line : whether a short report on a terminal also shows the sentence, cut to one line
     """
 
     text: str
     code: tuple[str, ...] = ()
-    in_c: str = ""
     requested: bool = False
     one_line: bool = False
 
@@ -409,35 +405,10 @@ def _describe_budget_recommendation(condition: str, choice: Choice, limit: float
 # -- code ----------------------------------------------------------------------------------------------------
 
 
-def _explain_missing_c(records: Records, call: TimedCall) -> str:
-    """Return why the C library cannot run a call on its cases; empty if it can."""
-    for case, record in call.runs.items():
-        info = records.cases[case]
-        if "ellipses" in info.structure:
-            return "the library has no ellipses: use problem.disk"
-        if record.solver in ("direct", "lemke") and info.law not in ("linear", "lcp"):
-            return f"{record.solver} accepts only bounded rows there"
-        if record.solver in ("pgs", "jacobi") and info.bodies and record.form != "whitened J":
-            return f"{record.solver} does not accept bodies there: use the matrix, problem.csr"
-    return ""
-
-
 def _make_statement_with_code(
     records: Records, call: TimedCall, text: str, requested: bool = False
 ) -> Statement:
-    """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
+    """Return a sentence with the lines of its call."""
     if not call.as_record.timing_mode:
         text += " Records of an earlier version: the call itself was not timed."
-    line, reason, in_c = call.as_record, _explain_missing_c(records, call), ""
-    spec = specs().get(line.solver)
-    if (
-        spec is not None
-        and spec.builtin
-        and not spec.external
-        and line.mode == "tol"
-        and line.timing_mode != "batch"
-    ):
-        source = quote(records.source or "records.jsonl")
-        command = f"lavender export c liblavender --solver {line.solver} --records {source}"
-        in_c = f"not in C: {reason}" if reason else command
-    return Statement(text, call.code_lines, in_c, requested)
+    return Statement(text, call.code_lines, requested)

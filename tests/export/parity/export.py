@@ -15,14 +15,15 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parents[1]), str(HERE.parents[1] / "sim" / "web")]
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1]), str(HERE.parents[1] / "sim" / "web")]
 
+import vectors  # noqa: E402
 from random_problems import as_matrix, random_contact_problem, random_lcp  # noqa: E402
 from record import SCENES, STEPS  # noqa: E402
+from vectors import NotSupported  # noqa: E402
 
 import lavender as lv  # noqa: E402
-from lavender.export import engine_image, vectors  # noqa: E402
-from lavender.export.view import NotSupported  # noqa: E402
+from lavender.export import engine_image  # noqa: E402
 from lavender_ext.engine.arrays import make_array_views  # noqa: E402
 
 ORDERS = ("symmetric", "random", "reverse")
