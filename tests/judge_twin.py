@@ -244,7 +244,10 @@ class Problem:
                         size[row, body, 3:] = reach
         self.touches = np.zeros((m, n), bool)  # bodies of each row
         for k, pair in enumerate([*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]):
-            self.touches[ptr[k] : ptr[k + 1], [body for body in pair if body >= 0]] = True
+            moving = [
+                i for i in pair if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))
+            ]
+            self.touches[ptr[k] : ptr[k + 1], moving] = True
         minv, minv_size = np.zeros((n, 6, 6), L), np.zeros((n, 6, 6), L)
         for i in range(n):
             minv[i, [0, 1, 2], [0, 1, 2]] = r["inv_mass"][i]

@@ -1,5 +1,7 @@
 """Small random problems for property tests: the generators of `lavender.contract`, and others that only tests use."""
 
+from dataclasses import replace
+
 import hypothesis.strategies as st
 import numpy as np
 import scipy.sparse as sp
@@ -35,6 +37,24 @@ def side_by_side(parts):
         sp.block_diag([part.csr for part in parts], format="csr"),
     )
     return lv.Problem(b, cones, a, friction=parts[0].friction)
+
+
+def with_ground_as_body(problem):
+    """Return the problem of bodies with its static body, -1, given as one more body of inverse mass and inertia 0."""
+    rows, n = problem.rows, problem.rows.n_bodies
+    ground = {
+        "inv_mass": np.append(rows.inv_mass, 0.0),
+        "inv_inertia": np.concatenate([rows.inv_inertia, np.zeros((1, 3, 3))]),
+        "v_free": np.concatenate([rows.v_free, np.zeros((1, 6))]),
+    }
+    pairs = {
+        name: np.where(getattr(rows, name) < 0, np.int32(n), getattr(rows, name))
+        for name in ("joint_body", "contact_body")
+    }
+    bodies = replace(rows, **ground, **pairs)
+    return lv.Problem(
+        problem.b, problem.cones, rows=bodies, compliance=problem.compliance, friction=problem.friction
+    )
 
 
 #: And by a dense matrix with a guess.

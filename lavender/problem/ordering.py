@@ -154,7 +154,7 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
                 "ground= is given for a problem with rows, whose static bodies define the ground: leave it "
                 "out"
             )
-        return compute_block_levels(problem.rows.block_bodies, problem.rows.n_bodies)
+        return compute_block_levels(problem.rows.moving_block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
             "the levels of a problem given as a matrix cannot be computed without ground=; give the "
@@ -190,7 +190,7 @@ def number_bodies_by_adjacency(problem: Problem) -> IntArray:
     assert problem.rows is not None
     n = problem.rows.n_bodies
     numbers = np.arange(n, dtype=np.int32)
-    pair = problem.rows.block_bodies
+    pair = problem.rows.moving_block_bodies
     pair = pair[(pair >= 0).all(axis=1)]
     if not len(pair) or np.abs(pair[:, 0] - pair[:, 1]).mean() <= MAX_MEAN_BODY_DISTANCE:
         return numbers
@@ -211,7 +211,7 @@ def compute_small_bandwidth_block_order(problem: Problem) -> IntArray:
         graph = sp.csr_matrix(_build_block_graph(problem))
         return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
     rank = np.append(number_bodies_by_adjacency(problem), np.int32(-1))
-    pair = rank[problem.rows.block_bodies]
+    pair = rank[problem.rows.moving_block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
     low = np.where(low < 0, high, low)  # For a static body, -1, use the number of the moving body.
     is_contact = np.arange(problem.n_blocks) >= problem.rows.n_joints
@@ -224,7 +224,7 @@ def compute_block_colors(problem: Problem) -> IntArray:
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
     if problem.rows is not None:
-        return compute_body_colors(problem.rows.block_bodies, problem.rows.n_bodies)
+        return compute_body_colors(problem.rows.moving_block_bodies, problem.rows.n_bodies)
     graph = _build_block_graph(problem)
     k = problem.n_blocks
     return compute_matrix_colors(

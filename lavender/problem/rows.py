@@ -239,6 +239,13 @@ class Rows:
             return self.contact_body
         return np.concatenate([self.joint_body, self.contact_body])
 
+    @property
+    def moving_block_bodies(self) -> IntArray:
+        """Moving bodies of each block (k, 2): `block_bodies` with -1 for bodies whose inverse mass and inertia are 0."""
+        moves = np.append((self.inv_mass != 0.0) | self.inv_inertia.any(axis=(1, 2)), False)
+        bodies = self.block_bodies
+        return mark_read_only(bodies if moves[:-1].all() else np.where(moves[bodies], bodies, np.int32(-1)))
+
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """Compute J as a CSR matrix (m, 6 n); columns 6 i to 6 i + 5 are body i, linear then angular."""
         is_valid = isinstance(cones, Cones) and cones.n_blocks == self.n_joints + self.n_contacts

@@ -135,7 +135,7 @@ class AdmmState:
             rows, n = problem.rows, 6 * problem.rows.n_bodies
             setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
             setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
-            work = Layout(rows.block_bodies, rows.n_bodies, 6).work
+            work = Layout(rows.moving_block_bodies, rows.n_bodies, 6).work
             return float(setup + rates["form row"] * n + rates["panels work"] * work)
         if not problem.m:
             return 0.0

@@ -16,7 +16,7 @@ from lavender_ext.core.validate cimport has_invalid_number
 from lavender_ext.core.block_types cimport blocks_t, count_tangent_rows, count_angular_rows
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport form_contact_jacobian, dot6, multiply_inverse_mass
-from lavender_ext.core.view cimport get_block_bodies, rows_t
+from lavender_ext.core.view cimport get_block_bodies, get_moving_body, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
@@ -51,7 +51,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
         start[i] = 0
     for i in range(p.n_blocks):
         for s in range(2):
-            x = get_block_bodies(r, i)[s]
+            x = get_moving_body(r, i, s)
             if x >= 0:
                 start[x] += 1
     for i in range(r.n_bodies + 1):
@@ -60,7 +60,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
         sum_ += t
     for i in range(p.n_blocks):
         for s in range(2):
-            x = get_block_bodies(r, i)[s]
+            x = get_moving_body(r, i, s)
             if x >= 0:
                 blocks[start[x]] = i
                 start[x] += 1
@@ -72,7 +72,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
     bound[0] = 0
     for i in range(p.n_blocks):
         n_rows = p.ptr[i + 1] - p.ptr[i]
-        t = (get_block_bodies(r, i)[0] >= 0) + (get_block_bodies(r, i)[1] >= 0)
+        t = (get_moving_body(r, i, 0) >= 0) + (get_moving_body(r, i, 1) >= 0)
         # The loop over bodies counts a block with itself once for each of its moving bodies; count it once in all.
         bound[0] += n_rows if t == 0 else (1 - t) * n_rows * n_rows
     for i in range(r.n_bodies):
@@ -85,7 +85,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
 cdef inline int32_t list_coupled_blocks(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks,
                                    int32_t* out) noexcept nogil:
     """List block i and the blocks that share a body with it in `out`, increasing; return their number."""
-    cdef int32_t a = get_block_bodies(r, i)[0], b = get_block_bodies(r, i)[1], x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
+    cdef int32_t a = get_moving_body(r, i, 0), b = get_moving_body(r, i, 1), x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
     if a >= 0:
         x = start[a]
         xe = start[a + 1]
@@ -109,7 +109,7 @@ cdef inline int32_t find_shared_bodies(const rows_t* r, int32_t i, int32_t j) no
     """Return a bit set. Bit 2 s + t is set if body s (0 or 1) of block i and body t of block j are the same moving body."""
     cdef int32_t s, t, x, bits = 0
     for s in range(2):
-        x = get_block_bodies(r, i)[s]
+        x = get_moving_body(r, i, s)
         for t in range(2):
             if x >= 0 and x == get_block_bodies(r, j)[t]:
                 bits |= 1 << (2 * s + t)

@@ -1,7 +1,8 @@
 """Islands: sets of blocks that no other block can influence.
 
 Two blocks are connected if they share a moving body, a kinematic tree of M or a non-zero entry of A. An island is a connected
-component of blocks. A block that touches no moving body is an island of its own. Components are found by union-find with
+component of blocks. A block that touches no moving body is an island of its own; a body moves if its inverse mass or an entry
+of its inverse inertia is not 0. Components are found by union-find with
 path halving; islands are numbered in the order of their first block.
 """
 from libc.stdint cimport int32_t, int64_t
@@ -9,7 +10,7 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.roots cimport find_root
-from lavender_ext.core.view cimport get_block_bodies, csr_t, generalized_t, rows_t, view_t
+from lavender_ext.core.view cimport get_moving_body, csr_t, generalized_t, rows_t, view_t
 
 
 cdef inline int32_t merge_components(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
@@ -47,19 +48,18 @@ cdef inline int32_t merge_with_first_at(int32_t* first, int32_t place, int32_t i
 cdef inline int32_t connect_blocks_by_bodies(const rows_t* r, int32_t k, int32_t* parent, int32_t* first) noexcept nogil:
     """Connect k blocks that share a moving body; return the number of components. first (n_bodies) is scratch."""
     cdef int32_t i, side, body, count = k
-    cdef const int32_t* pair
     for body in range(r.n_bodies):
         first[body] = -1
     for i in range(k):
-        pair = get_block_bodies(r, i)
         for side in range(2):
-            if pair[side] >= 0:
-                count -= merge_with_first_at(first, pair[side], i, parent)
+            body = get_moving_body(r, i, side)
+            if body >= 0:
+                count -= merge_with_first_at(first, body, i, parent)
     return count
 
 
 cdef inline int32_t connect_blocks_by_matrix(const blocks_t* p, const csr_t* a, int32_t* parent, int32_t* block) noexcept nogil:
-    """Connect blocks that share a stored entry of A; return the number of components. block (m) is scratch."""
+    """Connect blocks that share a nonzero entry of A; return the number of components. block (m) is scratch."""
     cdef int32_t i, j, q, count = p.n_blocks
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
@@ -67,7 +67,7 @@ cdef inline int32_t connect_blocks_by_matrix(const blocks_t* p, const csr_t* a, 
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(a.indptr[j], a.indptr[j + 1]):
-                if block[a.indices[q]] != i:
+                if block[a.indices[q]] != i and a.data[q] != 0.0:
                     count -= merge_components(parent, i, block[a.indices[q]])
         if count == 1:
             break
@@ -86,7 +86,7 @@ cdef inline int32_t connect_blocks_by_trees(const blocks_t* p, const generalized
         last = -1
         for q in range(g.jptr[p.ptr[i]], g.jptr[p.ptr[i + 1]]):
             t = tree[g.jidx[q]]
-            if t != last:
+            if t != last and g.jval[q] != 0.0:
                 count -= merge_with_first_at(first, t, i, parent)
                 last = t
         if count == 1:
@@ -130,14 +130,19 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
 
 
 cdef inline bint has_no_moving_body(const view_t* v, int32_t i) noexcept nogil:
-    """Return whether no impulse changes a slack of block i: its bodies are static, or its rows of J or A are empty."""
-    cdef const int32_t* pair
+    """Return whether no impulse changes a slack of block i: its bodies are immovable, or its rows of J or A are zero."""
+    cdef int32_t q
     if v.g != NULL:
-        return v.g.jptr[v.p.ptr[i + 1]] == v.g.jptr[v.p.ptr[i]]
+        for q in range(v.g.jptr[v.p.ptr[i]], v.g.jptr[v.p.ptr[i + 1]]):
+            if v.g.jval[q] != 0.0:
+                return False
+        return True
     if v.r != NULL:
-        pair = get_block_bodies(v.r, i)
-        return pair[0] < 0 and pair[1] < 0
-    return v.a.indptr[v.p.ptr[i + 1]] == v.a.indptr[v.p.ptr[i]]
+        return get_moving_body(v.r, i, 0) < 0 and get_moving_body(v.r, i, 1) < 0
+    for q in range(v.a.indptr[v.p.ptr[i]], v.a.indptr[v.p.ptr[i + 1]]):
+        if v.a.data[q] != 0.0:
+            return False
+    return True
 
 
 cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noexcept nogil:

@@ -68,3 +68,14 @@ cdef struct view_t:
 cdef inline const int32_t* get_block_bodies(const rows_t* r, int32_t i) noexcept nogil:
     """Return the two bodies of block i."""
     return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
+
+
+cdef inline int32_t get_moving_body(const rows_t* r, int32_t i, int32_t side) noexcept nogil:
+    """Return the body on one side (0 or 1) of block i, -1 if it is static or its inverse mass and inertia are 0."""
+    cdef int32_t k, body = get_block_bodies(r, i)[side]
+    if body < 0 or r.inv_mass[body] != 0.0:
+        return body
+    for k in range(9):
+        if r.inv_inertia[9 * body + k] != 0.0:
+            return body
+    return -1

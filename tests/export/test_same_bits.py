@@ -284,6 +284,40 @@ def test_islands_are_what_shares_no_body(library):
     assert count >= 1 and sorted(set(label.tolist())) == list(range(count))
 
 
+def count_islands(library, given, **arrays):
+    method = (
+        "pgs" if given.matrix is not None else "sequential_impulses" if given.rows is not None else "nncg"
+    )
+    solver = library.open(library.problem(given, **arrays), library.options(method))
+    label = np.full(given.n_blocks, -1, np.int32)
+    return library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
+
+
+def test_islands_immovable_bodies_and_stored_zeros_connect_nothing(library):
+    two = lv.Problem.from_rows(rp.touching([(-1, 0), (-1, 1)]), tangents=0)
+    assert count_islands(library, two) == count_islands(library, rp.with_ground_as_body(two)) == 2
+    dense = np.eye(2)
+    cones = lv.Cones.contacts(0.0, count=2, tangents=0)
+    stored = {
+        "index_ptr": np.array([0, 2, 4], np.int32),
+        "index": np.array([0, 1, 0, 1], np.int32),
+        "value": dense.ravel(),
+    }
+    mass = {"mass_ptr": np.array([0, 1, 3], np.int32), "mass_index": np.array([0, 0, 1], np.int32),
+            "mass_value": np.array([1.0, 0.0, 1.0])}  # fmt: skip
+    for given, arrays in (
+        (lv.Problem(np.ones(2), cones, dense), stored),
+        (lv.Problem.from_jacobian(dense, dense, [-1.0, -1.0], cones=cones), stored),
+        (lv.Problem.from_jacobian(dense, dense, [-1.0, -1.0], cones=cones), mass),
+    ):
+        made = library.problem(given, **arrays)
+        made.n_entries = 4 if "value" in arrays else made.n_entries
+        made.n_mass_entries = 3 if "mass_ptr" in arrays else made.n_mass_entries
+        solver = library.open(made, library.options("nncg"))
+        label = np.full(2, -1, np.int32)
+        assert library.c.lav_islands(solver.at, label.ctypes.data, 2) == 2
+
+
 @pytest.mark.parametrize("name", ["newton", "admm"])
 def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_does(library, name):
     met = 0

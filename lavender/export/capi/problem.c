@@ -161,25 +161,25 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   return LAV_OK;
 }
 
-/* Copy a matrix to compressed rows; of a dense one, only nonzero entries. `lower`: the lower triangle and every diagonal entry. */
+/* Copy the nonzero entries of a matrix to compressed rows. `lower`: the lower triangle and every diagonal entry. */
 static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const double *to_value, const int32_t *ptr,
-                        const int32_t *index, const double *value, int32_t rows, int32_t columns, int32_t entries,
-                        int32_t lower) {
+                        const int32_t *index, const double *value, int32_t rows, int32_t columns, int32_t lower) {
   int32_t *out = (int32_t *)(uintptr_t)to_ptr, *to = (int32_t *)(uintptr_t)to_index, i, j, at = 0;
   double *x = (double *)(uintptr_t)to_value;
-  if (ptr) {
-    COPY(out, ptr, rows + 1);
-    COPY(to, index, entries);
-    COPY(x, value, entries);
-    return;
-  }
   out[0] = 0;
   for (i = 0; i < rows; i++) {
-    for (j = 0; j < (lower ? i + 1 : columns); j++)
-      if (value[(int64_t)i * columns + j] != 0.0 || (lower && j == i)) {
-        to[at] = j;
-        x[at++] = value[(int64_t)i * columns + j];
+    if (ptr)
+      for (j = ptr[i]; j < ptr[i + 1]; j++) {
+        to[at] = index[j];
+        x[at] = value[j];
+        at += value[j] != 0.0 || (lower && index[j] == i);
       }
+    else
+      for (j = 0; j < (lower ? i + 1 : columns); j++)
+        if (value[(int64_t)i * columns + j] != 0.0 || (lower && j == i)) {
+          to[at] = j;
+          x[at++] = value[(int64_t)i * columns + j];
+        }
     out[i + 1] = at;
   }
 }
@@ -229,7 +229,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   const uint64_t from = s->used;
   int64_t workspace = (int64_t)q->n_mass_entries + 1;
   if (s->is_short) return LAV_ERROR_WORKSPACE;
-  fill_matrix(mptr, midx, mval, q->mass_ptr, q->mass_index, q->mass_value, n, n, q->n_mass_entries, 1);
+  fill_matrix(mptr, midx, mval, q->mass_ptr, q->mass_index, q->mass_value, n, n, 1);
   for (;; workspace = 2 * workspace < most ? 2 * workspace : most) {
     s->used = from;
     columns = TAKE(s, int32_t, workspace);
@@ -260,7 +260,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   double *b = (double *)(uintptr_t)s->p.b, values = 0.0;
   int64_t workspace = (int64_t)q->n_entries + 64;
   uint64_t from;
-  fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, q->n_entries, 0);
+  fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, 0);
   GIVE_BACK(factor_mass(s, q));
   copy_or(s->g.compliance, q->compliance, m, 0.0);
   copy_or(s->v_free, q->velocity, n, 0.0);

@@ -580,7 +580,7 @@ def _build_body_graph(problem: Problem) -> Edges:
     """Return the graph of moving bodies that a joint or a contact connects."""
     r = problem.rows
     assert r is not None
-    ends = np.concatenate([r.joint_body, r.contact_body])
+    ends = r.moving_block_bodies
     pairs = np.unique(np.sort(ends[(ends >= 0).any(axis=1)], axis=1), axis=0)
     bodies, indices = np.unique(pairs, return_inverse=True)
     indices = indices.reshape(pairs.shape)[pairs[:, 0] >= 0]

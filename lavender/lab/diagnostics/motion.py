@@ -108,7 +108,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
         return
     if r is None or speed is None:
         return
-    if np.all(tn < 0.0) and np.any(un < 0.0) and np.any(np.all(r.contact_body >= 0, axis=1)):
+    if np.all(tn < 0.0) and np.any(un < 0.0) and np.any(np.all(r.moving_block_bodies[r.n_joints :] >= 0, axis=1)):
         typical = float(np.median(-tn))
         if typical > 0.1 * float(np.median(speed)):
             reason = (
@@ -150,13 +150,14 @@ def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
     r = reconstruct_bodies(p)
     if r is None or np.count_nonzero(r.inv_mass) < 2:
         return
-    still = np.flatnonzero((r.contact_body < 0).any(axis=1))
+    body = r.moving_block_bodies[r.n_joints :]
+    still = np.flatnonzero((body < 0).any(axis=1))
     v = r.v_free[r.inv_mass > 0.0, :3]
     fall = np.median(v, axis=0)
     size = float(np.linalg.norm(fall))
     if len(still) < 4 or size == 0.0 or np.median(np.abs(v @ fall / size - size)) > 0.6 * size:
         return
-    toward = np.where(r.contact_body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
+    toward = np.where(body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
     if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
         reason = "static bodies push others in the direction of their fall: are normals flipped, or bodies swapped?"
         yield make_diagnostic(

@@ -16,9 +16,11 @@ from random_problems import (
     seeds,
     side_by_side,
     touching,
+    with_ground_as_body,
 )
 
 import lavender as lv
+from lavender.problem.ordering import compute_block_colors, compute_block_levels_from_ground
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import get
 
@@ -222,3 +224,79 @@ def test_bodies_that_share_nothing_are_islands_in_every_form():
     counts = [find_islands(convert(both))[0] for convert in FORMS.values()]
     assert counts[0] > 1
     assert len(set(counts)) == 1
+
+
+# -- immovable bodies and entries that are zero --------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(seed):
+    first, second = (random_contact_problem(seed + i, bodies=3, joints=2, contacts=4) for i in (0, 7))
+    both, _ = rows_side_by_side(first, scaled(second, 1000.0))
+    given = with_ground_as_body(both)
+    count, label = find_islands(both)
+    assert count > 1
+    for name, convert in FORMS.items():
+        if name == "J and M":
+            continue  # M of an immovable body does not exist.
+        found = find_islands(convert(given))
+        assert found[0] == count
+        np.testing.assert_array_equal(found[1], label)
+    np.testing.assert_array_equal(compute_block_colors(given), compute_block_colors(both))
+    np.testing.assert_array_equal(
+        compute_block_levels_from_ground(given), compute_block_levels_from_ground(both)
+    )
+    lam = np.random.default_rng(seed).normal(size=both.m)
+    assert lv.residual(given, lam).relative == lv.residual(both, lam).relative
+    for name in ("pgs", "sequential_impulses", "block_gauss_seidel", "newton", "auto"):
+        one, other = (lv.solve(p, name, tol=1e-8) for p in (both, given))
+        assert one.status is other.status, name
+        np.testing.assert_allclose(
+            lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative
+        )
+
+
+def test_solve_fast_ball_beside_stack_on_immovable_body_is_judged_separately():
+    """A stack that is heavier upwards, and a ball at 1000 m/s on the same ground of inverse mass 0."""
+    n = 6
+    inverse = np.append(10.0 ** -np.linspace(0.0, 2.0, n), 1.0)
+    v_free = np.zeros((n + 1, 6))
+    v_free[:, 2] = np.append(np.full(n, -0.1), -1000.0)
+    pairs = [(-1, 0), *((i, i + 1) for i in range(n - 1)), (-1, n)]
+    rows = touching(pairs, inv_mass=inverse, inv_inertia=inverse[:, None, None] * np.eye(3), v_free=v_free)
+    alone = lv.Problem.from_rows(
+        touching(
+            pairs[:n],
+            inv_mass=inverse[:n],
+            inv_inertia=inverse[:n, None, None] * np.eye(3),
+            v_free=v_free[:n],
+        ),
+        tangents=0,
+    )
+    given = with_ground_as_body(lv.Problem.from_rows(rows, tangents=0))
+    solution = lv.solve(given, "pgs", tol=1e-6, max_iter=100_000)
+    assert solution.success
+    assert lv.residual(alone, solution.impulse[:n]).relative <= 1e-6 * (1 + ROUNDING)
+
+    for world in lv.solve_many([given, given], "pgs", tol=1e-6, max_iter=100_000):
+        assert lv.residual(alone, world.impulse[:n]).relative <= 1e-6 * (1 + ROUNDING)
+
+
+def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
+    rows = touching(
+        [(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)]
+    )
+    problem = lv.Problem.from_rows(rows, target=[0.0, 0.0, 0.0, 1.0, 0.5, 0.0], mu=0.5)
+    assert find_islands(problem) == (2, pytest.approx([0, 1]))
+    for name in ("newton", "auto", "admm", "block_gauss_seidel"):
+        solution = lv.solve(problem, name, tol=1e-9)
+        assert solution.success, name
+        np.testing.assert_allclose(problem.velocity(solution.impulse)[2, :2], [0.5, 0.0], atol=1e-8)
+
+
+def test_find_islands_stored_zero_of_matrix_connects_nothing():
+    a = sp.csr_array(
+        (np.array([2.0, 0.0, 0.0, 2.0]), np.array([0, 1, 0, 1]), np.array([0, 2, 4])), shape=(2, 2)
+    )
+    assert a.nnz == 4
+    assert find_islands(lv.Problem.lcp(a, [1.0, 1000.0]))[0] == 2
