@@ -3,13 +3,15 @@
     explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
     print(explanation.table); print(explanation.sentence)
 
-The sliding speed of a contact is the norm of the tangential relative velocity v_t = J_t v+ after the step. It is
+The sliding speed of a contact is the norm of v_t = J_t v+ - target, the tangential relative velocity after the step
+minus the velocity of the surface, such as a conveyor belt's. Softened friction rows (with compliance) are an exception:
+their target is the damping of an engine and not the velocity of a surface, unless `surface_velocity` is given. v_t is
 computed from the impulses of these variants; each variant includes the replacements of the variants above it:
 
     engine      the engine's answer
     solved      the exact solution of the engine's own problem
     disk        a round friction cone in place of a pyramid or box
-    hard        friction rows without compliance and with target velocity 0, in place of softened ones
+    hard        friction rows without compliance and with the surface's velocity as target, in place of softened ones
     coulomb     Coulomb's law in place of the convex relaxation
 
 The difference of v_t between two consecutive variants is the part of the slip that the replaced property causes:
@@ -166,6 +168,7 @@ def explain_slip(
     *,
     contacts: Sequence[int] | Sequence[str] | str | None = None,
     disk: Problem | None = None,
+    surface_velocity: Any = None,
     tol: float = 1e-9,
 ) -> SlipExplanation:
     """Divide the slip of contacts after a step into parts by their causes.
@@ -181,6 +184,9 @@ def explain_slip(
     disk : Problem, optional
         The problem of the same step with friction cones in place of pyramids, over the same velocities. It is needed
         if the rows of `problem` are edges of pyramids, because such rows do not show which rows form a contact.
+    surface_velocity : (rows,), m/s, optional
+        Velocity of the surface along each row of `disk` if it is given, else of `problem`; only its friction rows are
+        read. Default: the target of rows without compliance, 0 on rows with compliance.
     tol : float, default 1e-9
         Relative residual to which each variant is solved.
 
@@ -203,21 +209,27 @@ def explain_slip(
     check_problem(measured)
     blocks = _choose_contacts(measured, contacts)
     jacobian = measured.jacobian.tocsr()
-    free = measured.velocity(np.zeros(measured.m))
-    if len(problem.velocity(answer)) != len(free):
+    free, own_free = (p.velocity(np.zeros(p.m)) for p in (measured, problem))
+    if own_free.shape != free.shape:
         raise InputError(
-            f"disk has {len(free)} velocities and problem {len(problem.velocity(answer))}; both must "
+            f"disk has velocities of shape {free.shape} and problem of shape {own_free.shape}; both must "
             "describe the same step of the same model"
         )
+    surface = (
+        _find_surface_velocity(measured)
+        if surface_velocity is None
+        else as_array("surface_velocity", surface_velocity, (measured.m,), unit="m/s")
+    )
 
-    def slip(velocity: FloatArray) -> tuple[FloatArray, ...]:
-        return tuple(jacobian[rows] @ velocity for rows in rows_of_contacts)
+    def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
+        velocity = changed.velocity(impulse).ravel()
+        return tuple(jacobian[rows] @ velocity - surface[rows] for rows in rows_of_contacts)
 
     cones = measured.cones
     rows_of_contacts = [
         np.arange(cones.ptr[k] + 1, cones.ptr[k] + 1 + min(2, int(cones.n_tangents[k]))) for k in blocks
     ]
-    variants = [SlipVariant("engine", slip(problem.velocity(answer)), residual(problem, answer).relative)]
+    variants = [SlipVariant("engine", slip(problem, answer), residual(problem, answer).relative)]
 
     def solve_and_add_variant(
         name: str, changed: Problem, start: FloatArray | None, note: str = ""
@@ -230,7 +242,7 @@ def explain_slip(
         failed = "" if solution.residual.relative <= max(tol, solution.residual.roundoff_floor) else (
             f"not solved: {solution.status.name}"
         )  # fmt: skip
-        velocity = slip(changed.velocity(solution.impulse))
+        velocity = slip(changed, solution.impulse)
         variants.append(SlipVariant(name, velocity, solution.residual.relative, failed))
         return solution.impulse
 
@@ -243,7 +255,7 @@ def explain_slip(
         start if own_disk.m == problem.m else None,
         "cones are round" if is_same_shape else "",
     )
-    hard, has_soft_friction = _replace_soft_friction(own_disk)
+    hard, has_soft_friction = _replace_soft_friction(own_disk, surface)
     start = solve_and_add_variant("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
         UNDEFINED_LAW if hard.cones.has_round else ""
@@ -291,18 +303,30 @@ def _as_disk(problem: Problem) -> Problem:
     return replace(problem, cones=problem.cones.shaped("disk"))
 
 
-def _replace_soft_friction(problem: Problem) -> tuple[Problem, bool]:
-    """Return the problem with hard friction rows at target velocity 0, and whether a row changed."""
+def _compute_free_row_velocities(problem: Problem) -> FloatArray:
+    """Return J v* (m,) [m/s]."""
+    return np.asarray(problem.jacobian @ problem.velocity(np.zeros(problem.m)).ravel())
+
+
+def _find_surface_velocity(problem: Problem) -> FloatArray:
+    """Return the target (m,) [m/s] of rows without compliance, 0 on other rows and if the target is rounding."""
+    free = _compute_free_row_velocities(problem)
+    target = problem.b + free
+    # The target is computed as b + J v*.
+    target[np.abs(target) <= 8.0 * np.finfo(float).eps * (np.abs(problem.b) + np.abs(free))] = 0.0
+    return target if problem.compliance is None else np.where(problem.compliance > 0.0, 0.0, target)
+
+
+def _replace_soft_friction(problem: Problem, surface: FloatArray) -> tuple[Problem, bool]:
+    """Return the problem with hard friction rows at the velocity of the surface (m,), and whether a row changed."""
     rows = problem.cones.friction_rows
-    free_slip = (problem.jacobian @ problem.velocity(np.zeros(problem.m)))[rows]
-    target = problem.b[rows] + free_slip
+    wanted = surface[rows] - _compute_free_row_velocities(problem)[rows]
     soft = np.zeros(problem.m) if problem.compliance is None else np.array(problem.compliance)
-    # The target is computed as b + J v*; it counts as 0 if it is below the rounding of this sum.
-    rounding = 8.0 * np.finfo(float).eps * (np.abs(problem.b[rows]) + np.abs(free_slip))
-    if not soft[rows].any() and not (np.abs(target) > rounding).any():
+    rounding = 8.0 * np.finfo(float).eps * (np.abs(problem.b[rows]) + np.abs(wanted) + np.abs(surface[rows]))
+    if not soft[rows].any() and not (np.abs(problem.b[rows] - wanted) > rounding).any():
         return problem, False
     b = np.array(problem.b)
-    b[rows] = -free_slip
+    b[rows] = wanted
     soft[rows] = 0.0
     return replace(problem, b=b, compliance=soft), True
 
@@ -314,7 +338,7 @@ def _find_speed_ranges_over_solutions(problem: Problem, slip: Any) -> FloatArray
     motions = find_solutions(problem).motions
     if len(motions) < 2:
         return None
-    speeds = np.array([[np.linalg.norm(v) for v in slip(problem.velocity(x.impulse))] for x in motions])
+    speeds = np.array([[np.linalg.norm(v) for v in slip(problem, x.impulse)] for x in motions])
     return np.array([speeds.min(axis=0), speeds.max(axis=0)])
 
 
@@ -365,7 +389,7 @@ def explain_slip_of_states(
         for _ in range(steps - 1):
             mj.mj_step(model, data)
         mj.mj_forward(model, data)
-        problem = adapter.from_mujoco(model, data)
+        problem, final = adapter.from_mujoco(model, data), data
         disk = None
         if round_model is not None:
             other = mj.MjData(round_model)
@@ -373,10 +397,19 @@ def explain_slip_of_states(
             mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
             mj.mj_setState(round_model, other, state, mj.mjtState.mjSTATE_INTEGRATION)
             mj.mj_forward(round_model, other)
-            disk = adapter.from_mujoco(round_model, other)
-        if (problem if disk is None else disk).cones.n_tangents.any():
+            disk, final = adapter.from_mujoco(round_model, other), other
+        measured, surface = problem if disk is None else disk, None
+        if getattr(model, "flg_surfacevel", False):  # MuJoCo subtracts the surfaces' velocities from J v.
+            surface = measured.jacobian @ data.qvel - final.efc_vel
+        if measured.cones.n_tangents.any():
             explanations.append(
-                explain_slip(problem, adapter.impulse(model, data), contacts=contacts, disk=disk)
+                explain_slip(
+                    problem,
+                    adapter.impulse(model, data),
+                    contacts=contacts,
+                    disk=disk,
+                    surface_velocity=surface,
+                )
             )
     return explanations
 

@@ -241,7 +241,7 @@ class Rows:
 
     @property
     def moving_block_bodies(self) -> IntArray:
-        """Moving bodies of each block (k, 2): `block_bodies` with -1 for bodies whose inverse mass and inertia are 0."""
+        """`block_bodies` with -1 for bodies that cannot move: their inverse mass and inertia are 0."""
         moves = np.append((self.inv_mass != 0.0) | self.inv_inertia.any(axis=(1, 2)), False)
         bodies = self.block_bodies
         return mark_read_only(bodies if moves[:-1].all() else np.where(moves[bodies], bodies, np.int32(-1)))

@@ -223,3 +223,55 @@ def test_a_law_that_is_not_defined_has_no_value():
     assert "not defined" in explanations[0].sentence
     summary = summarize_slip(explanations)
     assert all(str(row[summary.heads.index("coulomb [m/s]")]) == NONE for row in summary.rows)
+
+
+def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
+    """A box of 1 kg that rests on a belt of 1 m/s and moves with it, by bodies or by J and M."""
+    if form == "bodies":
+        rows = lv.Rows(
+            inv_mass=[1.0], inv_inertia=[np.eye(3)], v_free=[[1.0, 0.0, -0.1, 0.0, 0.0, 0.0]],
+            contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)], tangent=[(1.0, 0.0, 0.0)],
+            arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, 0.0)],
+        )  # fmt: skip
+        return lv.Problem.from_rows(
+            rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance]
+        )
+    return lv.Problem.from_jacobian(
+        np.eye(3)[[2, 0, 1]], np.eye(3), [1.0, 0.0, -0.1], target=[0.0, belt, 0.0], cones=lv.Cones.contacts(mu),
+        compliance=[0.0, compliance, compliance],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M"])
+def test_explain_slip_box_carried_by_conveyor_does_not_slip(form):
+    problem = conveyor(form)
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    assert explanation.causes == ("no slip",)
+    # A belt of 2 m/s slides under the box: 1 m/s minus the friction of 0.5 * 0.1 N s on 1 kg.
+    problem = conveyor(form, belt=2.0)
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    assert explanation.variants[0].speeds == pytest.approx([0.95])
+    assert explanation.causes == ("load above the friction limit",)
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M"])
+def test_explain_slip_softened_rows_need_surface_velocity(form):
+    problem = conveyor(form, belt=1.2, compliance=10.0, mu=5.0)
+    impulse = lv.solve(problem, tol=1e-9).impulse
+    # v_t = 1.2 - 10 lambda and lambda = v_t - 1: a belt that softness lets slip by 10 / 11 of 0.2 m/s.
+    explanation = explain_slip(problem, impulse, surface_velocity=[0.0, 1.2, 0.0])
+    assert explanation.variants[0].speeds == pytest.approx([0.2 * 10 / 11])
+    assert explanation.causes == ("softness of friction",)
+    assert explanation.variants[3].speeds == pytest.approx([0.0], abs=1e-9)
+    # Without it, the target is an engine's damping.
+    assert explain_slip(problem, impulse).variants[0].speeds == pytest.approx([1.2 - 0.2 * 10 / 11])
+
+
+def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
+    for cone in ("elliptic", "pyramidal"):
+        model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="{cone}"/><worldbody>
+          <geom name="belt" type="plane" size="9 9 1" surfacevel="1 0 0 0 0 0"/>
+          <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body></worldbody>
+          </mujoco>""")
+        explanation = explain_slip_of_states(model, steps=1000)[0]
+        assert explanation.causes == ("no slip",) * len(explanation.contacts)

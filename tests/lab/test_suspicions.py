@@ -338,3 +338,48 @@ def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an
             soft[list(found.soft_rows)] = found.compliance
             assert lv.solve(replace(problem, compliance=problem.compliance + soft), tol=1e-6).success
     assert fights
+
+
+def thin_wall(entry, as_bodies):
+    """A body of 0.5 kg that a wall pushes out with 0.05 m/s, along a row of J of this size, and a floor."""
+    cones = lv.Cones.contacts(0.0, count=2, tangents=0)
+    if not as_bodies:
+        jac = np.array([[entry, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return lv.Problem.from_jacobian(
+            jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones
+        )
+    jac = np.zeros((2, 12))
+    jac[0, 6], jac[1, 8] = entry, 1.0
+    rows = lv.Rows(
+        inv_mass=[2.0], inv_inertia=[np.eye(3)], v_free=[[0.2, -0.1, -0.00981, 0.0, 0.0, 0.0]], jac=jac,
+        joint_ptr=[0, 1, 2], joint_body=[(-1, 0)] * 2,
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, target=[0.05, 0.0], lower=[0.0, 0.0])
+
+
+@pytest.mark.parametrize("as_bodies", [False, True])
+def test_diagnose_impulse_far_above_momentum_is_reported(as_bodies):
+    for entry, reported in ((1e-9, True), (1e-2, False), (1.0, False)):
+        problem = thin_wall(entry, as_bodies)
+        solution = lv.solve(problem, tol=1e-9)
+        assert solution.success
+        found = lv.diagnose(problem, solution.impulse)
+        assert [d.kind for d in found] == ["impulses"] * reported, entry
+        if reported:
+            assert list(found[0].blocks) == [0]
+            # the impulse times the entry of J: 0.5 kg (0.05 m/s / 1e-9)
+            assert found[0].data["push"] == pytest.approx(2.5e7)
+    problem = thin_wall(1.0, as_bodies)
+    far = lv.solve(problem, tol=1e-9).impulse + np.array([0.0, 1e6])
+    assert "impulses" in [d.kind for d in lv.diagnose(problem, far)]
+
+
+def test_diagnose_light_body_thrown_away_is_reported():
+    """The impulse is small against the momentum of the heavy body beside the light one."""
+    problem = lv.Problem.from_jacobian(
+        [[1e-6, 0.0], [0.0, 1.0]], np.diag([1e-6, 1e6]), [-1.0, -1.0], target=[0.1, 0.0],
+        cones=lv.Cones.contacts(0.0, count=2, tangents=0),
+    )  # fmt: skip
+    solution = lv.solve(problem, tol=1e-9)
+    found = [d for d in lv.diagnose(problem, solution.impulse) if d.kind == "impulses"]
+    assert solution.success and len(found) == 1 and found[0].data["change"] == pytest.approx(1e5, rel=1e-3)

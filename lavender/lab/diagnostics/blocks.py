@@ -14,6 +14,9 @@ from lavender.problem import Problem
 from lavender.solvers.certify import find_conflict
 
 MAX_PLAUSIBLE_FRICTION = 10.0  # [-] No pair of materials has a larger friction coefficient.
+# Impulses this many times above the momentum of the problem are reported. At the foot of a stack of n bodies they
+# exceed the momentum of one body n times, so the ratio is multiplied by rows / 100.
+MAX_MOMENTUM_RATIO = 1e4
 # [rows] For larger problems, no proof that no solution exists is searched: it takes seconds.
 MAX_CONFLICT_ROWS = 1000
 CONFLICT_TOL = 1e-6  # [-] A proof counts only if it excludes every answer with up to this relative residual.
@@ -126,10 +129,14 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
         )
         yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
+    excessive = list(_diagnose_momentum(p, impulse, b))
+    yield from excessive
+    if excessive:
+        return
     row_velocity = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)
     i = int(np.argmax(row_velocity))
     # At the foot of a stack of n bodies, impulses are n times as large as for one body.
-    if row_velocity[i] > 1e4 * b * max(1.0, p.m / 100):
+    if row_velocity[i] > MAX_MOMENTUM_RATIO * b * max(1.0, p.m / 100):
         reason = f"an impulse of {impulse[i]:.3g} N s changes its row by {row_velocity[i]:.3g} m/s, while b is at most "
         yield make_diagnostic(
             p,
@@ -138,6 +145,45 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
             [p.block_of(i)],
             velocity=float(row_velocity[i]),
         )
+
+
+def _diagnose_momentum(p: Problem, impulse: FloatArray, speed: float) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if an impulse (m,) [N s] is far above the momentum of the problem, or throws a body away.
+
+    The momentum is the sum of M_jj max(|v*_j|, `speed`) over the velocities, with `speed` the largest |b| [m/s].
+    """
+    if p.rows is not None:
+        inertia = np.linalg.pinv(p.rows.inv_inertia, hermitian=True)
+        mass = np.divide(1.0, p.rows.inv_mass, out=np.zeros(p.rows.n_bodies), where=p.rows.inv_mass > 0.0)
+        masses = np.hstack(
+            [np.repeat(mass[:, None], 3, axis=1), np.diagonal(inertia, axis1=1, axis2=2)]
+        ).ravel()
+    elif p.generalized is not None:
+        masses = p.generalized.mass.diagonal()
+    else:
+        return
+    free = p.velocity(np.zeros(p.m)).ravel()
+    momentum = float(masses @ np.maximum(np.abs(free), speed))
+    jac = p.jacobian.tocsr()
+    # Forces on immovable bodies change no momentum.
+    push = (abs(jac) @ (masses > 0.0).astype(float)) * np.abs(impulse)
+    change = np.abs(p.velocity(impulse).ravel() - free)
+    i, j = int(np.argmax(push)), int(np.argmax(change))
+    usual_speed = max(speed, float(np.abs(free).max(initial=0.0)))
+    excess = max(1.0, p.m / 100) * MAX_MOMENTUM_RATIO
+    if push[i] > excess * momentum:
+        reason = (
+            f"the impulse of {p.row_name(i)}, {impulse[i]:.3g} N s, pushes with {push[i]:.3g} N s, but the momentum "
+            f"of the problem is {momentum:.3g} N s: is its row of J nearly zero, or nearly equal to another?"
+        )
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(i)], push=float(push[i]), momentum=momentum)
+    elif change[j] > excess * usual_speed:
+        i = int(np.argmax(abs(jac[:, [j]]).toarray().ravel() * np.abs(impulse)))
+        reason = (
+            f"impulses change velocity {j} by {change[j]:.3g} m/s or rad/s, but v* and b are at most "
+            f"{usual_speed:.3g}"
+        )
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(i)], change=float(change[j]))
 
 
 def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:

@@ -108,7 +108,11 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
         return
     if r is None or speed is None:
         return
-    if np.all(tn < 0.0) and np.any(un < 0.0) and np.any(np.all(r.moving_block_bodies[r.n_joints :] >= 0, axis=1)):
+    if (
+        np.all(tn < 0.0)
+        and np.any(un < 0.0)
+        and np.any(np.all(r.moving_block_bodies[r.n_joints :] >= 0, axis=1))
+    ):
         typical = float(np.median(-tn))
         if typical > 0.1 * float(np.median(speed)):
             reason = (

@@ -75,7 +75,9 @@ def find_bodies(problem: Problem) -> Bodies | None:
     For J and M these are free rigid bodies, of which every block must couple at most two.
     """
     if problem.rows is not None:
-        return Bodies(problem.rows.moving_block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
+        return (
+            Bodies(problem.rows.moving_block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
+        )
     if problem.generalized is None or problem.cones.has_round:
         return None
     parts = graph.find_bodies_of_velocities(problem.metric, problem.generalized.order)
