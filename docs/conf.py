@@ -55,12 +55,11 @@ CONTENTS = {
     ),
     "Use": (
         "commands report campaigns formats generalized quadratic-programs mujoco worlds engines audit "
-        "tune derivatives proof c solvers generated/api"
+        "tune derivatives c solvers generated/api"
     ),
     "LavenderSim": "engine engine-measurements scenes towers web",
     "Background": (
-        "chapter motion newtons-method auto performance peers catalogue generated/cases "
-        "generated/measured method"
+        "chapter motion newtons-method auto performance peers generated/cases generated/measured method"
     ),
     "Project": "architecture plugin trust platforms limitations",
 }

@@ -588,9 +588,8 @@ def suite_page(site):
         (
             '`lavender.suite` makes problems from a name: `suite.case("pyramid(k=10, mass_ratio=1e6)")`, or the '
             "same text "
-            "on the command\nline. Each says why it is there; where the solution is known by closed form, exact "
-            "arithmetic "
-            "or proof, `case.reference` holds it."
+            "on the command\nline. Each says why it is there; where the exact solution is known, "
+            "`case.reference` holds it."
         ),
         "## Families",
     ]

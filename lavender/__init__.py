@@ -8,7 +8,7 @@ Problems   `Problem`, `Cones` (bounds and friction), `Rows` and `RowBuilder` (bo
 Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
 Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
            of `auto`)
-Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
+Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide)
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
@@ -67,7 +67,6 @@ if TYPE_CHECKING:
     from lavender.lab.diagnostics import Diagnostic, diagnose
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
     from lavender.lab.motion import MotionError, SolutionSet, find_solutions, motion_error
-    from lavender.lab.proof import Enclosure, prove
     from lavender.lab.slip import SlipExplanation, explain_slip
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
@@ -89,7 +88,6 @@ _LAZY_NAMES = {
     "lavender.lab.diagnostics": ("Diagnostic", "diagnose"),
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
     "lavender.lab.motion": ("MotionError", "SolutionSet", "find_solutions", "motion_error"),
-    "lavender.lab.proof": ("Enclosure", "prove"),
     "lavender.lab.slip": ("SlipExplanation", "explain_slip"),
     "lavender.problem.row_builder": ("RowBuilder",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
@@ -131,7 +129,6 @@ __all__ = [
     "CrossCheck",
     "Derivative",
     "Diagnostic",
-    "Enclosure",
     "Generalized",
     "History",
     "InUse",
@@ -177,7 +174,6 @@ __all__ = [
     "motion",
     "motion_error",
     "prepare",
-    "prove",
     "redundancy",
     "register",
     "report",

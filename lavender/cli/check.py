@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
@@ -17,6 +18,10 @@ from lavender.cli.options import (
     print_escaped,
     threshold_option,
 )
+
+if TYPE_CHECKING:
+    from lavender.lab.bench.cases import Item
+    from lavender.lab.check import CrossCheck
 
 
 @click.command(cls=MultiValueCommand)
@@ -45,8 +50,9 @@ def check(
 ) -> None:
     """Compare solvers with a reference solver and with the judge.
 
-    The judge checks the claim of each solver. A solution stored in a file is judged, too: it is at the floor of its
-    precision, close enough (--threshold), or its solver stopped early.
+    The judge checks the claim of each solver. For a case of the suite whose exact solution is known, the distance of
+    each answer from it is printed. A solution stored in a file is judged, too: it is at the floor of its precision,
+    close enough (--threshold), or its solver stopped early.
 
     Exit code 1: a claim is contradicted; none of the solvers accepts a problem; a file in a folder cannot be read; or,
     with --precision or --threshold, a stored solution is neither at its floor nor close enough.
@@ -79,6 +85,8 @@ def check(
             stored = item.judge_stored_answer(precision, threshold)
             print_escaped(item.name, style="bold")
             print_escaped(str(comparison))
+            if (exact := _describe_distances(item, comparison)) is not None:
+                print_escaped(exact)
             if stored is not None:
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
@@ -99,3 +107,26 @@ def check(
         shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
         print_escaped(f"stored solutions: {shares}")
     errors.exit(contradicted or unaccepted or (judges_stored and unmet))
+
+
+def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
+    """Describe the distance of each answer from the exact solution of a case; None if no solution is known."""
+    import numpy as np
+
+    from lavender.lab import suite
+    from lavender.lab.bench.cases import is_path
+
+    if item.in_memory is not None or is_path(item.source):
+        return None
+    reference = suite.case(item.source).reference
+    if reference is None or reference.impulse is None or reference.compare == "error":
+        return None
+    unique = reference.compare == "impulse"
+    exact = reference.impulse if unique else item.problem.slack(reference.impulse)
+    distances = [
+        f"{row.solver} {np.abs((row.solution.impulse if unique else row.solution.slack) - exact).max():.1e}"
+        for row in comparison
+        if row.solution is not None
+    ]
+    what = "impulses [N s]" if unique else "slacks [m/s]"
+    return f"distance of the {what} from the exact solution ({reference.source}): {', '.join(distances)}"

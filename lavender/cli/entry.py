@@ -27,11 +27,11 @@ from lavender.cli.options import (
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
-    "Solve and judge": ("solve", "check", "prove", "reference", "explain"),
+    "Solve and judge": ("solve", "check", "explain"),
     "Measure": ("report",),
     "MuJoCo": ("record", "audit", "tune", "slip", "bench"),
     "Engine": ("run", "view", "web"),
-    "Tools": ("solvers", "contract", "cases", "problems", "doctor", "export"),
+    "Tools": ("solvers", "contract", "cases", "doctor", "export"),
 }
 _WEB_COMMANDS = ("view", "web")
 #: Module of each command.

@@ -91,7 +91,7 @@ def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     InputError
         A tolerance, budget or limit is invalid.
     """
-    names = ("tolerances", "budgets", "motion", "prove", "velocity_tolerances", "orders")
+    names = ("tolerances", "budgets", "motion", "velocity_tolerances", "orders")
     return kind(**{name: options[name] for name in names if options[name] is not None}, **more)
 
 
@@ -166,7 +166,6 @@ def measure_files(
 def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
     """Make the plan of a report that measures times."""
     from lavender.lab.bench import Plan
-    from lavender.lab.proof import require_python_flint
 
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
@@ -180,10 +179,7 @@ def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: S
         (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
     )
     more: dict[str, Any] = {"repeats": options["repeats"], "times": options["time_budgets"], "sweeps": sweeps}
-    plan = make_plan(options, Plan, **limits, **more)
-    if plan.prove:
-        require_python_flint()
-    return plan
+    return make_plan(options, Plan, **limits, **more)
 
 
 def show_page(page: SummaryPage, folder: Path) -> None:

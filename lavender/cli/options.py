@@ -298,8 +298,6 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                   "help": "Relative residuals to reach."}),
     ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
                   "relative to a reference that is solved once for each case."}),
-    ("--prove", {"is_flag": True, "help": "Measure the motion error from an enclosed exact solution, if one is proven "
-                 "(extra `proof`); implies --motion."}),
     ("--velocity-tolerances", {"type": ListType(float), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
     ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,

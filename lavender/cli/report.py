@@ -176,7 +176,6 @@ def _reject_unused_options(
         reject_unused_options(
             context, timing_options, "with --workers, which measures no times and ends by iterations"
         )
-        reject_unused_options(context, ["prove"], "with --workers, which measures too many problems")
     else:
         reject_unused_options(context, ["seeds"], "without --workers")
     reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))

@@ -65,7 +65,7 @@ def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, p
 RUNS = {
     "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1), "tune": ("m.xml", "--worlds", 2, "--steps", 2),
     "record": ("m.xml", "--steps", 1, "--out", "out"), "check": ("stack(n=2)", "--solvers", "pgs"),
-    "explain": ("stack(n=2)",), "prove": ("stack(n=2)",),
+    "explain": ("stack(n=2)",),
     "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK), "run": ("stack", "--solver", "newton"),
     "solve": ("stack(n=2)",),
 }  # fmt: skip
@@ -460,8 +460,7 @@ def test_files_are_written_whoever_reads(path, tmp_path):
     made = [tmp_path / name for name in ("x.csv", "x.npz")]
     assert _unread("run", "stack", "--steps", 3, "--trace", made[0]) == ""
     assert _unread("solve", path, "--output", made[1]) == ""
-    assert _unread("reference", path) == ""
-    assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
+    assert all(p.is_file() for p in made)
 
 
 def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender, tmp_path):

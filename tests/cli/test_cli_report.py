@@ -1,4 +1,4 @@
-"""`lavender report`, `prove`, `explain`: what measures and examines from the command line."""
+"""`lavender report`, `explain`: what measures and examines from the command line."""
 
 import json
 import os
@@ -59,48 +59,7 @@ def test_without_a_problem_nothing_is_printed_but_why(boxes):
     assert warm.exit_code == 0 and "ours, median" in warm.output and "Cold" not in warm.output
 
 
-def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkeypatch):
-    problem = lv.suite.case("stack(n=8)").problem
-    lv.io.save(problem, tmp_path / "pile.npz")
-    code, out, _ = lavender("reference", tmp_path)
-    assert code == 0 and "auto" in out
-    assert (tmp_path / "pile.npz.reference").is_file()
-    used = []
-    import lavender.lab.bench.running.runner as runner
-
-    load = runner.load_reference
-    monkeypatch.setattr(runner, "load_reference", lambda p, path: used.append(load(p, path)))
-    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
-    found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
-    assert len(found.cases) == 1
-    assert used[0].is_accepted
-
-
-def test_a_proven_reference_is_what_a_report_measures_motions_from(lavender, tmp_path):
-    pytest.importorskip("flint")
-    path = tmp_path / "pile.npz"
-    lv.suite.case("stack(n=8)").problem.save(path)
-    code, out, _ = lavender("reference", "--prove", path)
-    assert code == 0 and "proof: an exact solution within" in out
-    found = lv.motion.load_reference(lv.load(path), path)
-    assert found.solver.startswith("proof") and found.residual.at_floor
-    plan = bench.Plan(tolerances=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
-    coarse, fine = (r.motion_error for r in bench.run([path], ["pgs"], plan))
-    assert 0.0 < fine < 1e-3 * coarse
-
-    # On the border of two states: a solution is found, but no proof by signs.
-    lv.suite.case("threshold").problem.save(tmp_path / "border.npz")
-    code, out, _ = lavender("reference", "--prove", tmp_path / "border.npz")
-    assert code == 1 and "not proven" in out
-    assert not (tmp_path / "border.npz.reference").exists()
-
-
-def test_what_nothing_solves_fails_and_what_has_nothing_to_do_does_not(lavender, tmp_path):
-    lv.io.save(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), tmp_path / "impossible.npz")
-    for place in (tmp_path / "impossible.npz", "stack(n=4)"):  # a case has no place for a reference
-        assert lavender("reference", place)[0] == 1
-    (tmp_path / "cut.npz").write_bytes(b"PK")
-    assert [lavender("reference", place)[0] for place in (tmp_path / "cut.npz", tmp_path)] == [2, 1]
+def test_a_problem_with_nothing_to_do_is_said_to_have_nothing_to_do(lavender, tmp_path):
     lv.io.save(idle_problem(), tmp_path / "idle.npz")
     code, out, _ = lavender("solve", tmp_path / "idle.npz", "--solver", "pgs")
     assert code == 0 and "nothing to do" in out

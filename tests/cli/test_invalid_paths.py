@@ -34,7 +34,6 @@ from lavender.io.stored import (
     write_atomically,
     write_text,
 )
-from lavender.lab import collection
 from lavender.lab.bench import machine
 from lavender.lab.bench.record import KINDS, Skip, escape_unprintable, make_file_name, to_json
 from lavender.lab.bench.store import Records, Store
@@ -57,7 +56,6 @@ READERS = {
     "load snapshot": (".snap", lambda results, path: lv.Snapshot.load(path)),
     "load state": (".snap", lambda results, path: lv.Simulation("stack").load(path)),
     "read records": (".jsonl", lambda results, path: bench.read_records(path)),
-    "load manifest": (".json", lambda results, path: collection.load_manifest(path)),
 }
 
 
@@ -396,7 +394,6 @@ WRITE_A_FOLDER = {
     "report": ("report", "stack(n=2)", *QUICK, "--out", "OUT"),
     "records shown again": ("report", "records.jsonl", "--out", "OUT"),
     "report with workers": ("report", "--workers", "1", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
-    "problems": ("problems", "@walking", "--out", "OUT"),
     "run": ("run", "stack", "--steps", 1, "--record", "OUT"),
     "export": ("export", "c", "OUT"),
     "web": ("web", "page", "OUT"),
@@ -422,7 +419,7 @@ def test_a_folder_that_another_command_writes_is_refused_before_the_work(lavende
     assert not out.exists()  # It was made for the lock alone.
 
 
-@pytest.mark.parametrize("name", ["report", "run", "export", "web", "problems"])
+@pytest.mark.parametrize("name", ["report", "run", "export", "web"])
 def test_a_folder_that_cannot_be_made_is_named(name, lavender, tmp_path, monkeypatch):
     """Some file systems refuse only when they are asked: /proc is writable to root, and makes nothing."""
     if name == "export":
@@ -448,7 +445,6 @@ COMMANDS = [
     ("solve", "stack(n=2)", "--output", "solution.npz"),
     ("export", "c", "c"),
     ("web", "page", "page"),
-    ("problems", "@hard", "--page", "set.md"),
 ]  # fmt: skip
 
 
@@ -481,7 +477,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         print("OPENED", sorted(opened))"""
     done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
     files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
-    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page", "set.md"}
+    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page"}
     locks = [f"{name}/{FOLDER_LOCK}" for name in ("c", "page", "report", "steps")]
     assert literal_eval(done.stdout.splitlines()[-1].removeprefix("OPENED ")) == sorted(
         [*locks, "report/records.jsonl", "report/records.jsonl.lock"]
@@ -530,7 +526,6 @@ def test_commands_print_paths_as_text(lavender, tmp_path):
     for line in (
         ["bench", "mujoco", path, "--steps", "1"],
         ["record", path, "--steps", "15", "--record-every", "15", "--out", to],
-        ["problems", "@walking", "--out", f"{to}1"],
         ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
         ["solve", "stack(n=2)", "--output", f"{to}.npz"],
     ):

@@ -94,7 +94,6 @@ NOT_CALLED = {
     **dict.fromkeys(
         (
             "CrossCheck",
-            "Enclosure",
             "MotionError",
             "SlipExplanation",
             "SolutionSet",
@@ -104,7 +103,6 @@ NOT_CALLED = {
         "a result: the package makes it",
     ),
     "CrossCheck.__getitem__": "a mapping by the names of solvers",
-    "prove": "needs python-flint: tests/lab/motion/test_proof.py",
 }
 
 

@@ -88,8 +88,6 @@ def test_python_of_a_page_runs(page, files, capsys):
     whole = "".join(text for *_, text in blocks(page, "python", "pycon"))
     if ".hdf5" in whole:
         pytest.importorskip("h5py", reason="the page reads HDF5 files")
-    if "lv.prove(" in whole:
-        pytest.importorskip("flint", reason="the page proves (extra: proof)")
     for engine in ("newton", "genesis"):
         if f"import {engine}\n" in whole or f"import {engine} as" in whole:
             pytest.importorskip(engine, reason=f"the page steps {engine}")
@@ -114,8 +112,6 @@ def test_the_test_of_the_quick_start_passes_as_a_file_of_its_own(tmp_path):
 
 @pytest.mark.parametrize("name", list(modules_with_doctests()))
 def test_doctests_of_a_module(name):
-    if name == "lavender.lab.proof":
-        pytest.importorskip("flint", reason="its example proves (extra: proof)")
     failures, tried = doctest.testmod(importlib.import_module(name), optionflags=FLAGS)
     assert tried > 0
     assert failures == 0

@@ -186,8 +186,6 @@ def test_every_import_is_declared():
     )
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
-    known |= {"pytest"}  # of the plug-in that pytest itself imports
-    known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}

@@ -167,8 +167,6 @@ class CaseInfo(_PrintableEntry):
         Kind of the problem's guess; no run starts from an "answer".
     condition : float or None
         Condition number of A on its range, scaled to a unit diagonal; None if it was not computed.
-    proof : str
-        Distance of a proved exact solution, or the reason why no proof exists; empty if no proof was requested.
     """
 
     run: str
@@ -194,7 +192,6 @@ class CaseInfo(_PrintableEntry):
     diagnostics: tuple[str, ...] = ()
     guess: str = ""
     condition: float | None = None
-    proof: str = ""
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,6 @@ class Difficulty:
         See `CaseInfo.condition`.
     boundary_fraction : float or None
         Fraction of blocks at a boundary in the best answer, of the blocks with a bounded error.
-    proof : str
     same : tuple of str
         Solvers that returned bit-identical answers without an iteration. They took the same shortcut, so their
         times measure the shortcut and not the solvers.
@@ -163,7 +162,6 @@ class Difficulty:
     sweeps: int | None
     condition: float | None
     boundary_fraction: float | None
-    proof: str
     same: tuple[str, ...]
 
 
@@ -288,7 +286,6 @@ def compute_difficulties(records: Records) -> list[Difficulty]:
                 sweeps=min(swept, default=None),
                 condition=info.condition,
                 boundary_fraction=min(judged, key=lambda r: r.relative).boundary_fraction if judged else None,
-                proof=info.proof,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
         )

@@ -30,7 +30,6 @@ REFERENCE_SOLVER = "auto"
 REFERENCE_TOL = 1e-15
 # An impulse is accepted as a reference up to this relative residual, or at its floor.
 REFERENCE_MAX_RESIDUAL = 1e-10
-PROOF = "proof: "  # Prefix of `Reference.solver` for an impulse that `enclose_reference` stored.
 REFERENCE_SUFFIX = ".reference"  # Appended to a problem's file name.
 CONVEX_LAWS = ("linear", "lcp", "cone")
 
@@ -62,11 +61,6 @@ class Reference:
     def is_accepted(self) -> bool:
         """Whether it counts as a solution: its relative residual is at most 1e-10, or at its round-off floor."""
         return self.residual.relative <= REFERENCE_MAX_RESIDUAL or self.residual.at_floor
-
-    @property
-    def is_enclosed(self) -> bool:
-        """Whether it is an exact solution, rounded, that was enclosed with a proof."""
-        return self.solver.startswith(PROOF)
 
     def __str__(self) -> str:
         quality = "" if self.is_accepted else ", no solution"

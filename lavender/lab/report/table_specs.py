@@ -346,7 +346,7 @@ def tabulate_times_to_tolerances(reaches: Sequence[statistics.Reach], tolerances
 
 
 def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Table:
-    """Tabulate the measures of difficulty of each case, and the proved distance of an exact solution if known."""
+    """Tabulate the measures of difficulty of each case."""
     rows: Rows = [
         [
             d.case,
@@ -355,12 +355,12 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
             NONE if d.condition is None else format_residual(d.condition),
             NONE if d.boundary_fraction is None else format_percent(round(1e6 * d.boundary_fraction), 10**6),
             ", ".join(d.same),
-            d.proof,
         ]
         for d in difficulties
     ]
-    heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer", "exact solution"]
-    return Table(heads, rows).without_columns(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
+    heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer"]
+    table = Table(heads, rows)
+    return table if any(row[5] for row in rows) else table.without_columns("same answer")
 
 
 def tabulate_motion_errors(report: Report) -> Table:

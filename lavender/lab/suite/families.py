@@ -9,7 +9,6 @@ solution.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -28,9 +27,7 @@ from lavender.lab.suite.build import (
     place_tower,
 )
 from lavender.lab.suite.case import Draft, Reference, register_family
-from lavender.lab.suite.exact import solve_boxed, solve_linear, solve_rest_impulse
 from lavender.problem import Problem
-from lavender.solving.solve import solve
 
 WITH_FRICTION = {"friction": "coulomb"}
 FRICTION_COEFFICIENT = 0.5
@@ -50,24 +47,6 @@ def check_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0.0:
             raise InputError(f"{name} is {value}; a number above 0 is needed")
-
-
-def make_rest_reference(problem: Problem) -> Callable[[], Reference]:
-    """Return the function that computes the reference of bodies that stay at rest: w = 0."""
-    return lambda: Reference(
-        solve_rest_impulse(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
-    )
-
-
-def make_boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Reference]:
-    """Return the function that computes a boxed LCP's reference: sweeps propose an active set, which is proved."""
-
-    def solve_reference() -> Reference:
-        candidate = solve(problem, "pgs", tol=1e-10, max_iter=50_000).impulse
-        source = "active set from sweeps, solved and proved in 100 bits"
-        return Reference(solve_boxed(problem, candidate), source, compare)
-
-    return solve_reference
 
 
 # -- stacks ---------------------------------------------------------------------------------------
@@ -151,7 +130,7 @@ def pyramid(
     bodies, contacts = _build_cube_pyramid(k, mass_ratio, bottom_ratio)
     problem = _build_box_problem(bodies, contacts, friction, sliding)
     reason = "more contacts than degrees of freedom, loads that spread sideways, heavy on light"
-    return Draft(problem, reason, make_rest_reference(problem) if friction == "none" else None)
+    return Draft(problem, reason)
 
 
 def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
@@ -208,7 +187,7 @@ def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int
     add_horizontal_velocity(bodies, sliding)
     problem = build_contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
     reason = "a large well-conditioned pile: sweeps converge fast, factorisations fill in"
-    return Draft(problem, reason, make_boxed_reference(problem) if friction == "none" else None)
+    return Draft(problem, reason)
 
 
 def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
@@ -301,7 +280,6 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     return Draft(
         problem,
         "bilateral and banded with little tension: easy for every solver that uses the band",
-        _make_linear_reference(problem),
     )
 
 
@@ -319,7 +297,6 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
     return Draft(
         problem,
         "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
-        _make_linear_reference(problem),
     )
 
 
@@ -357,11 +334,6 @@ def compute_ball_joint_jacobian(position: FloatArray, body: np.ndarray, anchor: 
 def multiply_in_index_order(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute a @ b, summed in the order of the index: unlike BLAS, it has the same bits on every processor."""
     return np.asarray(sum(np.multiply.outer(column, row) for column, row in zip(a.T, b, strict=True)))
-
-
-def _make_linear_reference(problem: Problem) -> Callable[[], Reference]:
-    """Return the function that computes the reference of a linear problem."""
-    return lambda: Reference(solve_linear(problem), "factorised in float64, refined in 100 bits")
 
 
 @register_family()
@@ -415,10 +387,10 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
     reason = "eight contacts that fit on a page, one of which must open"
     if friction == "none":
         problem = build_contact_problem(bodies, contacts)
-        return Draft(problem, reason, make_boxed_reference(problem, "impulse"))
+        return Draft(problem, reason)
     bodies.v_free[:, 0] = 0.05 * np.arange(1, n + 1)
     problem = _build_boxed_friction_problem(bodies, contacts)
-    return Draft(problem, reason + ", with friction bounded by fixed loads", make_boxed_reference(problem))
+    return Draft(problem, reason + ", with friction bounded by fixed loads")
 
 
 @register_family()
@@ -446,7 +418,6 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
     return Draft(
         problem,
         "no structure, only a condition number, which separates direct from iterative solvers",
-        _make_linear_reference(problem),
     )
 
 
@@ -475,7 +446,6 @@ def boxed_friction(
     return Draft(
         problem,
         "friction that every QP solver accepts: a boxed LCP with finite bounds",
-        make_boxed_reference(problem),
     )
 
 

@@ -17,7 +17,7 @@ from lavender.lab.suite.build import (
     place_corner_contacts,
 )
 from lavender.lab.suite.case import Draft, Reference, register_family
-from lavender.lab.suite.families import BOX, check_min_sizes, check_positive, make_rest_reference
+from lavender.lab.suite.families import BOX, check_min_sizes, check_positive
 from lavender.lab.suite.hard import EXPECT_EXACT
 from lavender.problem import Problem
 
@@ -185,8 +185,7 @@ def arch(n: int = 9, mu: float = 0.6) -> Draft:
     return Draft(
         problem,
         "held by friction and thrust alone: errors appear as a sag",
-        make_rest_reference(problem),
-        EXPECT_EXACT,
+        expect=EXPECT_EXACT,
     )
 
 
@@ -232,6 +231,4 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     bodies = Bodies(position, 1.0, 0.1)
     a, b, point, normal = zip(*contacts, strict=True)
     problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
-    return Draft(
-        problem, "held by friction only, over several levels", make_rest_reference(problem), EXPECT_EXACT
-    )
+    return Draft(problem, "held by friction only, over several levels", expect=EXPECT_EXACT)

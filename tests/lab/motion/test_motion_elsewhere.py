@@ -119,7 +119,7 @@ def test_threads_that_enter_a_package_by_different_files_all_get_it():
         first = threading.Thread(target=lambda: found.append(lv.motion_error))
         first.start()
         assert inside.wait(600)
-        found.append(lv.prove)
+        found.append(lv.find_solutions)
         first.join()
         assert len(found) == 2"""
     assert python("-W", "error", "-c", code).stderr == ""

@@ -112,7 +112,7 @@ def example(folder):
             "stored": 1e-4,
             "diagnostics": ("duplicate rows: two of <3>",),
         },
-        EVIL: {"source": "chains/one.npz", "guess": "answer", "condition": 41.0, "proof": "within 1e-12"},
+        EVIL: {"source": "chains/one.npz", "guess": "answer", "condition": 41.0},
         "idle": {"nothing_to_do": True},
         **{f"walk[{k}]": {"sequence": "walk", "step": k, "structure": ("chain",)} for k in range(3)},
     }

@@ -67,7 +67,8 @@ def test_painleve_has_three_solutions():
 
 
 @pytest.mark.parametrize(
-    "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box", "slab(n=5)"]
+    "name",
+    ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"],
 )
 def test_structures_stand(name):
     case = suite.case(name)
@@ -77,5 +78,5 @@ def test_structures_stand(name):
     assert np.linalg.norm(case.problem.rows.v_free) >= build.FALL_SPEED
     if case.problem.law == "coulomb":
         weaker = suite.case(name.rstrip(")") + (", " if "(" in name else "(") + "mu=0.01)")
-        with pytest.raises(lv.InputError, match="at rest"):  # friction is what holds them
-            assert weaker.reference is None
+        solution = lv.solve(weaker.problem)  # friction is what holds them
+        assert solution.success and np.abs(weaker.problem.velocity(solution.impulse)).max() > 1e-3

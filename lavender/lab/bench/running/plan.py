@@ -55,9 +55,6 @@ class Plan:
         random with seed 3.
     motion : bool
         Measure the motion error, from a reference that is solved once for each case.
-    prove : bool
-        Compare motions with an exact solution if one is enclosed (`lavender.prove`); implies `motion`. A claim is
-        contradicted if its distance from the solution is larger than its residual allows.
     velocity_tolerances : sequence of float, m/s
         Motion errors to reach; implies `motion`. Each solver is run to the residual that is estimated to reach them,
         with tighter residuals if it does not, up to `MAX_SPEED_TRIES` times per tolerance.
@@ -83,7 +80,6 @@ class Plan:
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
     motion: bool = False
-    prove: bool = False
     velocity_tolerances: Sequence[float] = ()
     times: Sequence[float] = ()
     sweeps: Sequence[int] = ()
@@ -107,7 +103,7 @@ class Plan:
         check_int("repeats", self.repeats, 1)
         check_float("time_limit", self.time_limit, above=0.0)
         check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
-        for name in ("warm", "campaign", "motion", "prove"):
+        for name in ("warm", "campaign", "motion"):
             check_bool(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = str(word).partition(":")
@@ -128,7 +124,7 @@ class Plan:
             object.__setattr__(self, name, tuple(sorted(counts)))
         object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
-        object.__setattr__(self, "motion", self.motion or self.prove or bool(self.velocity_tolerances))
+        object.__setattr__(self, "motion", self.motion or bool(self.velocity_tolerances))
 
     timing_mode = "call"  # Value of `Record.timing_mode` for single problems.
 

@@ -21,7 +21,6 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, reject_former_names, require_packages
-from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import compute_states
 from lavender.lab import motion
 from lavender.lab.bench import machine
@@ -33,9 +32,6 @@ from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.bench.store import Records, Store, open_store
 from lavender.lab.motion import load_reference
-from lavender.lab.motion.bound import compute_separation
-from lavender.lab.motion.reference import as_reference
-from lavender.lab.proof import enclose_reference
 from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -95,22 +91,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
         else motion.measure_distance_to_nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    with_motion = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
-    reference = error.reference
-    if (
-        record.claims
-        and record.status != "INFEASIBLE"
-        and reference.is_enclosed
-        and reference.witness is not None
-    ):
-        apart, allowed = compute_separation(problem, as_reference(problem, impulse), reference)
-        if apart > allowed:
-            words = (
-                f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"
-            )
-            conflict = record.status_conflict or words
-            return replace(with_motion, claim_check=CONTRADICTED, status_conflict=conflict)
-    return with_motion
+    return replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
 
 
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
@@ -385,14 +366,6 @@ class Runner:
                 info = describe_case(item, self.this.run)
             if self.plan.motion:
                 load_reference(item.problem, item.source)
-            if self.plan.prove:
-                enclosure = enclose_reference(item.problem)
-                proof = (
-                    f"within {enclosure.velocity_radius:.1e} m/s"
-                    if enclosure.proven
-                    else f"none: {enclosure.reason}"
-                )
-                info = replace(info, proof=proof)
         except Exception as error:  # A reader may raise any exception; only its own case is lost.
             self.add_entry(
                 Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
