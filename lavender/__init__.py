@@ -16,14 +16,23 @@ Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other
 Submodules and the engine are imported at their first use.
 """
 
-import lavender.base.early_sigint  # noqa: I001 - first: handles Ctrl-C from here on
-
 from typing import TYPE_CHECKING
 
-import lavender.base.check_build
-from lavender.base.lazy_import import import_module_under_lock
-from lavender.base.renamed import build_attribute_error
+import lavender.base.check_build  # noqa: F401 - first: explains why kernels cannot be imported
 from lavender._version import __version__
+from lavender.base.errors import (
+    CapabilityError,
+    InputError,
+    InUse,
+    LavenderError,
+    SolveFailed,
+    SolverUnavailable,
+    UnknownName,
+)
+from lavender.base.lazy_import import import_module_under_lock
+from lavender.judge.residuals import Residual, residual
+from lavender.judge.solution import Claim, History, Solution, SolverStage, Status
+from lavender.problem import Problem, QPSolution
 from lavender.problem.cones import (
     CONTACT,
     CONTACT_BOX,
@@ -34,21 +43,9 @@ from lavender.problem.cones import (
     ROW,
     Cones,
 )
-from lavender.base.errors import (
-    CapabilityError,
-    InputError,
-    InUse,
-    LavenderError,
-    SolveFailed,
-    SolverUnavailable,
-    UnknownName,
-)
 from lavender.problem.generalized import Generalized
-from lavender.problem import Problem, QPSolution
-from lavender.solvers.registry import SolverSpec, available, get, known, register
-from lavender.judge.residuals import Residual, residual
 from lavender.problem.rows import Rows
-from lavender.judge.solution import Claim, History, Solution, Status, SolverStage
+from lavender.solvers.registry import SolverSpec, available, get, known, register
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
@@ -195,7 +192,7 @@ if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they rep
         elif name in _MODULE_OF_NAME:
             value = getattr(import_module_under_lock(_MODULE_OF_NAME[name]), name)
         else:
-            raise build_attribute_error("lavender", "module 'lavender'", name)
+            raise AttributeError(f"module 'lavender' has no attribute {name!r}", name=name)
         globals()[name] = value
         return value
 
@@ -207,4 +204,3 @@ def __dir__() -> list[str]:
 # Import `auto` and the solvers that it runs with the package, because the first solve may have a time limit.
 for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):
     get(_name)
-lavender.base.early_sigint.restore_keyboard_interrupt()

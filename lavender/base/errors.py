@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from functools import wraps
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -21,7 +20,6 @@ __all__ = [
     "UnknownName",
     "check_name",
     "format_error",
-    "reject_former_names",
     "require_packages",
 ]
 
@@ -49,11 +47,9 @@ class UnknownName(LavenderError, KeyError):
         The unknown name.
     known : iterable of str
         Valid names.
-    successor : str
-        Present name if `name` is a former one; the message suggests it.
     """
 
-    def __init__(self, kind: str, name: object, known: Iterable[str], successor: str = "") -> None:
+    def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         import difflib  # Imported here, as it is needed only for error messages.
 
         known = sorted(set(known))
@@ -61,7 +57,7 @@ class UnknownName(LavenderError, KeyError):
         lower_case = str(name).lower()
         matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.5)
         matches = [lower_case] if lower_case in by_lower_case else matches
-        similar = [successor] if successor else [by_lower_case[match] for match in matches]
+        similar = [by_lower_case[match] for match in matches]
         hint = (
             f"did you mean {' or '.join(map(repr, similar))}?"
             if similar
@@ -88,33 +84,6 @@ def check_name(kind: str, name: object, known: Collection[str]) -> str:
 
 
 _Callable = TypeVar("_Callable", bound=Callable[..., Any])
-
-
-def reject_former_names(**successors: str) -> Callable[[_Callable], _Callable]:
-    """Decorate a function or class with renamed keyword arguments: a former name raises `UnknownName`.
-
-    Parameters
-    ----------
-    **successors : present name by former name
-    """
-
-    def decorate(function: Any) -> Any:
-        is_class = isinstance(function, type)
-        inner = function.__init__ if is_class else function
-
-        @wraps(inner)
-        def call(*args: Any, **arguments: Any) -> Any:
-            for name in successors.keys() & arguments.keys():
-                kind = f"argument of {function.__name__}"
-                raise UnknownName(kind, name, (), successor=successors[name])
-            return inner(*args, **arguments)
-
-        if not is_class:
-            return call
-        function.__init__ = call
-        return function
-
-    return decorate
 
 
 def _restore_unknown_name(message: str) -> UnknownName:

@@ -5,11 +5,7 @@ A command imports its modules when it runs, so that --help is fast.
 
 import sys
 
-from lavender.base import early_sigint as _early_sigint
-
-_early_sigint.exit_on_sigint()  # Ctrl-C during imports exits quietly; `main` restores Python's handler.
-
-from lavender.base.errors import InputError, require_packages  # noqa: E402
+from lavender.base.errors import InputError, require_packages
 
 try:
     require_packages("the command line", "click", "rich", "threadpoolctl")
@@ -18,7 +14,7 @@ except InputError as error:
     # The value of EXIT_BAD_INPUT, whose module cannot be imported without click.
     raise SystemExit(2) from None
 
-from lavender.cli.entry import cli, main  # noqa: E402
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET  # noqa: E402
+from lavender.cli.entry import cli, main
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
 
 __all__ = ["EXIT_BAD_INPUT", "EXIT_INFEASIBLE", "EXIT_INTERRUPTED", "EXIT_UNMET", "cli", "main"]

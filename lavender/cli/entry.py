@@ -15,14 +15,12 @@ from typing import Any
 import click
 
 from lavender._version import __version__
-from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
 from lavender.cli.options import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
     discard_output,
     print_escaped,
-    suggest_new_option,
 )
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
@@ -94,7 +92,6 @@ def main(args: Sequence[str] | None = None) -> None:
     SIGTERM, which `timeout` and batch queues send, stops a command as Ctrl-C does and exits with 143; a second SIGTERM
     ends the process at once.
     """
-    _early_sigint.restore_keyboard_interrupt()
     with _record_signals() as received:
         try:
             code = _run_command(args)
@@ -163,8 +160,6 @@ def _run_command(args: Sequence[str] | None) -> int:
         print_escaped(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
     except click.exceptions.ClickException as error:
-        if isinstance(error, click.NoSuchOption):
-            suggest_new_option(error)
         error.show()
         code = error.exit_code
     except (click.exceptions.Abort, KeyboardInterrupt):

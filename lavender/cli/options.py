@@ -37,29 +37,6 @@ Option = tuple[tuple[str, ...], dict[str, Any]]  # Positional (names) and keywor
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
-#: Present name of each option that earlier versions had under another name.
-RENAMED_OPTIONS = {
-    "--accept": "--max-velocity-error",
-    "--ahead": "--horizon",
-    "--campaign": "--workers",
-    "--every": "--record-every",
-    "--fresh": "--no-reuse",
-    "--levels": "--tolerances",
-    "--pass-limit": "--sequence-time-limit",
-    "--rounds": "--repeats",
-    "--speed-levels": "--velocity-tolerances",
-}
-
-
-def suggest_new_option(error: click.NoSuchOption) -> None:
-    """Make the error about a renamed option suggest its present name, if the command has the renamed option."""
-    new_name = RENAMED_OPTIONS.get(error.option_name)
-    command = error.ctx.command if error.ctx is not None else None
-    if command is not None and any(new_name in option.opts for option in command.params):
-        error.message = f"{error.message} Did you mean {new_name!r}?"  # type: ignore[misc]
-        error.possibilities = None  # type: ignore[misc]
-
-
 def _is_number(word: str) -> bool:
     try:
         float(word)

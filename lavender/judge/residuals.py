@@ -49,7 +49,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,7 +63,6 @@ from lavender.base.arrays import (
     mark_read_only,
 )
 from lavender.base.errors import InputError
-from lavender.base.renamed import build_attribute_error
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
@@ -83,7 +82,6 @@ DEFAULT_THRESHOLD = 1e-6
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
 )  # fmt: skip
-VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # Verdicts in files of earlier versions.
 
 
 @dataclass(frozen=True)
@@ -190,11 +188,6 @@ class Residual:
     _float64_relative: float = field(
         default=math.nan, repr=False
     )  # Relative residual before the refinement for an ill-conditioned M.
-
-    if not TYPE_CHECKING:  # Type checkers report unknown names.
-
-        def __getattr__(self, name: str) -> Any:
-            raise build_attribute_error("Residual", repr(type(self).__name__), name)
 
     @property
     def at_floor(self) -> bool:

@@ -13,7 +13,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_choice, format_html_table, mark_read_only
 from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
-from lavender.base.renamed import build_attribute_error
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 
@@ -51,38 +50,6 @@ class Status(str, Enum):
 
     def __str__(self) -> str:
         return self.name
-
-    @classmethod
-    def _missing_(cls, value: object) -> Status | None:
-        """Return the member that an earlier version pickled as `value`."""
-        name = STATUS_OF_EARLIER_VALUE.get(value) if isinstance(value, str) else None
-        return None if name is None else cls[name]
-
-
-#: Names of statuses in files of earlier versions.
-RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
-for _name, _renamed in RENAMED_STATUSES.items():  # Python 3.11.0 to 3.11.3 pickle a member by its name.
-    type.__setattr__(Status, _name, Status[_renamed])
-
-#: Earlier versions pickled a status by its description, which also changed.
-STATUS_OF_EARLIER_VALUE = {
-    **RENAMED_STATUSES,
-    "the solver's own test at tol was met": "CONVERGED",
-    "its own test at tol was met": "CONVERGED",
-    "above tol, but within twice the error of rounding to float64": "ROUNDOFF_LIMIT",
-    "above tol, within twice what rounding to float64 allows": "ROUNDOFF_LIMIT",
-    "the iteration budget was used up": "MAX_ITERATIONS",
-    "the time limit was reached": "TIME_LIMIT",
-    "no further progress": "STALLED",
-    "no progress any more": "STALLED",
-    "the iterate grew, or is not finite": "DIVERGED",
-    "no solution exists; `certificate` proves it, unless `claim_check` says otherwise": "INFEASIBLE",
-    "no solution exists; `certificate` proves it": "INFEASIBLE",
-    "a factorisation or the backend failed": "NUMERICAL_ERROR",
-    "stopped by Ctrl-C or by the callback": "INTERRUPTED",
-    "the data of one world of a batch are not a valid problem": "INVALID_PROBLEM",
-    "of one world of many: its data are no problem's": "INVALID_PROBLEM",
-}
 
 
 # Members as module constants: access through the class costs 600 instructions and is needed a dozen times per solve.
@@ -356,7 +323,9 @@ class Solution:
                 attributes.pop("_rest", None)
             if name in attributes:
                 return attributes[name]
-            raise build_attribute_error("Solution", repr(type(self).__name__), name)
+            raise AttributeError(
+                f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self
+            )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # `work` is a read-only view of a dict, which cannot be pickled: store a dict.
@@ -511,22 +480,3 @@ def raise_if_interrupted(solution: Solution) -> Solution:
 def _rebuild_solution(values: dict[str, Any]) -> Solution:
     """Rebuild a pickled solution."""
     return Solution.from_fields(values | {"work": MappingProxyType(values["work"])})
-
-
-def _rebuild_earlier_solution(values: dict[str, Any]) -> Solution:
-    """Rebuild a solution from a pickle with earlier field names; its residual is computed again."""
-    values = dict(values)
-    status, conflict = values["status"], values.pop("contradicted", "")
-    not_proven = status is Status.INFEASIBLE and values["certificate"] is None
-    values.setdefault("stages", values.pop("turns", ()))
-    values.setdefault("claim_check", CONTRADICTED if conflict else NOT_PROVEN if not_proven else CONFIRMED)
-    values.setdefault("status_conflict", conflict)
-    values.setdefault("velocity_tol", None)
-    problem = values["residual"]._problem
-    values["residual"] = residual(problem, values["impulse"], "float64", tol=values["tol"])
-    return _rebuild_solution(values)
-
-
-# Names in pickles of earlier versions.
-Turn = SolverStage
-_restored = _rebuild_earlier_solution

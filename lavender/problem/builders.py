@@ -20,7 +20,6 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
-from lavender.base.renamed import suggest_argument_name
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.data import Names, check_matrix
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
@@ -61,18 +60,14 @@ class ProblemOptions(NewProblemOptions, total=False):
 
 
 def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()) -> None:
-    """Raise InputError at a keyword that is not in PROBLEM_KEYWORDS; the message suggests a similar one, or lists all.
+    """Raise InputError at a keyword that is not in PROBLEM_KEYWORDS; the message lists all.
 
     `own` names the explicit arguments of `Problem.method`, for the message.
     """
     for name in keywords:
         if name not in PROBLEM_KEYWORDS:
-            valid = (*own, *PROBLEM_KEYWORDS)
-            successor = suggest_argument_name(name, valid)
-            words = (
-                f"use {successor}=" if successor else f"it takes {', '.join(f'{word}=' for word in valid)}"
-            )
-            raise InputError(f"Problem.{method} has no argument {name}=; {words}")
+            valid = ", ".join(f"{word}=" for word in (*own, *PROBLEM_KEYWORDS))
+            raise InputError(f"Problem.{method} has no argument {name}=; it takes {valid}")
 
 
 def check_rhs_length(A: Any, b: FloatArray) -> None:

@@ -41,7 +41,6 @@ from lavender.base.arrays import (
     resolve_index,
 )
 from lavender.base.errors import InputError
-from lavender.base.renamed import build_attribute_error
 from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
@@ -166,7 +165,7 @@ class Cones:
         def __getattr__(self, name: str) -> Any:
             # The arrays of the fields are created when one of them is first read.
             if name not in CONES_FIELDS:
-                raise build_attribute_error("Cones", "'Cones'", name)
+                raise AttributeError(f"'Cones' object has no attribute {name!r}", name=name, obj=self)
             self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
             return self.__dict__[name]
 

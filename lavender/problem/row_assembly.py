@@ -20,7 +20,6 @@ from lavender.base.arrays import (
     get_shape,
 )
 from lavender.base.errors import InputError
-from lavender.base.renamed import ARGUMENT_NOTES, suggest_argument_name
 from lavender.problem.rows import check_and_symmetrise_inertia
 from lavender.problem.vectors import (
     X_AXIS,
@@ -79,11 +78,7 @@ def reject_call(method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[
     valid = dict(list(signature(method).parameters.items())[1:])  # Without `self`.
     for name in kwargs:
         if name not in valid:
-            successor = suggest_argument_name(name, valid)
-            words = (
-                f"use {successor}={ARGUMENT_NOTES.get(name, '')}" if successor else f"it takes {_list(valid)}"
-            )
-            raise InputError(f"{call} has no argument {name}=; {words}") from None
+            raise InputError(f"{call} has no argument {name}=; it takes {_list(valid)}") from None
     positional = [name for name, x in valid.items() if x.kind is Parameter.POSITIONAL_OR_KEYWORD]
     given = len(args) - 1
     if given > len(positional):

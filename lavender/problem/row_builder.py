@@ -6,13 +6,12 @@ The notes of `RowBuilder` have the equations of the rows.
 from __future__ import annotations
 
 from math import hypot, inf
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, check_float, check_int
 from lavender.base.errors import InputError
-from lavender.base.renamed import build_attribute_error
 from lavender.problem.problem import Problem
 from lavender.problem.row_assembly import (
     NORMAL_LENGTH_TOLERANCE,
@@ -107,11 +106,6 @@ class RowBuilder(RowAssembly):
     >>> again.success
     True
     """
-
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
-
-        def __getattr__(self, name: str) -> Any:
-            raise build_attribute_error("RowBuilder", "'RowBuilder'", name)
 
     # -- joints --------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
 from lavender.base.lazy_import import import_lock, import_module_under_lock
-from lavender.base.renamed import SOLVER_HINTS
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -530,7 +529,7 @@ def get(name: str) -> SolverSpec:
     if spec is None and isinstance(name, str):
         spec = _register_by_name(name)
     if spec is None:
-        raise UnknownName("solver", name, specs(), SOLVER_HINTS.get(str(name).lower(), ""))
+        raise UnknownName("solver", name, specs())
     reason = spec.requires and spec.missing()
     if reason:
         raise SolverUnavailable(f"solver {name!r} {reason}")

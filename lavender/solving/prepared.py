@@ -15,7 +15,6 @@ from lavender.base.arrays import ArrayLike, FloatArray, are_equal
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.base.renamed import suggest_argument_name
 from lavender.external.foreign import ForeignSolver
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
@@ -146,7 +145,7 @@ class Prepared:
                     )
                 valid = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
                 kind = f"option of solver {spec.name!r}"
-                raise UnknownName(kind, name, valid, suggest_argument_name(name, valid))
+                raise UnknownName(kind, name, valid)
         self.spec = spec
         self.options = options
         self._original, self.problem = problem, problem if late else problem.disk
@@ -204,8 +203,7 @@ class Prepared:
             An argument does not exist.
         """
         for name in unknown:
-            successor = suggest_argument_name(name, SOLVE_ARGUMENTS)
-            raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS, successor)
+            raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS)
         begun = 0.0 if time_limit is None else perf_counter()
         limit = math.inf if time_limit is None else check_time_limit(time_limit)
         original = self._original if problem is None else problem

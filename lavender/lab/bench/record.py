@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from lavender.judge.residuals import VERDICTS_OF_OLD
-from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_PROVEN, RENAMED_STATUSES
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 
 # Statuses of a run that returned no solution, in addition to the statuses of a solve.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -360,24 +359,6 @@ def make_measurement_key(measurement: Any) -> tuple[Any, ...]:
 
 
 Entry = Run | CaseInfo | Skip | Record
-#: Present name of each field that earlier versions wrote under another name; "plan." marks fields of a run's plan.
-RENAMED_FIELDS = {
-    "floor": "roundoff_floor",
-    "suspicions": "diagnostics",
-    "contradicted": "status_conflict",
-    "way": "timing_mode",
-    "pace": "calibration_time",
-    "own_min": "backend_time_min",
-    "reached": "residual_per_repeat",
-    "motion": "motion_error",
-    "bits": "solution_hash",
-    "degenerate": "boundary_fraction",
-    "turns": "interleave_group",
-    "plan.levels": "tolerances",
-    "plan.speed_levels": "velocity_tolerances",
-    "plan.pass_limit": "sequence_time_limit",
-}
-REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 
 
@@ -400,32 +381,10 @@ def from_json(line: Any) -> Entry:
             f"not an entry of a records file; a JSON object with a kind is needed, one of {', '.join(KINDS)}"
         )
     cls = KINDS[line["kind"]]
-    line = _rename_fields(line)
     try:
-        values = parse_fields(cls, line)
-        word, comma, rest = str(values.get("stored_verdict", "")).partition(",")
-        if word in VERDICTS_OF_OLD:
-            values["stored_verdict"] = VERDICTS_OF_OLD[word] + comma + rest
-        return cls(**values)
+        return cls(**parse_fields(cls, line))
     except (TypeError, ValueError) as error:
         raise ValueError(f"the line is not a valid entry of kind {line['kind']!r}: {error}") from None
-
-
-def _rename_fields(line: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a line of an earlier version with the fields' names of this one."""
-    renamed = {RENAMED_FIELDS.get(name, name): value for name, value in line.items()}
-    status = renamed.get("status")
-    if isinstance(status, str):
-        renamed["status"] = RENAMED_STATUSES.get(status, status)
-    if isinstance(plan := renamed.get("plan"), Mapping):
-        renamed["plan"] = {RENAMED_FIELDS.get(f"plan.{name}", name): value for name, value in plan.items()}
-    conflict = line.get("contradicted")
-    if not conflict or "claim_check" in line:
-        return renamed
-    # Earlier versions called a claim of INFEASIBLE contradicted if no certificate proved it.
-    if renamed.get("status") == "INFEASIBLE":
-        return renamed | {"claim_check": NOT_PROVEN, "status_conflict": ""}
-    return renamed | {"claim_check": CONTRADICTED}
 
 
 def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,6 @@ from lavender.io.stored import (
     write_text,
 )
 from lavender.lab.bench.record import (
-    REMOVED_KINDS,
     CaseInfo,
     Entry,
     Record,
@@ -309,10 +308,7 @@ def read_records(path: str | Path) -> Records:
         if not line.strip():
             continue
         try:
-            content = json.loads(line)
-            if isinstance(content, dict) and content.get("kind") in REMOVED_KINDS:
-                continue
-            entry = from_json(content)
+            entry = from_json(json.loads(line))
         except (ValueError, RecursionError) as error:
             raise InputError(
                 f"{path}, line {number}: {error}. Give a records.jsonl that `lavender report` wrote, or "

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
-from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG
 from lavender.lab.bench.recommendation import Choice
 from lavender.lab.bench.record import escape_unprintable
 from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_penalty_time_of_miss
@@ -81,7 +81,6 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
             rows, time, relative = (float(entry[name]) for name in _NUMERIC_KEYS)
             row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
             verdict = str(entry["verdict"])
-            verdict = VERDICTS_OF_OLD.get(verdict, verdict)
             entries.append((rows, relative, row, verdict, escape_unprintable(str(entry["solver"]))))
             if math.isfinite(time) and time >= 0.0:
                 answers[escape_unprintable(str(entry.get("file", "")))] = time, relative

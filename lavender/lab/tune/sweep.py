@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from lavender.base.arrays import check_float, check_int
-from lavender.base.errors import InputError, check_name, reject_former_names
+from lavender.base.errors import InputError, check_name
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
@@ -41,7 +41,6 @@ EXPECTED_VARIED_SETTINGS = 4
 TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
 
 
-@reject_former_names(ahead="horizon", rounds="repeats")
 def tune(
     model: str | os.PathLike[str],
     *,

@@ -19,7 +19,7 @@ import lavender as lv
 from lavender import bench
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine, store
-from lavender.lab.bench.record import RENAMED_FIELDS, Record, from_json, to_json
+from lavender.lab.bench.record import Record, from_json, to_json
 from lavender.lab.bench.running import timing
 from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
@@ -28,7 +28,6 @@ from lavender.lab.report.terminal import print_report
 from lavender.lab.report.write import write
 
 QUICK = bench.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
-UNWRITTEN = {"contradicted"}  # Its meaning was divided between two fields, see below.
 
 
 def broken(problem, impulse):
@@ -327,63 +326,6 @@ def test_json_and_csv_hold_every_number(tmp_path):
         assert tuple(json.loads(row["times"])) == r.times
         assert row["cpu"] == bench.get_cpu_name()
         assert json.loads(row["versions"])["numpy"] == np.__version__
-
-
-@pytest.mark.parametrize(
-    ("status", "conflict", "check", "kept"),
-    [
-        ("CONVERGED", "", "confirmed", ""),
-        (
-            "CONVERGED",
-            "says CONVERGED, relative residual 1e-2",
-            "contradicted",
-            "says CONVERGED, relative residual 1e-2",
-        ),
-        ("INFEASIBLE", "says INFEASIBLE, no certificate was given", "not proven", ""),
-    ],
-)
-def test_records_of_earlier_versions_keep_their_verdict(status, conflict, check, kept):
-    """They had one field, `contradicted`, for what was contradicted and for what was not proven."""
-    line = to_json(
-        Record(
-            run="r", case="c", sha="s", solver="x", options={}, start="cold", mode="tol", tol=1e-3,
-            max_iter=1, time_limit=1.0, order="given", seed=3, status=status,
-        )
-    )  # fmt: skip
-    del line["claim_check"], line["status_conflict"]
-    found = from_json(line | {"contradicted": conflict})
-    assert (found.claim_check, found.status_conflict) == (check, kept)
-    again = from_json(to_json(found))
-    assert (again.claim_check, again.status_conflict) == (check, kept)
-
-
-def _former_names(content):
-    """Return the content of a line, and of its plan, under the names that earlier versions wrote."""
-    former = {new: old for old, new in RENAMED_FIELDS.items() if not old.startswith("plan.")}
-    of_plan = {new: old[5:] for old, new in RENAMED_FIELDS.items() if old.startswith("plan.")}
-    line = {former.get(name, name): value for name, value in content.items()}
-    if "plan" in line:
-        line["plan"] = {of_plan.get(name, name): value for name, value in line["plan"].items()}
-    return line
-
-
-def test_files_of_earlier_versions_load_with_their_values(tmp_path):
-    path = tmp_path / "records.jsonl"
-    plan = dataclasses.replace(QUICK, velocity_tolerances=(1e-1,))
-    bench.run([stack(2)], ["pgs"], plan, path)
-    content = [json.loads(line) for line in path.read_text().splitlines()]
-    lines = [_former_names(line) for line in content]
-    names = {name for line in lines for name in (*line, *(f"plan.{name}" for name in line.get("plan", ())))}
-    assert names >= RENAMED_FIELDS.keys() - UNWRITTEN
-    assert [to_json(from_json(line)) for line in lines] == content
-
-
-def test_former_names_of_arguments_are_answered_with_the_present_ones():
-    for kind in (bench.Plan, bench.CampaignPlan):
-        with pytest.raises(lv.UnknownName, match=r"unknown argument 'levels' of .*did you mean 'tolerances'"):
-            kind(levels=(1e-3,))
-    with pytest.raises(lv.UnknownName, match=r"unknown argument 'fresh' of run; did you mean 'reuse'"):
-        bench.run([stack(2)], ["pgs"], fresh=True)
 
 
 def test_infinite_and_undefined_numbers_survive_json():

@@ -14,7 +14,6 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
-from lavender.base.errors import reject_former_names
 from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Record
@@ -43,7 +42,6 @@ RecordsByKey = dict[tuple[Any, ...], list[Record]]  # Records by measurement, on
 Cases = Sequence[tuple[Item, CaseInfo]]
 
 
-@reject_former_names(fresh="reuse")
 def time_alternately(
     cases: Iterable[Source],
     call_specs: Sequence[CallSpec],

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
-from lavender.base.errors import InputError, UnknownName, reject_former_names
-from lavender.lab.bench.record import RENAMED_FIELDS, CaseInfo, Record
+from lavender.base.errors import InputError, UnknownName
+from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.timing import CallSpec, Task
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
@@ -24,12 +24,7 @@ UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; th
 # [s] After this time, a campaign kills the process of a third-party solver and records KILLED.
 HANG_LIMIT = 60.0
 
-FORMER_PLAN_FIELDS = {
-    name.removeprefix("plan."): new for name, new in RENAMED_FIELDS.items() if name.startswith("plan.")
-}
 
-
-@reject_former_names(**FORMER_PLAN_FIELDS)
 @dataclass(frozen=True)
 class Plan:
     """Parameters of the runs of each solver on each case.
@@ -200,7 +195,6 @@ class Plan:
                 last = solve_to(tol)
 
 
-@reject_former_names(**FORMER_PLAN_FIELDS)
 @dataclass(frozen=True)
 class CampaignPlan(Plan):
     """Parameters of runs without times, which end after a number of iterations and not by the clock.

@@ -20,7 +20,7 @@ from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray, check_sequence
-from lavender.base.errors import InputError, LavenderError, reject_former_names, require_packages
+from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.judge.states import compute_states
 from lavender.lab import motion
 from lavender.lab.bench import machine
@@ -132,7 +132,6 @@ def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
     return [name for name, spec in sorted(registry.specs().items()) if spec.missing() is None]
 
 
-@reject_former_names(fresh="reuse")
 def run(
     cases: Source | Iterable[Source] = (),
     solvers: str | Sequence[str] | None = None,
