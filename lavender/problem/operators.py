@@ -52,6 +52,27 @@ class Operators(ProblemData):
         object.__setattr__(problem, "__dict__", fields)
         return problem
 
+    def _share_operator(self, other: Operators) -> None:
+        """Give the same problem with another friction law the arrays of this one that do not depend on the law."""
+        known, law = self.__dict__, FRICTION_NUMBER[other.friction]
+        for name in (
+            "csr",
+            "jacobian",
+            "whitened",
+            "bandwidth",
+            "_compressed",
+            "_couplings",
+            "_matrix_asymmetry",
+        ):
+            if name in known:
+                other.__dict__[name] = known[name]
+        if "csr_data" in known:
+            other.__dict__["csr_data"] = known["csr_data"].with_law(law)
+        if "data" in known and self.rows is not None:
+            other.__dict__["data"] = known["data"].with_law(law)
+        if self.derived.view is not None and self.derived.view.ready:
+            other.derived.view = self.derived.view.with_law(law)
+
     def _has_large_entries(self) -> bool:
         """Return whether an entry of J, M^-1 or the compliance exceeds MAX_SAFE_ENTRY: A_ii may be too large."""
         if self.compliance is not None and max_abs_of_array(self.compliance) > MAX_SAFE_ENTRY:

@@ -169,7 +169,9 @@ class Problem(Builders):
         InputError
             `friction` is "coulomb", and the problem has round cones of more than two tangents.
         """
-        return replace(self, friction=friction, copy=False)
+        relaxed = replace(self, friction=friction, copy=False)
+        self._share_operator(relaxed)
+        return relaxed
 
     @property
     def disk(self) -> Problem:

@@ -2,8 +2,12 @@
 
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
-    is
-                     estimated to cost no more than the first sweeps (`small.py`); attempted once
+                     is estimated to cost no more than the first sweeps (`small.py`); attempted once
+    relaxation       under Coulomb's law, above `relaxed_rows` rows: `anderson` on the convex relaxation up to the cost
+                     of Newton's method, unless more sweeps than that are predicted to be needed; then the interior
+                     points of `newton` on it. Each iterate is judged under Coulomb's law, which it meets if no contact
+                     slips. The stage ends early if contacts slip: the residual of the relaxation is below `slip_ratio`
+                     times that of Coulomb's law
     sweeps           `anderson`, unless the problem is linear: `first_sweeps` sweeps. Sweeping continues up to the cost
                      of the cheapest factorising solver, unless more sweeps than that are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
@@ -59,11 +63,13 @@ from lavender.solvers.newton import NewtonState
 from lavender.solvers.recording import Recorder
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
 from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, get_call_time_fraction
-from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.solve_log import SolveLog, get_relaxation
 from lavender.solvers.steps import (
     METHODS,
     Iterations,
     Newton,
+    RelaxedNewton,
+    RelaxedSweeps,
     Step,
     Sweeps,
     estimate_cost,
@@ -72,6 +78,8 @@ from lavender.solvers.steps import (
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
+# Newton's method on the relaxation may use this multiple of its expected number of factorisations.
+RELAXED_BUDGET_RATIO = 2.0
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
@@ -250,6 +258,26 @@ class DecisionTree:
         if p.matrix is not None:
             return False
         return self.min_newton_cost < first and self.newton < first
+
+    @cached_property
+    def starts_relaxed(self) -> bool:
+        """Whether the convex relaxation is solved first: under Coulomb's law, if the problem is large."""
+        p = self.problem
+        large = self.law == "coulomb" and p.m > DECISIONS.relaxed_rows
+        return large and not p.cones.has_round and p.is_symmetric
+
+    def iterate_relaxed_stages(self) -> Iterator[Stage]:
+        """Yield the stages on the convex relaxation, if it is solved first."""
+        if not self.starts_relaxed:
+            return
+        state, sweep = (
+            self.states.get("newton"),
+            estimate_cost("anderson", get_relaxation(self.problem)).iteration,
+        )
+        cost, why = inf if state is None else state.cost, "the solution if no contact slips"
+        yield Stage("anderson on the relaxation", inf, cost, why, cost / sweep)
+        if state is not None:
+            yield Stage("newton on the relaxation", RELAXED_BUDGET_RATIO * state.steps, cost, why)
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
@@ -506,6 +534,7 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
+    solve_relaxation(log, tree)
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         Sweeps("anderson", log).sweep_until_deadline()
@@ -558,6 +587,22 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         certify_infeasibility(log)
 
 
+def solve_relaxation(log: SolveLog, tree: DecisionTree) -> None:
+    """Run the stages on the convex relaxation until one solves the problem or shows that contacts slip."""
+    slips = False
+    for stage in tree.iterate_relaxed_stages():
+        step = create_solver_step(stage.solver, log, tree)
+        if (
+            log.done()
+            or slips
+            or (isinstance(step, RelaxedNewton) and not tree.has_time("newton", stage.cost))
+        ):
+            return
+        step.least = stage.least
+        step.run(stage.iterations)
+        slips, tree.best = step.slips, log.best
+
+
 def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
     """Return whether work of this cost [ns] leaves time for a factorising solver, or whether all of them have ended."""
     if "states" not in vars(tree):
@@ -570,8 +615,13 @@ def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost
 
 def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
-    kinds = {"anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton}
+    kinds = {
+        "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
+        "anderson on the relaxation": RelaxedSweeps, "newton on the relaxation": RelaxedNewton,
+    }  # fmt: skip
     step = kinds.get(name, Iterations)(name, log)
+    if isinstance(step, RelaxedNewton):
+        step.like = tree.states["newton"]
     if isinstance(step, Newton):
         step.state = tree.states[name]
         step.started_from_zero = name == "newton" and tree.started_from_zero

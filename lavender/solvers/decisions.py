@@ -47,6 +47,12 @@ NUMBERS = (
     Number("first_sweeps", 100.0, "sweeps",
            "Sweeps before a factorising solver, unless it costs less; they predict how many remain.",
            REPLAY + "; values from 64 to 128 lose less than 5 %"),
+    Number("relaxed_rows", 1000.0, "rows",
+           "Above this size, the convex relaxation of Coulomb's law is solved first.",
+           "Below, Newton's method on Coulomb's law needs few more factorisations than on the relaxation."),
+    Number("slip_ratio", 0.1, "",
+           "Contacts slip if an interior point's residual of the relaxation is below this multiple of Coulomb's.",
+           "At least 0.4 on piles without slip; pyramids reach 0.1 within 11 factorisations."),
     Number("factorisations", 18.0, "factorisations",
            "Newton's method is expected to need this many with friction or over J and M; 1 for linear problems.",
            REPLAY + "; values from 12 to 25 lose less than 4 %"),
@@ -72,6 +78,8 @@ class Decisions:
     island_rows: float
     call_cost: float
     first_sweeps: float
+    relaxed_rows: float
+    slip_ratio: float
     factorisations: float
     pivot_factorisations: float
     budget_ratio: float

@@ -19,15 +19,31 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
+from lavender_ext.judge.measure import residuals_by_island
 
 if TYPE_CHECKING:
     from lavender.solvers.recording import Recorder
 
-__all__ = ["SolveLog"]
+__all__ = ["SolveLog", "get_relaxation"]
 
 # Sweeps start from the given impulse if its relative residual is at most this, even if the zero impulse has a smaller
 # residual, because the given impulse shows which rows are free.
 MAX_START_RESIDUAL = 1e3
+
+
+# Key in `Derived.cache` of the problem's convex relaxation.
+RELAXATION_KEY = "lavender.solvers.solve_log: relaxation"
+
+
+def get_relaxation(problem: Problem) -> Problem:
+    """Return the convex relaxation over the same arrays and references; it is cached with the problem."""
+    relaxed: Problem | None = problem.derived.cache.get(RELAXATION_KEY)
+    if relaxed is None:
+        relaxed = problem.relaxed("cone")
+        get_zero_impulse_reference(problem)
+        relaxed.metric.share_reference(problem.metric)
+        problem.derived.cache[RELAXATION_KEY] = relaxed
+    return relaxed
 
 
 class SolveLog:
@@ -86,6 +102,22 @@ class SolveLog:
         if self.best > self.tol and not is_known:
             starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
             self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
+
+    def compare_with_relaxation(self, impulse: FloatArray) -> tuple[float, float]:
+        """Return how well an impulse (m,) [N s] solves the convex relaxation in the islands that are not solved.
+
+        Returns
+        -------
+        ratio : float
+            Largest residual of the relaxation divided by that of Coulomb's law; 0 if all islands are solved.
+        relative : float
+            Largest relative residual of the relaxation.
+        """
+        problems = self.problem, get_relaxation(self.problem)
+        exact, relaxed = (residuals_by_island(p.metric, impulse)[1][:, :2] for p in problems)
+        unsolved = exact[:, 0] > self.tol
+        ratio = relaxed[unsolved, 1] / exact[unsolved, 1]
+        return float(ratio.max(initial=0.0)), float(relaxed[unsolved, 0].max(initial=0.0))
 
     def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""

@@ -11,7 +11,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers._accelerated import build_state_in_given_form
 from lavender.solvers.costs import Cost, estimate_formation_cost, get_loose_limit
@@ -19,12 +19,13 @@ from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
 from lavender.solvers.registry import get
-from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.solve_log import SolveLog, get_relaxation
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "estimate_cost", "make_solver"]
 
 NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
+MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 #: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
@@ -33,12 +34,21 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "direct": ("direct", {}),
     "nncg": ("nncg", NNCG_OPTIONS),
     "admm": ("admm", {}),
+    "anderson on the relaxation": ("anderson", {"convex": MAX_CALL_ITERATIONS}),
+    "newton on the relaxation": ("newton", {}),
 }
-MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 # Predictions of remaining sweeps replace a smaller tol by this relative residual.
 MIN_PREDICTED_RESIDUAL = 1e-16
 # [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
 ITERATION_TIME_PER_COST = 4e-9
+# Sweeps over the relaxation before the first prediction of how many remain.
+FIRST_RELAXED_SWEEPS = 32
+# The relaxation counts as solved if its residual is within tol and below this multiple of that of Coulomb's law.
+SOLVED_RATIO = 0.01
+# Interior points on the relaxation need at least this number of factorisations.
+FIRST_RELAXED_FACTORISATIONS = 6
+# Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
+RELAXED_TOLERANCE = 0.01
 # Sweeps use a formed A only if at least this multiple of the cost to form it remains.
 FORMATION_COST_RATIO = 4.0
 
@@ -69,7 +79,7 @@ class Step:
     more than `least` iterations are still needed.
     """
 
-    over = late = False
+    over = late = slips = False
     least = np.inf
     state: Any = None
     impulse: FloatArray  # Present iterate (m,) [N s].
@@ -188,6 +198,7 @@ class Sweeps(Iterations):
     """
 
     time_fraction = DECISIONS.time_share
+    first_sweeps = DECISIONS.first_sweeps
     predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
 
     def advance(self, n: int) -> Claim:
@@ -211,7 +222,7 @@ class Sweeps(Iterations):
 
     def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
-        first = int(DECISIONS.first_sweeps)
+        first = int(self.first_sweeps)
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
         if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
             loop.tol = 0.0
@@ -231,13 +242,63 @@ class Sweeps(Iterations):
                 return claim
             before = self.log.best
             self.store_iterate_in_log()
+            self.slips = self.finds_slip()
+            if self.slips:
+                return replace(claim, status=Status.STALLED)
             now = self.log.best
             gain = log(before / now) if 0.0 < now < before else 0.0
             if now <= tol or gain * self.least < step * log(now / tol):
                 return claim
+
+    def finds_slip(self) -> bool:
+        """Return whether the sweeps solve the relaxation, and its solution slips."""
+        return False
 
     def sweep_until_deadline(self) -> None:
         """Sweep until the remaining time is used up."""
         self.time_fraction, self.least = 1.0, np.inf
         self.run(np.inf)
         self.log.timed_out = self.late
+
+
+class RelaxedSweeps(Sweeps):
+    """Sweeps over the convex relaxation, judged under Coulomb's law. They stop if they show that contacts slip."""
+
+    first_sweeps = FIRST_RELAXED_SWEEPS
+
+    def finds_slip(self) -> bool:
+        """Return whether the relaxation is solved, and its solution does not solve Coulomb's law."""
+        ratio, relative = self.log.compare_with_relaxation(self.impulse)
+        return relative <= self.log.tol and ratio < SOLVED_RATIO
+
+
+class RelaxedNewton(Step):
+    """Interior points on the convex relaxation, judged under Coulomb's law. They stop if contacts slip."""
+
+    like: Any = None  # `NewtonState` of the problem, whose elimination order is reused.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n factorisations, and compare both laws after each from the first possible end on."""
+        log = self.log
+        if self.state is None:
+            self.state = self.solver.update(self.like, get_relaxation(log.problem))
+            self.impulse = log.problem.start()
+        system, trial = self.state.system, self.impulse.copy()
+        claim, done = Claim(Status.MAX_ITERATIONS, 0), 0
+        work: dict[str, int] = {}
+        count = min(n, FIRST_RELAXED_FACTORISATIONS) if system is not None else n
+        while done < n and claim.status is Status.MAX_ITERATIONS:
+            claim = self.solver.advance(
+                self.state, self.impulse, count, RELAXED_TOLERANCE * log.tol, log.time_left, n - done
+            )
+            done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
+            self.store_iterate_in_log()
+            if claim.status is not Status.MAX_ITERATIONS or system is None:
+                break
+            system.solve.write_interior_impulse(trial)
+            log.judge_and_store_best(trial)
+            self.slips = log.compare_with_relaxation(trial)[0] < DECISIONS.slip_ratio
+            if log.best <= log.tol or self.slips:
+                break
+        self.record_iterate(claim)
+        return replace(claim, iterations=done, work=work)

@@ -71,7 +71,7 @@ class Plan:
             limit = "to its end"
             if stage.iterations < 1e9:
                 limit = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
-            lines.append(f"  {stage.solver:<23}{limit:<26}{stage.why}")
+            lines.append(f"  {stage.solver:<27}{limit:<26}{stage.why}")
         if not self.in_turn:
             return "\n".join([*lines, "then a linear program for a certificate that there is no solution"])
         names = ", ".join(self.in_turn)
@@ -128,7 +128,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     get_zero_impulse_reference(problem)
     tree, small = DecisionTree(problem), describe_small_call(problem)
     tree.compiled_call_failed = problem.generalized is not None and bool(small)
-    stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
+    stages = (*tree.iterate_relaxed_stages(), *islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
         sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.iterate_one_round(1.0)),

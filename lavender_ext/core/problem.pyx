@@ -346,6 +346,18 @@ cdef class Data:
         free(self.derived.marks)
         free(self.derived.numbers)
 
+    def with_law(self, int law):
+        """Return data of the same problem under another friction law (a value of `LAWS`), with the same arrays."""
+        cdef Data other = Data.__new__(Data)
+        other.keep = [self]
+        other.blocks, other.csr, other.rows, other.general = self.blocks, self.csr, self.rows, self.general
+        other.blocks.law, other.blocks.islands = law, NULL
+        other.factored, other.is_general = self.factored, self.is_general
+        other.ready, other.single_rows, other.empty = self.ready, self.single_rows, self.empty
+        other._numbers, other._d, other._nu, other._step = self._numbers, self._d, self._nu, self._step
+        other.reference_energy = other.reference_velocity = other.relative_at_zero = -1.0
+        return other
+
     cdef view_t get_pointers(self) noexcept nogil:
         """Return the problem as structs that point into this object, which must live as long as they are used."""
         cdef view_t v = view_t(self.blocks, NULL, NULL, NULL)
@@ -434,7 +446,7 @@ cdef class Data:
         out = np.empty(m)
         if m:
             x = out
-            memcpy(&x[0], self.derived.numbers + at, m * sizeof(double))
+            memcpy(&x[0], self.blocks.d + at, m * sizeof(double))
         return out
 
     @property

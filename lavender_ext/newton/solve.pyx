@@ -408,6 +408,10 @@ cdef class Solve(Method):
         self.python.raise_error()
         return self.how
 
+    def write_interior_impulse(self, double[::1] impulse):
+        """Write the impulse (rows,) [N s] of the last interior point."""
+        write_impulse(self.n, self.n.ip.z, &impulse[0])
+
     @property
     def counts(self):
         """Counts in the order of `COUNTED`."""
