@@ -17,6 +17,8 @@ from lavender.cli.options import (
     is_option_set,
     limit_to_one_thread,
     precision_option,
+    print_escaped,
+    reject_unused_options,
     threshold_option,
 )
 from lavender.io.stored import lock_output
@@ -36,6 +38,11 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
 )
 @click.option("--max-velocity-error", type=float, metavar="M/S",
               help="Exit with 1 if a step above its floor has a larger velocity error [m/s, rad/s].")  # fmt: skip
+@click.option("--keep", type=int, metavar="N",
+              help="Keep the N worst steps; default: the worst step of each of three worlds.")  # fmt: skip
+@click.option("--save-states", type=(click.Choice(["contact", "worst"]), FILE), metavar="contact|worst FILE.npz",
+              help="Write the states before steps with contact (up to 1000), or before the worst steps, for --states "
+              "of tune, slip, record and report.")  # fmt: skip
 @threshold_option
 @precision_option
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
@@ -44,7 +51,14 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
               show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
 @click.pass_context
 def audit(
-    context: click.Context, /, model: Path, out: Path, max_velocity_error: float | None, **options: Any
+    context: click.Context,
+    /,
+    model: Path,
+    out: Path,
+    max_velocity_error: float | None,
+    keep: int | None,
+    save_states: tuple[str, Path] | None,
+    **options: Any,
 ) -> None:
     """Judge every step of many worlds of a MuJoCo model.
 
@@ -62,6 +76,7 @@ def audit(
     """
     from lavender.lab.audit import audit as run
     from lavender.lab.engine_scenes import CLAIM_ENGINES
+    from lavender.lab.report.text import format_count
 
     if max_velocity_error is not None and not max_velocity_error >= 0.0:
         raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
@@ -77,13 +92,20 @@ def audit(
             raise InputError(
                 f"--controls needs a model of MuJoCo; the scene of {options['engine']} sets its own controls"
             )
+        reject_unused_options(context, ["keep", "save_states"], f"with --engine {options['engine']}")
         _audit_claims(context, model, out, max_velocity_error, options)
         return
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with show_progress() as watch:
-        result = run(model, watch=watch, max_velocity_error=max_velocity_error, **options)
+        result = run(
+            model, watch=watch, max_velocity_error=max_velocity_error, keep=keep,
+            keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
+        )  # fmt: skip
     result.write(out)
+    if save_states is not None:
+        n = result.save_states(*save_states)
+        print_escaped(f"{save_states[1]}: {format_count(n, 'state')} for --states")
     show_page(result.summary_page, out)
     if result.n_diverged or result.n_unjudged or result.n_above_limit:
         raise click.exceptions.Exit(EXIT_UNMET)
@@ -95,9 +117,11 @@ def _audit_claims(
     """Compare the claims of an engine with the verdicts, and write the page."""
     from lavender.lab.claims import compare_claims
     from lavender.lab.engine_scenes import step_scene
+    from lavender.lab.simulated_worlds import SPREADS
 
     worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
-    starts = {name: options[name] for name in ("states", "spread", "seed")}
+    starts = {name: options[name] for name in ("states", "seed")}
+    starts["spread"] = SPREADS[0] if options["spread"] is None else options["spread"]
     stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps, **starts)
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()

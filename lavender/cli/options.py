@@ -187,8 +187,9 @@ def add_worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[...
         (("--worlds",), {"default": worlds, "type": int, "help": "Number of worlds; the first is the one of `lavender "
                          "record`." + " Default: as many as take about a minute." * (worlds is None)}),
         (("--steps",), {"default": steps, "help": "Steps of each world."}),
-        (("--spread",), {"default": 0.1, "metavar": "M/S",
-                         "help": "Standard deviation by which the initial velocities of the other worlds differ."}),
+        (("--spread",), {"default": None, "type": float, "metavar": "M/S",
+                         "help": "Standard deviation by which the initial velocities of the other worlds differ. "
+                         "Default: the largest of 0.1, 0.01, 0.001 and 0 with which trial worlds do not diverge."}),
     ]  # fmt: skip
     options += [
         (names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed", "--states")

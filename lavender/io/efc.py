@@ -34,6 +34,7 @@ from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
+from lavender.io.states import can_sleep
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
@@ -55,6 +56,10 @@ CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
 # float32, in which the factors of M are rounded, too.
 MASS_TOLERANCES = {"float64": MASS_TOLERANCE, "float32": 2.0**-14}
+
+
+# MuJoCo restarts a simulation at a larger acceleration (mjMAXVAL) [m/s^2, rad/s^2]; MJX and MuJoCo Warp continue.
+MAX_ACCELERATION = 1e10
 
 
 class Imported(NamedTuple):
@@ -87,6 +92,7 @@ def from_efc(
     contacts: tuple[Any, Any, Any, Any] | None = None,
     efc_force: Any = None,
     qfrc_smooth: Any = None,
+    qacc: Any = None,
     friction: str = "cone",
     like: Any = None,
 ) -> Imported:
@@ -115,6 +121,9 @@ def from_efc(
         The engine's answer.
     qfrc_smooth : (n, nv), optional
         Force without constraints. If given, it must equal M qacc_smooth to the precision of the data.
+    qacc : (n, nv), optional
+        The engine's acceleration. If a number of a world is not finite or above 1e10, the engine's answer is not
+        usable, whatever its forces are: all impulses of this world are NaN.
     friction : {"cone", "coulomb"}, default "cone"
         Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
         Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.
@@ -194,11 +203,17 @@ def from_efc(
         return Imported(batch, None)
     lam = np.where(used_rows, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
     lam = lam if scale is None else lam / scale
+    if qacc is not None:
+        size = np.abs(as_array("qacc", qacc, (n, nv), finite=False))
+        lam[~(size <= MAX_ACCELERATION).all(axis=1)] = np.nan
     return Imported(batch, lam if convert is None else convert(lam))
 
 
 def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str = "raise") -> Imported:
     """Call `mj_forward` on many states of one MuJoCo model; return the problems and MuJoCo's own answers.
+
+    A model with <flag sleep="enable"/> is rejected: a state does not contain which trees sleep, so that MuJoCo would
+    wake all of them with another warm start. Clear the flag in the simulation and here.
 
     Parameters
     ----------
@@ -212,8 +227,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         Number of threads; the results do not depend on it.
     errors : {"raise", "status"}
         Treatment of a state that is not finite: raise an error, or convert it to a world without rows and with a
-        v_free of NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with
-        errors="status".
+        v_free of NaN. A state whose acceleration is not finite raises an error, or has impulses of NaN. `solve_many`
+        and `residual_many` reject such a world by its number, or accept it with errors="status".
 
     Returns
     -------
@@ -224,7 +239,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     Raises
     ------
     InputError
-        `model` is not an MjModel, states have the wrong size, a state is not finite, or MuJoCo raises an error.
+        `model` is not an MjModel or has sleep enabled; states have the wrong size; a state or an acceleration is not
+        finite; or MuJoCo raises an error.
     CapabilityError
         MuJoCo does not store the stiffness of a flex, which the integrator adds to M; see `from_mujoco`.
     """
@@ -232,6 +248,12 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
 
     if not isinstance(model, mj.MjModel):
         raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
+    if can_sleep(mj, model):
+        raise InputError(
+            'the model has <flag sleep="enable"/>, and a state does not contain which trees sleep: this call would '
+            "wake all of them. Clear the flag in the simulation of the states and here: "
+            "model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
+        )
     check_choice("errors", errors, ERRORS)
     values = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = values.shape[1]
@@ -268,6 +290,10 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                 mj.mj_forward(model, data)
             except mj.FatalError as error:
                 raise InputError(f"state {i}: MuJoCo raised an error, {error}") from None
+            if not all_finite(data.qacc):
+                if errors == "raise":
+                    raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
+                data.efc_force[:] = np.nan
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             if is_active(data):
                 try:

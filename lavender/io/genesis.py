@@ -110,6 +110,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         contacts=contacts,
         efc_force=_copy_to_host(constraints.efc_force, m).T,
         qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
+        qacc=_copy_to_host(constraints.qacc).T,
         friction="coulomb" if config.enable_signorini_contact else "cone",
     )
     converged = ~_copy_to_host(constraints.improved).astype(bool)

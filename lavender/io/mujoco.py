@@ -74,6 +74,10 @@ SUM_TOLERANCE = 2.0**-40
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
 # [bytes] Lower bounds of the memory that MuJoCo allocates for a row, a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
+DIVERGED_TEXT = (
+    "qacc holds numbers that are not finite: the simulation has diverged, or the data was changed. Use data of an "
+    "earlier step"
+)
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = (
@@ -431,10 +435,7 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
         0 if all numbers are finite.
     """
     if finite != 0.0:
-        raise InputError(
-            "qacc holds numbers that are not finite: the simulation has diverged, or the data was changed. "
-            "Use data of an earlier step"
-        )
+        raise InputError(DIVERGED_TEXT)
     for difference, names in (
         (velocity, "J qvel and efc_vel"),
         (row, "J qacc_smooth - efc_aref and efc_b"),

@@ -93,6 +93,7 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
         qvel=velocity.astype(jac.dtype),
         qacc_smooth=data.qacc_smooth.numpy(),
         qfrc_smooth=data.qfrc_smooth.numpy(),
+        qacc=data.qacc.numpy(),
         timestep=solver.mjw_model.opt.timestep.numpy(),
         nefc=used,
         contacts=(world, address[:, 0], dim, friction),

@@ -4,12 +4,14 @@
     mujoco.mj_setState(model, data, starts.vectors[0], mujoco.mjtState.mjSTATE_INTEGRATION)
 
 A file holds `state`, with a vector of mjSTATE_INTEGRATION in each row, or arrays with the names of MjData, of which
-qpos and qvel are required. Only the vector contains everything that a step depends on: warm start, controls, mocap
-bodies, applied forces, the state of plug-ins. Quantities without an array have the values of a new MjData.
+qpos and qvel are required. Only the vector contains all that a step depends on (warm start, controls, mocap bodies,
+applied forces, the state of plug-ins), except which trees sleep: MuJoCo wakes all trees when a state is set. Quantities
+without an array have the values of a new MjData.
 """
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import closing
@@ -61,6 +63,24 @@ class StartStates:
         chosen = np.arange(count) * len(self) // count
         controls = None if self.controls is None else self.controls[chosen]
         return replace(self, vectors=self.vectors[chosen], controls=controls)
+
+
+def can_sleep(mj: Any, model: Any) -> bool:
+    """Return whether the model has <flag sleep="enable"/>."""
+    flag = getattr(mj.mjtEnableBit, "mjENBL_SLEEP", 0)
+    return bool(model.opt.enableflags & int(flag))
+
+
+def without_sleep(mj: Any, model: Any) -> Any:
+    """Return a copy of the model with <flag sleep="disable"/>, or the model itself if it has this flag.
+
+    A state does not contain which trees sleep. A simulation whose steps are repeated from states must not use sleep.
+    """
+    if not can_sleep(mj, model):
+        return model
+    awake = copy.copy(model)
+    awake.opt.enableflags &= ~int(mj.mjtEnableBit.mjENBL_SLEEP)
+    return awake
 
 
 def read_states(mj: Any, model: Any, source: Any) -> StartStates:

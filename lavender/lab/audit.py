@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float
+from lavender.base.arrays import FloatArray, check_choice, check_float, check_int
 from lavender.base.errors import InputError, check_name
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
@@ -49,6 +49,7 @@ from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_count, format_percent, format_size
 from lavender.lab.simulated_worlds import (
     ENGINES,
+    N_TRIAL_WORLDS,
     Divergence,
     Runs,
     StepSizes,
@@ -73,6 +74,9 @@ DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about
 MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated only after results have arrived for this long.
 # If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
 MAX_DEFAULT_WORLDS = 4096
+N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
+SAVED_KINDS = ("worst", "contact")
+MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
@@ -93,6 +97,7 @@ DIVERGED_NOTE = (
 AUDIT_BUSY_CONSEQUENCE = (
     "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
+ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
 OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
 DIVERGENCE_ADVICE = (
     'To find out whether the solver is the cause, audit again with <option solver="Newton" iterations="100" '
@@ -129,6 +134,40 @@ class Worst:
     state: dict[str, FloatArray] = field(repr=False)
 
 
+class StepState(NamedTuple):
+    """The state before a step.
+
+    Parameters
+    ----------
+    world, step : int
+    state : dict
+        By the names of MjData.
+    """
+
+    world: int
+    step: int
+    state: dict[str, FloatArray]
+
+
+class Judging(NamedTuple):
+    """How steps are judged and which are kept.
+
+    Parameters
+    ----------
+    precision : {"float64", "float32"}
+    threshold : float, m/s
+    keep : int or None
+        Number of worst steps to keep; None: the worst step of each of `N_WORST_WORLDS` worlds.
+    contact_share : float
+        Up to this fraction of the steps have contact and their state before the step kept.
+    """
+
+    precision: str
+    threshold: float
+    keep: int | None = None
+    contact_share: float = 0.0
+
+
 class Piece(NamedTuple):
     """Results of k judged steps.
 
@@ -147,6 +186,7 @@ class Piece(NamedTuple):
     divergences : sequence of Divergence
     engine_warnings : dict
         MuJoCo's own warnings, and how often each occurred.
+    contact_states : sequence of StepState
     """
 
     world: Any
@@ -159,6 +199,7 @@ class Piece(NamedTuple):
     worst: list[Worst]
     divergences: Sequence[Divergence] = ()
     engine_warnings: Mapping[str, int] = MappingProxyType({})
+    contact_states: Sequence[StepState] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +231,12 @@ class Audit:
         The summary counts the steps with a larger velocity error that rounding does not explain.
     engine_warnings : Counter
         MuJoCo's own warnings, and how often each occurred.
+    notes : str
+        Sentences about what differs from a simulation of the model as it is: no sleep, a smaller spread.
+    n_quiet : (int, int)
+        Number of worlds that diverged and were simulated again without noise, and how many of these then survived.
+    contact_states : list of StepState
+        States before steps with contact, if the audit keeps them; in the order of worlds and steps.
     """
 
     runs: Runs
@@ -206,6 +253,9 @@ class Audit:
     busy: str = ""
     error_limit: float | None = None
     engine_warnings: Counter[str] = field(default_factory=Counter)
+    notes: str = ""
+    n_quiet: tuple[int, int] = (0, 0)
+    contact_states: list[StepState] = field(default_factory=list)
 
     @property
     def is_judged(self) -> Any:
@@ -285,7 +335,7 @@ class Audit:
         return (
             f"The start states have no {' and no '.join(missing)}: "
             f"{' and '.join(consequences[name] for name in missing)}. The first step therefore has "
-            "other errors than in the original simulation. Only the array `state` (mjSTATE_INTEGRATION) contains all."
+            "other errors than in the original simulation. Only the array `state` (mjSTATE_INTEGRATION) contains both."
         )
 
     @property
@@ -341,13 +391,38 @@ class Audit:
             return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
         first = min(d.step for d in self.divergences)
         text = f"{format_count(self.n_diverged, 'world')} diverged, in step {first} at the earliest"
-        text += f"; {unjudged} {were} not judged." if lost.any() else "."
+        if lost.any():
+            text += f"; {unjudged} {were} not judged, because numbers are not finite or above 1e10"
+        noisy = [d.world for d in self.divergences if d.world >= self.runs.n_exact_worlds]
+        if noisy and self.runs.spread and len(noisy) == self.n_diverged:
+            return f"{text}. {self._describe_noise(noisy)}"
+        text += "."
         exact = sum(map(self.has_exact_solves, self.divergences))
         if exact == self.n_diverged:
             return f"{text} Every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
         if exact:
             text += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
-        return f"{text} {DIVERGENCE_ADVICE}"
+        return f"{text} {DIVERGENCE_ADVICE if self.engine == 'mujoco' else ENGINE_ADVICE}"
+
+    def _describe_noise(self, worlds: list[int]) -> str:
+        """Return sentences about worlds that diverged, all of which started with random velocities."""
+        exact, (checked, quiet) = self.runs.n_exact_worlds, self.n_quiet
+        names = "World 0, which starts" if exact == 1 else f"The first {exact} worlds, which start"
+        text = (
+            f"{names} without random velocities, did not diverge; the others start with {self.runs.spread:g} m/s or "
+            f"rad/s (--spread), and {_join_numbers(worlds)} diverged."
+        )
+        remedy = "Audit again with --spread 0, or from states of your own (--states)."
+        if checked and quiet == checked:
+            again = "It was" if len(worlds) == 1 else f"{checked} of these {len(worlds)} were"
+            return (
+                f"{text} {again} simulated again with the same controls and without random velocities, and did not "
+                f"diverge: the random velocities are the cause, not the model or its solver. {remedy}"
+            )
+        if checked:
+            cause = f"{text} Without random velocities {checked - quiet} of {checked} of them diverge, too."
+            return f"{cause} {DIVERGENCE_ADVICE}"
+        return f"{text} {remedy}"
 
     @property
     def table_of_errors(self) -> Table:
@@ -438,15 +513,29 @@ class Audit:
         with lock_step_folder(folder / "worst", replace=True) as worst:
             for i, w in enumerate(self.worst, 1):
                 npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
-        names = self.worst[0].state if self.worst else ()
-        states = {name: np.array([w.state[name] for w in self.worst]) for name in names}
-        indices = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
+        self.save_states("worst", folder / "states.npz")
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
-        write_arrays(folder / "states.npz", states | indices)
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
         records |= {"rows": self.rows, "contacts": self.contacts}
         records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
         write_arrays(folder / "records.npz", records)
+
+    def save_states(self, kind: str, path: str | os.PathLike[str]) -> int:
+        """Write states before steps to a file that `--states` reads, and return their number.
+
+        Parameters
+        ----------
+        kind : {"worst", "contact"}
+            Steps with the largest errors (`worst`), or with contact (`contact_states`).
+        path : path of an .npz
+        """
+        check_choice("kind", kind, SAVED_KINDS)
+        kept: Sequence[Worst | StepState] = self.worst if kind == "worst" else self.contact_states
+        names = kept[0].state if kept else ()
+        arrays = {name: np.array([entry.state[name] for entry in kept]) for name in names}
+        labels = {name: np.array([getattr(entry, name) for entry in kept], int) for name in ("world", "step")}
+        write_arrays(Path(path), arrays | labels)
+        return len(kept)
 
     @property
     def totals(self) -> dict[str, Any]:
@@ -461,6 +550,7 @@ class Audit:
             "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
             "divergences": divergences, **self.judged_sizes.as_dict,
             "engine_warnings": dict(self.engine_warnings), "busy": self.busy, "start_warning": self.start_warning,
+            "spread": runs.spread, "notes": self.notes,
             "stopped": self.stopped,
         }  # fmt: skip
 
@@ -481,7 +571,7 @@ class Audit:
             ],
             self.totals,
             stopped=self.stopped,
-            warning=" ".join(filter(None, (self.start_warning, self.busy))),
+            warning=" ".join(filter(None, (self.start_warning, self.notes, self.busy))),
         )  # fmt: skip
 
 
@@ -493,8 +583,10 @@ def audit(
     engine: str = "mujoco",
     control: Control = "random",
     seed: int = 0,
-    spread: float = 0.1,
+    spread: float | None = None,
     states: Any = None,
+    keep: int | None = None,
+    keep_contact_states: bool = False,
     precision: str | None = None,
     threshold: float = DEFAULT_THRESHOLD,
     max_velocity_error: float | None = None,
@@ -510,10 +602,14 @@ def audit(
     worlds : int, optional
         Default: as many as take about a minute (`DEFAULT_DURATION`), at most 4096.
     steps, control, seed, spread
-        See `Runs`.
+        See `Runs`. Default spread: the largest of 0.1, 0.01, 0.001 and 0 m/s with which trial worlds do not diverge.
     engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
         States in which the worlds start: see `lavender.io.states`. Default: the model's own.
+    keep : int, optional
+        Number of worst steps that are kept as problems and states. Default: the worst step of each of three worlds.
+    keep_contact_states : bool
+        Keep the states before up to 1000 evenly spaced steps with contact (`Audit.save_states`).
     precision : {"float64", "float32"}, optional
         Precision in which MuJoCo computes; default float64. The other engines determine it themselves.
     threshold : float, m/s
@@ -537,7 +633,7 @@ def audit(
     InputError
         The model cannot be read, the engine is not installed, or a number is out of range.
     CapabilityError
-        The integrator's constraint problem uses a matrix other than M.
+        MuJoCo does not store the matrix of the integrator "discrete"; see `lavender.io.from_mujoco`.
     UnknownName
         The engine is unknown.
     """
@@ -550,19 +646,22 @@ def audit(
     check_workers(workers)
     if max_velocity_error is not None:
         max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
-    judging = precision or "float64", check_float("threshold", threshold, low=0.0)
+    judging = Judging(
+        precision or "float64",
+        check_float("threshold", threshold, low=0.0),
+        None if keep is None else check_int("keep", keep, 1),
+    )
     expected_time = None
     if worlds is None:
         if watch is not None:
             watch(Event(0, 0, "timing one world", ""))
         expected_time = DEFAULT_DURATION
-        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed, spread=spread).with_start_states(
-            states
-        )
+        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed).with_start_states(states)
         worlds = choose_world_count(one, judging, count_processes(workers) if engine == "mujoco" else 1)
-    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).with_start_states(
-        states
-    )
+    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed).with_start_states(states)
+    runs, spread_note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+    if keep_contact_states:
+        judging = judging._replace(contact_share=min(1.0, MAX_CONTACT_STATES / (worlds * steps)))
     numbers, verdict = (
         np.full((len(WORST_ROW_ERRORS), worlds, steps), np.nan),
         np.full((worlds, steps), -1, np.int8),
@@ -572,13 +671,14 @@ def audit(
         runs, engine, numbers, verdict, rows=rows, contacts=contacts,
         can_touch=can_any_geoms_collide(*runs.load_model()), where={},
         worst=[], divergences=[], error_limit=max_velocity_error,
+        notes=" ".join(filter(None, (runs.sleep_note, spread_note))),
     )  # fmt: skip
     loads, processes = [], 1
     if engine == "mujoco":
         pieces = _audit_mujoco(runs, judging, workers, backend)
         processes += count_processes(workers)  # This process waits for the workers.
     else:
-        pieces = _audit_jointly_stepped_worlds(engine, runs, judging[1])
+        pieces = _audit_jointly_stepped_worlds(engine, runs, judging)
     if watch is not None:
         text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
         watch(Event(0, worlds * steps, text, "", remaining=expected_time))
@@ -593,7 +693,8 @@ def audit(
             for i, name in piece.where:
                 count, largest = result.where.get(name, (0, 0.0))
                 result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
-            result.worst[:] = _select_worst([*result.worst, *piece.worst])
+            result.worst[:] = _select_worst([*result.worst, *piece.worst], judging.keep)
+            result.contact_states.extend(piece.contact_states)
             result.engine_warnings.update(piece.engine_warnings)
             result.divergences[:] = sorted([*result.divergences, *piece.divergences])
             loads.append(machine.count_runnable_processes())
@@ -616,7 +717,29 @@ def audit(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
         )
     busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
-    return replace(result, stopped=result.n_processed < worlds * steps, busy=busy)
+    result.contact_states.sort(key=lambda entry: entry[:2])
+    n_quiet = _repeat_without_noise(runs, result.divergences) if engine == "mujoco" else (0, 0)
+    return replace(result, stopped=result.n_processed < worlds * steps, busy=busy, n_quiet=n_quiet)
+
+
+def _repeat_without_noise(runs: Runs, divergences: list[Divergence]) -> tuple[int, int]:
+    """Simulate the first worlds that diverged again, without their random velocities and with the same controls.
+
+    Returns the number of worlds and how many of them did not diverge.
+    """
+    worlds = [d.world for d in divergences if d.world >= runs.n_exact_worlds][:N_TRIAL_WORLDS]
+    mj, model = runs.load_model()
+    with count_engine_warnings(mj):
+        repeated = [simulate_world(mj, model, replace(runs, spread=0.0), world)[1] for world in worlds]
+    return len(worlds), repeated.count(None)
+
+
+def _join_numbers(numbers: list[int]) -> str:
+    """Return "world 3", "worlds 3 and 5", or "worlds 1, 2, 3 and 40 more"."""
+    shown = [str(number) for number in sorted(numbers)[:N_SHOWN_WORLDS]]
+    more = len(numbers) - len(shown)
+    last = f"{more} more" if more else shown.pop()
+    return f"world{'s' * (len(numbers) > 1)} {' and '.join(filter(None, (', '.join(shown), last)))}"
 
 
 def count_processes(workers: int) -> int:
@@ -624,7 +747,7 @@ def count_processes(workers: int) -> int:
     return workers if workers > 0 else max(1, (os.cpu_count() or 1) + 1 + workers)
 
 
-def choose_world_count(runs: Runs, judging: tuple[str, float], processes: int) -> int:
+def choose_world_count(runs: Runs, judging: Judging, processes: int) -> int:
     """Return the number of worlds that take about `DEFAULT_DURATION` in `processes` processes.
 
     `runs` describes one world. It is simulated and judged twice with MuJoCo, and the second run is timed, because the
@@ -638,15 +761,18 @@ def choose_world_count(runs: Runs, judging: tuple[str, float], processes: int) -
     return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / duration)))
 
 
-def _select_worst(candidates: list[Worst]) -> list[Worst]:
-    """Select the worst steps, at most one of each world."""
+def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:
+    """Select the `keep` worst steps, or the worst step of each of `N_WORST_WORLDS` worlds."""
+    ranked = sorted(candidates, key=lambda w: (-w.velocity, w.world, w.step))
+    if keep is not None:
+        return ranked[:keep]
     worst: dict[int, Worst] = {}
-    for w in sorted(candidates, key=lambda w: (-w.velocity, w.world, w.step)):
+    for w in ranked:
         worst.setdefault(w.world, w)
     return list(worst.values())[:N_WORST_WORLDS]
 
 
-def _audit_mujoco(runs: Runs, judging: tuple[str, float], workers: int, backend: str) -> Iterator[Piece]:
+def _audit_mujoco(runs: Runs, judging: Judging, workers: int, backend: str) -> Iterator[Piece]:
     """Simulate and judge MuJoCo's steps in worker processes."""
     _reject_unsupported_model(runs)
     share = -(-runs.worlds // (MIN_TASKS_PER_WORKER * count_processes(workers)))
@@ -667,7 +793,7 @@ def _reject_unsupported_model(runs: Runs) -> None:
     from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
 
 
-def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
+def audit_worlds(runs: Runs, judging: Judging, worlds: range) -> list[Piece]:
     """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
     mj, model = runs.load_model()
     with count_engine_warnings(mj) as engine_warnings:
@@ -675,7 +801,7 @@ def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[
     return [*pieces[:-1], pieces[-1]._replace(engine_warnings=engine_warnings)]
 
 
-def _audit_worlds(mj: Any, model: Any, runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
+def _audit_worlds(mj: Any, model: Any, runs: Runs, judging: Judging, worlds: range) -> list[Piece]:
     """Simulate and judge MuJoCo's steps of some worlds."""
     simulations = [simulate_world(mj, model, runs, world) for world in worlds]
     states = np.concatenate([states for states, _ in simulations])
@@ -697,7 +823,7 @@ def _audit_worlds(mj: Any, model: Any, runs: Runs, judging: tuple[str, float], w
     return [*out[:-1], out[-1]._replace(divergences=divergences)]
 
 
-def _audit_jointly_stepped_worlds(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
+def _audit_jointly_stepped_worlds(engine: str, runs: Runs, judging: Judging) -> Iterator[Piece]:
     """Judge the steps of an engine that steps all worlds at once."""
     world, diverged = np.arange(runs.worlds), np.zeros(runs.worlds, bool)
     for step, frame in enumerate(iterate_frames(engine, runs)):
@@ -705,13 +831,15 @@ def _audit_jointly_stepped_worlds(engine: str, runs: Runs, threshold: float) -> 
         def state_of(k: int, frame: Any = frame) -> dict[str, FloatArray]:
             return {name: x[k] for name, x in frame.state.items()}
 
-        judging, sizes = (frame.batch.precision, threshold), (frame.rows, frame.contacts)
-        at = np.full(runs.worlds, step)
+        judging = judging._replace(precision=frame.batch.precision)
+        sizes, at = (frame.rows, frame.contacts), np.full(runs.worlds, step)
         piece = _judge_steps(frame.batch, frame.impulse, judging, world, at, state_of, sizes)
         lost = (piece.verdict == NOT_JUDGED) & ~diverged
         finite = [all(np.isfinite(x[k]).all() for x in frame.state.values()) for k in world]
         divergences = [
-            Divergence(k, step, "answer" if finite[k] else "state before the step", not finite[k])
+            Divergence(
+                k, step, "forces or acceleration" if finite[k] else "state before the step", not finite[k]
+            )
             for k in np.flatnonzero(lost).tolist()
         ]
         diverged |= lost
@@ -721,7 +849,7 @@ def _audit_jointly_stepped_worlds(engine: str, runs: Runs, threshold: float) -> 
 def _judge_steps(
     batch: Batch,
     impulse: FloatArray,
-    judging: tuple[str, float],
+    judging: Judging,
     world: Any,
     step: Any,
     state_of: Callable[[int], Any],
@@ -729,10 +857,12 @@ def _judge_steps(
 ) -> Piece:
     """Judge the answers `impulse` [N s] to the problems of `batch`, one for each step.
 
-    `judging` is (precision, threshold [m/s]); `world` and `step` are the numbers of the steps, `state_of(i)` returns
-    the state before step i, and `sizes` holds the numbers of rows and of contacts.
+    `world` and `step` are the numbers of the steps, `state_of(i)` returns the state before step i, and `sizes` holds
+    the numbers of rows and of contacts.
     """
-    residuals = residual_many(batch, impulse, precision=judging[0], threshold=judging[1], errors="status")
+    residuals = residual_many(
+        batch, impulse, precision=judging.precision, threshold=judging.threshold, errors="status"
+    )
     numbers = np.array(
         [residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor]
     )
@@ -748,14 +878,19 @@ def _judge_steps(
     )
     names = {int(i): residuals[int(i)].worst_name for i in unconverged}
     order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
-    _, first = np.unique(world[order], return_index=True)
+    if judging.keep is None:
+        order = order[np.sort(np.unique(world[order], return_index=True)[1])]
     flat, worst = impulse.reshape(-1), []
-    for i in order[np.sort(first)][:N_WORST_WORLDS].tolist():
+    for i in order[: N_WORST_WORLDS if judging.keep is None else judging.keep].tolist():
         impulse_of_step = flat[batch.rows_of(i)].copy()
         world_and_step = int(world[i]), int(step[i])
         fields = {"where": names[i], "problem": batch[i], "impulse": impulse_of_step, "state": state_of(i)}
         worst.append(Worst(float(numbers[0, i]), *world_and_step, **fields))
     where = [(i, CONTACT_NUMBER.sub("contact ", name)) for i, name in names.items()]
+    with_contact = np.flatnonzero(contacts > 0)
+    n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
+    chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
     return Piece(
-        world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, where=where, worst=worst
-    )
+        world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, where=where, worst=worst,
+        contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
+    )  # fmt: skip

@@ -29,7 +29,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
 from lavender.io.recording import Control, load_controls, load_model, make_controller
-from lavender.io.states import StartStates, read_states
+from lavender.io.states import StartStates, can_sleep, read_states, without_sleep
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import format_count, format_percent
 
@@ -43,6 +43,7 @@ START_FIELDS = (
     "mocap_pos",
     "mocap_quat",
 )
+ACCELERATION_FIELDS = ("qacc_smooth", "qfrc_smooth", "qacc")  # Arrays of each step for `from_efc`.
 STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
 # mjtConstraint -> name of a block that is not a contact.
 BLOCK_KINDS = {
@@ -60,8 +61,16 @@ MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp a
 MIN_CONTACT_SHARE = 0.2
 
 
+SLEEP_NOTE = (
+    'Sleep was off in all worlds, although the model has <flag sleep="enable"/>: a state does not contain which trees '
+    "sleep, so that a repeated step would wake them."
+)
 # Matches the numbers in a warning of MuJoCo, such as a degree of freedom. Warnings are counted without them.
 WARNING_NUMBER = re.compile(r"\d+")
+
+
+SPREADS = (0.1, 0.01, 0.001, 0.0)  # [m/s, rad/s] Default: the largest one with which no trial world diverges.
+N_TRIAL_WORLDS = 3
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,7 @@ class Runs:
     steps: int
     control: Control = "random"
     seed: int = 0
-    spread: float = 0.1
+    spread: float = SPREADS[0]
     starts: StartStates | None = None
 
     def __post_init__(self) -> None:
@@ -96,10 +105,21 @@ class Runs:
         check_float("spread", self.spread, low=0.0)
 
     def load_model(self) -> tuple[Any, Any]:
-        """Load MuJoCo and the model; raise InputError if the model cannot be read or the controls do not fit it."""
+        """Load MuJoCo and the model, without sleep.
+
+        Raises
+        ------
+        InputError
+            The model cannot be read, or the controls do not fit it.
+        """
         mj, model = load_model(self.model)
         make_controller(model, self.control, self.seed)
-        return mj, model
+        return mj, without_sleep(mj, model)
+
+    @property
+    def sleep_note(self) -> str:
+        """Sentence about a model whose sleep is not simulated; else empty."""
+        return SLEEP_NOTE if can_sleep(*load_model(self.model)) else ""
 
     def with_start_states(self, states: Any) -> Runs:
         """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
@@ -107,14 +127,40 @@ class Runs:
             return self
         return replace(self, starts=read_states(*self.load_model(), states).select_evenly(self.worlds))
 
+    @property
+    def n_exact_worlds(self) -> int:
+        """Number of worlds that start without noise."""
+        return min(self.worlds, 1 if self.starts is None else len(self.starts))
+
+    def choose_spread(self) -> tuple[Runs, str]:
+        """Return these runs with the largest of `SPREADS` that the first worlds with noise survive in MuJoCo.
+
+        The second result is a sentence about a choice that is not the largest; else it is empty. If these worlds
+        diverge without noise, too, the largest is chosen.
+        """
+        mj, model = self.load_model()
+        trial = range(self.n_exact_worlds, min(self.worlds, self.n_exact_worlds + N_TRIAL_WORLDS))
+        with count_engine_warnings(mj):
+            for spread in SPREADS:
+                runs = replace(self, spread=spread)
+                if all(simulate_world(mj, model, runs, world)[1] is None for world in trial):
+                    break
+            else:
+                return replace(self, spread=SPREADS[0]), ""
+        if spread == SPREADS[0]:
+            return runs, ""
+        return runs, (
+            f"The start velocities of the worlds differ by {spread:g} m/s (rad/s) only, because worlds diverged with "
+            f"{SPREADS[SPREADS.index(spread) - 1]:g} m/s and not with {spread:g} m/s (--spread)."
+        )
+
     def create_start_data(self, mj: Any, model: Any, world: int) -> Any:
         """Create the MjData with which a world starts."""
-        data, exact = mj.MjData(model), 1
+        data = mj.MjData(model)
         if self.starts is not None:
-            exact = len(self.starts)
-            state = self.starts.vectors[world % exact]
+            state = self.starts.vectors[world % len(self.starts)]
             mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-        if world >= exact:
+        if world >= self.n_exact_worlds:
             data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(model.nv)
         return data
 
@@ -437,7 +483,7 @@ def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
             _concatenate_worlds(c.geom, n, size, 2),
         )  # fmt: skip
         state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
-        extra = {"qacc_smooth": np.asarray(now.qacc_smooth), "qfrc_smooth": np.asarray(now.qfrc_smooth)}
+        extra = {name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS}
         return state, efc, np.asarray(e.M), contact, extra
 
     return step
@@ -523,7 +569,7 @@ class WarpWorlds:
         k = int(data.nacon.numpy()[0])
         parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
         world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
-        extra = self.read_state(("qacc_smooth", "qfrc_smooth", "nefc"))
+        extra = self.read_state((*ACCELERATION_FIELDS, "nefc"))
         step_data = state, efc, data.M.numpy().copy(), (world_of, address[:, 0], dim, friction, geom)
         self.mjw.step(self.device_model, data)
         return *step_data, extra

@@ -364,7 +364,7 @@ def explain_slip_of_states(
     contacts : names or a part of names, optional
         Geoms of the contacts to explain; default: all.
     steps : int, default 1
-        Steps that are simulated from each state, with its controls; the last one is explained.
+        Steps that are simulated from each state, with its controls and without sleep; the last one is explained.
 
     Returns
     -------
@@ -372,9 +372,10 @@ def explain_slip_of_states(
         One for each state that has a contact with friction.
     """
     from lavender.io import mujoco as adapter
-    from lavender.io.states import read_states
+    from lavender.io.states import read_states, without_sleep
 
     mj = adapter.import_mujoco()
+    model = without_sleep(mj, model)
     data = mj.MjData(model)
     vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
     round_model = None

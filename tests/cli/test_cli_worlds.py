@@ -129,3 +129,21 @@ def test_recordings_start_from_states(lavender, tmp_path, boxes):
     (how,) = (tmp_path / "page" / "recorded").glob("*/how.json")
     assert json.loads(how.read_text())["states"].endswith("two.npz")
     assert lavender("report", "stack(n=4)", "--states", "keyframes", "--out", tmp_path / "no")[0] == 2
+
+
+def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, boxes, tmp_path):
+    path, file = boxes(EARLY), tmp_path / "contact.npz"
+    words = ("--worlds", 2, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")
+    code, out, _ = lavender("audit", path, *words, "--save-states", "contact", file, "--keep", 5)
+    assert code == 0 and f"{file}: " in out and "states for --states" in out
+    assert len(np.load(file)["state"]) > 5 == len(np.load(tmp_path / "a" / "states.npz")["state"])
+    assert lavender("record", path, "--states", file, "--steps", 5, "--out", tmp_path / "r")[0] == 0
+    assert "floor" in lavender("slip", path, "--states", file)[1]
+    code, _, err = lavender("audit", path, *words, "--save-states", "best", file)
+    assert code == 2 and "'best' is not one of 'contact', 'worst'" in err
+
+
+@pytest.mark.parametrize("option", [("--keep", 3), ("--save-states", "worst", "states.npz")])
+def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes, option):
+    code, _, err = lavender("audit", boxes(), "--engine", "kamino", *option)
+    assert code == 2 and f"{option[0]} has no effect with --engine kamino" in err

@@ -306,3 +306,63 @@ def test_coulombs_law_is_rejected_where_it_is_not_defined():
         lv.io.from_efc(**given, friction="coulomb")
     with pytest.raises(lv.InputError, match="friction"):
         lv.io.from_efc(**given, friction="ccp")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -3e10])
+def test_from_efc_of_a_world_with_a_bad_acceleration_has_no_answer(bad):
+    model = mj.MjModel.from_xml_string(scene())
+    arrays = stacked(model, states_of(model, 3), np.float32)
+    arrays["qacc"] = np.zeros_like(arrays["qacc_smooth"])
+    fine = lv.io.from_efc(**arrays)
+    arrays["qacc"][1, 0] = bad
+    found = lv.io.from_efc(**arrays)
+    assert np.isnan(found.impulse[1]).all()
+    np.testing.assert_array_equal(np.delete(found.impulse, 1, axis=0), np.delete(fine.impulse, 1, axis=0))
+    judged = lv.residual_many(found.batch, found.impulse).velocity_error
+    assert np.isfinite(judged).tolist() == [True, False, True]
+
+
+def test_from_mujoco_many_of_a_state_with_a_bad_acceleration_has_no_answer(monkeypatch):
+    model = mj.MjModel.from_xml_string(scene())
+    states, forward = states_of(model, 3), mj.mj_forward
+
+    def fail(model, data):
+        forward(model, data)
+        if np.array_equal(data.qpos, states[1, : model.nq]):
+            data.qacc[0] = np.nan
+            data.efc_force[:] = 0.0
+
+    monkeypatch.setattr(mj, "mj_forward", fail)
+    with pytest.raises(lv.InputError, match="state 1: qacc holds numbers that are not finite"):
+        lv.io.from_mujoco_many(model, states)
+    batch, impulse = lv.io.from_mujoco_many(model, states, errors="status")
+    judged = lv.residual_many(batch, impulse).velocity_error
+    assert np.isfinite(judged).tolist() == [True, False, True]
+
+
+def test_from_mujoco_many_of_a_model_with_sleep_is_rejected_and_agrees_with_from_mujoco_without():
+    if not hasattr(mj.mjtEnableBit, "mjENBL_SLEEP"):
+        pytest.skip("this MuJoCo has no sleep")
+    box = '<body pos="{} 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+    text = (
+        '<mujoco><option timestep=".005"><flag sleep="enable"/></option><worldbody>'
+        f'<geom type="plane" size="9 9 .1"/>{box.format(0)}{box.format(1)}</worldbody></mujoco>'
+    )
+    for word in ("enable", "disable"):
+        model = mj.MjModel.from_xml_string(text.replace("enable", word))
+        data = mj.MjData(model)
+        for _ in range(400):
+            mj.mj_step(model, data)
+        kind = mj.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mj.mj_stateSize(model, kind))
+        mj.mj_getState(model, data, state, kind)
+        mj.mj_forward(model, data)
+        if word == "enable":
+            assert data.nefc == 0 and data.ntree_awake == 0
+            with pytest.raises(lv.InputError, match=r"which trees sleep.*mjENBL_SLEEP"):
+                lv.io.from_mujoco_many(model, state[None])
+        else:
+            batch, impulse = lv.io.from_mujoco_many(model, state[None])
+            one = lv.residual(lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data))
+            assert batch.row_counts[0] == data.nefc > 0
+            assert lv.residual_many(batch, impulse).velocity_error[0] == pytest.approx(one.velocity)

@@ -29,7 +29,7 @@ def stand_in(cone="elliptic", n=3, max_rows=MAX_ROWS):
     rng, worlds = np.random.default_rng(0), []
     efc = {name: [] for name in ("J", "D", "aref", "type", "frictionloss", "force")}
     contact = {name: [] for name in ("worldid", "efc_address", "dim", "friction")}
-    rest = {name: [] for name in ("qacc_smooth", "qfrc_smooth", "M", "qvel")}
+    rest = {name: [] for name in ("qacc_smooth", "qfrc_smooth", "qacc", "M", "qvel")}
     for i in range(n):
         data = mj.MjData(model)
         data.qvel[:] = 0.3 * rng.standard_normal(model.nv)

@@ -62,8 +62,10 @@ def test_the_number_of_worlds_follows_from_the_time_of_one(boxes, monkeypatch):
     clock = iter([0.0, 0.5, 0.0, 1e-9])
     monkeypatch.setattr(module, "perf_counter", lambda: next(clock))
     runs = Runs(str(boxes()), 1, 5)
-    assert module.choose_world_count(runs, ("float64", 1e-6), 2) == 240  # 60 s in 2 processes, 0.5 s each
-    assert module.choose_world_count(runs, ("float64", 1e-6), 2) == module.MAX_DEFAULT_WORLDS
+    assert (
+        module.choose_world_count(runs, module.Judging("float64", 1e-6), 2) == 240
+    )  # 60 s in 2 processes, 0.5 s each
+    assert module.choose_world_count(runs, module.Judging("float64", 1e-6), 2) == module.MAX_DEFAULT_WORLDS
 
 
 def test_a_busy_machine_is_named_and_changes_no_error(boxes, monkeypatch):
@@ -488,3 +490,131 @@ def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package
         own = frame.batch[world]
         np.testing.assert_allclose(own.velocity(lv.solve(own, tol=1e-6).impulse), moved, atol=2e-3)
         assert any("floor" in name for name in frame.batch.names_of(world))
+
+
+SLEEPING = BOXES.format(options="").replace(
+    "<worldbody>", '<option><flag sleep="enable"/></option><worldbody>'
+)
+
+
+def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
+    # Replayed states of sleeping boxes woke them with the warm start of a free fall: most solves seemed unconverged.
+    path = tmp_path / "sleep.xml"
+    path.write_text(SLEEPING)
+    data = mj.MjData(mj.MjModel.from_xml_path(str(path)))
+    if not hasattr(data, "tree_asleep"):
+        pytest.skip("this MuJoCo has no sleep")
+    found = audit(path, worlds=1, steps=400, workers=1, control="zero")
+    awake = mj.MjModel.from_xml_string(SLEEPING.replace("enable", "disable"))
+    data = mj.MjData(awake)
+    for step in range(400):
+        mj.mj_forward(awake, data)
+        judged = lv.residual(lv.io.from_mujoco(awake, data), lv.io.mujoco.impulse(awake, data))
+        assert found.numbers[0, 0, step] == pytest.approx(judged.velocity, rel=1e-6, abs=1e-12)
+        mj.mj_step(awake, data)
+    assert "Sleep was off" in found.summary_page.warning
+    assert (
+        "Sleep" not in audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1).summary_page.warning
+    )
+
+
+def path_without_sleep(folder):
+    path = folder / "awake.xml"
+    path.write_text(BOXES.format(options=""))
+    return path
+
+
+# A joint whose damping is negative above 0.025 rad/s: it runs away from larger velocities, and from no smaller one.
+FRAGILE = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .099"><joint type="slide" axis="0 0 1"/><geom type="box" size=".1 .1 .1"/></body>
+  <body pos="2 0 1"><joint axis="0 1 0" damping="0.5 -20 0"/><inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/>
+  </body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def fragile(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there.
+    if not hasattr(mj.MjModel, "dof_dampingpoly"):
+        pytest.skip("this MuJoCo has no damping that depends on the velocity")
+    path = tmp_path / "fragile.xml"
+    path.write_text(FRAGILE)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_of_worlds_that_diverge_by_their_random_velocities_blames_these(fragile):
+    found = audit(fragile, worlds=9, steps=50, workers=1, spread=0.5)
+    assert found.n_diverged > 2 and 0 not in [d.world for d in found.divergences]
+    assert "World 0, which starts without random velocities, did not diverge" in found.summary_text
+    assert f"{found.divergences[0].world}, " in found.summary_text
+    assert "the random velocities are the cause, not the model or its solver" in found.summary_text
+    assert "--spread 0" in found.summary_text and "outside the constraint" not in found.summary_text
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_without_a_spread_chooses_one_that_trial_worlds_survive(fragile, boxes):
+    found = audit(fragile, worlds=4, steps=50, workers=1)
+    assert (found.runs.spread, found.n_diverged) == (0.01, 0)
+    assert "0.01 m/s (rad/s) only, because worlds diverged with 0.1 m/s" in found.summary_page.warning
+    found = audit(boxes(), worlds=2, steps=5, workers=1)
+    assert (found.runs.spread, found.notes) == (0.1, "")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_of_worlds_that_diverge_without_random_velocities_blames_the_model(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
+    found = audit("runaway.xml", worlds=3, steps=60, workers=1)
+    assert (found.runs.spread, found.notes, found.n_diverged) == (0.1, "", 3)
+    assert "random velocities" not in found.summary_text
+
+
+def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
+    found = audit(boxes(EARLY), worlds=1, steps=40, workers=1, keep=7)
+    speeds = np.where(found.is_unconverged, found.numbers[0], 0.0)[0]
+    assert [w.step for w in found.worst] == np.argsort(-speeds, kind="stable")[:7].tolist()
+    found.write(tmp_path)
+    assert len(np.load(tmp_path / "states.npz")["state"]) == 7
+
+
+def test_audit_keeps_states_before_steps_with_contact(boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_CONTACT_STATES", 20)
+    path = boxes(EARLY)
+    found = audit(path, worlds=2, steps=60, workers=1, keep_contact_states=True)
+    n = found.save_states("contact", tmp_path / "states.npz")
+    assert 20 <= n <= 22  # Up to one more for each of the batches.
+    stored = np.load(tmp_path / "states.npz")
+    assert (found.contacts[stored["world"], stored["step"]] > 0).all()
+    again = audit(path, worlds=n, steps=1, workers=1, states=tmp_path / "states.npz")
+    assert again.numbers[0, :, 0] == pytest.approx(found.numbers[0, stored["world"], stored["step"]])
+    with pytest.raises(lv.InputError, match="kind"):
+        found.save_states("best", tmp_path / "states.npz")
+
+
+def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_forces(boxes, monkeypatch):
+    """MJX returns forces of 0 with an acceleration of NaN, and goes on."""
+
+    def frames(engine, runs):
+        _, made = runs.load_model()
+        data = mj.MjData(made)
+        for step in range(runs.steps):
+            mj.mj_forward(made, data)
+            is_failed = step == 3
+            efc = {
+                "J": data.efc_J.reshape(-1, made.nv), "D": data.efc_D, "aref": data.efc_aref,
+                "force": data.efc_force * (not is_failed),
+            }  # fmt: skip
+            yield Frame(*from_efc(
+                **{f"efc_{name}": x[None] for name, x in efc.items()}, efc_type=data.efc_type,
+                M=whole_mass(made, data)[None], qvel=data.qvel[None], qacc_smooth=data.qacc_smooth[None],
+                qacc=data.qacc[None] * (np.nan if is_failed else 1.0), timestep=made.opt.timestep,
+            ), {"qpos": data.qpos[None].copy()}, np.array([data.nefc]), np.array([data.ncon]))  # fmt: skip
+            mj.mj_step(made, data)
+
+    monkeypatch.setattr(module, "iterate_frames", frames)
+    found = audit(boxes('jacobian="dense"'), worlds=1, steps=6, engine="mjx", spread=0.0)
+    assert np.flatnonzero(found.verdict[0] == AUDIT_VERDICTS.index("not judged")).tolist() == [3]
+    assert [(d.step, d.is_outside) for d in found.divergences] == [(3, False)]
+    assert "1 step was not judged, because numbers are not finite" in found.summary_text
+    assert "no better than zero forces" not in found.summary_text
+    assert "--engine mujoco" in found.summary_text

@@ -49,6 +49,8 @@ class Tuning:
         Rows and contacts of the steps of all worlds with the model's own setting.
     busy : str
         A warning if other processes used the processors during the timing; else empty.
+    notes : str
+        Sentences about what differs from a simulation of the model as it is: no sleep, a smaller spread.
     n_held_worlds : int
         Number of worlds held back.
     error_limit : float, m/s, optional
@@ -65,6 +67,7 @@ class Tuning:
     stopped: bool = False
     sizes: StepSizes | None = None
     busy: str = ""
+    notes: str = ""
     n_held_worlds: int = 0
     error_limit: float | None = None
     held_errors: Mapping[Setting, float] = field(default_factory=dict)
@@ -363,7 +366,7 @@ class Tuning:
              **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
              "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
             stopped=self.stopped,
-            warning=self.busy,
+            warning=" ".join(filter(None, (self.notes, self.busy))),
         )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -24,7 +25,13 @@ from lavender.io.recording import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
-from lavender.lab.simulated_worlds import Runs, StepSizes, can_any_geoms_collide, count_engine_warnings
+from lavender.lab.simulated_worlds import (
+    SPREADS,
+    Runs,
+    StepSizes,
+    can_any_geoms_collide,
+    count_engine_warnings,
+)
 from lavender.lab.tune.kamino_settings import KaminoStage
 from lavender.lab.tune.measured import Measured, Schedule, Setting, Stage
 from lavender.lab.tune.mujoco_settings import MujocoStage
@@ -49,7 +56,7 @@ def tune(
     steps: int = 200,
     control: Control = "random",
     seed: int = 0,
-    spread: float = 0.1,
+    spread: float | None = None,
     states: Any = None,
     horizon: int = 10,
     repeats: int = 5,
@@ -66,8 +73,8 @@ def tune(
     engine : {"mujoco", "mujoco_warp", "kamino"}
         The last two step all worlds at once; the time of a step is divided by the number of worlds.
     worlds, steps, control, seed, spread
-        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`. Scenes of Kamino set their
-        own controls.
+        See `Runs` and, for the default spread, `audit`. Half of the worlds are held back; `steps` is a multiple of
+        `horizon`. Scenes of Kamino set their own controls.
     states : path of an .npz, "keyframes", or arrays, optional
         States in which the worlds start: see `audit`, and for "kamino" `lavender.lab.engine_scenes`.
     horizon : int
@@ -92,8 +99,8 @@ def tune(
         The model cannot be read, the engine is not installed, there are fewer than two worlds, or `horizon` does not
         divide `steps`.
     CapabilityError
-        The integrator's constraint problem uses a matrix other than M, or a world has more rows than the engine has
-        memory for.
+        MuJoCo does not store the matrix of the integrator "discrete" (see `lavender.io.from_mujoco`), or a world has
+        more rows than the engine has memory for.
     UnknownName
         The engine is unknown.
     """
@@ -101,7 +108,8 @@ def tune(
     worlds = check_int("worlds", worlds, 2, None)
     horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
     threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
-    check_float("spread", spread, low=0.0)
+    if spread is not None:
+        check_float("spread", spread, low=0.0)
     if max_velocity_error is not None:
         max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
@@ -111,13 +119,14 @@ def tune(
             raise InputError(
                 "control needs a model of MuJoCo; a scene of kamino sets its own controls: leave it out"
             )
-        start = {"states": states, "spread": spread, "seed": seed}
+        start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
         return run_tuning(
             lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
             name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2,
             error_limit=max_velocity_error, watch=watch,
         )  # fmt: skip
-    runs = Runs(name, worlds, steps, control=control, seed=seed, spread=spread).with_start_states(states)
+    runs = Runs(name, worlds, steps, control=control, seed=seed).with_start_states(states)
+    runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
     mj, configured = runs.load_model()
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
@@ -132,10 +141,11 @@ def tune(
         return cast("tuple[Stage, Stage]", (even, odd))
 
     with count_engine_warnings(mj):  # Settings with which worlds diverge are left out.
-        return run_tuning(
+        tuning = run_tuning(
             make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
             n_held_worlds=worlds // 2, error_limit=max_velocity_error, watch=watch,
         )  # fmt: skip
+    return replace(tuning, notes=" ".join(filter(None, (runs.sleep_note, note))))
 
 
 def run_tuning(
