@@ -27,9 +27,9 @@ from lavender.cli.options import (
 COMMAND_GROUPS = {
     "Solve and judge": ("solve", "check", "explain"),
     "Measure": ("report",),
-    "MuJoCo": ("record", "audit", "tune", "slip", "bench"),
+    "MuJoCo": ("record", "audit", "tune", "slip"),
     "Engine": ("run", "view", "web"),
-    "Tools": ("solvers", "contract", "cases", "doctor", "export"),
+    "Tools": ("solvers", "contract", "doctor", "export"),
 }
 _WEB_COMMANDS = ("view", "web")
 #: Module of each command.

@@ -20,7 +20,6 @@ from lavender.cli.options import (
     limit_to_one_thread,
     make_console,
     print_escaped,
-    reject_unused_options,
 )
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     InputError
         A tolerance, budget or limit is invalid.
     """
-    names = ("tolerances", "budgets", "motion", "velocity_tolerances", "orders")
+    names = ("tolerances", "budgets", "orders")
     return kind(**{name: options[name] for name in names if options[name] is not None}, **more)
 
 
@@ -124,9 +123,6 @@ def measure_files(
     if campaign:
         workers = options["workers"] if is_option_set(context, "workers") else -1
         more = {"workers": workers, "backend": options["backend"]}
-        names = bench.expand_seeds(files, len(options["seeds"]), options["seeds"].start)
-        if names == list(files):
-            reject_unused_options(context, ["seeds"], "if no case takes one")
         plan = make_plan({**options, "orders": options["orders"] or ()}, bench.CampaignPlan)
     else:
         plan = _make_timed_plan(options, files, sweeps)

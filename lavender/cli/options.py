@@ -68,7 +68,6 @@ class MultiValueCommand(click.Command):
 
     VALUE_TESTS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
         "--tolerances": _is_number,
-        "--velocity-tolerances": _is_number,
         "--budgets": _is_number,
         "--time-budgets": _is_number,
         "--solvers": _is_solver_name,
@@ -112,23 +111,6 @@ class ListType(_ParamType):
             return self.fail(
                 f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx
             )
-
-
-class SeedRange(_ParamType):
-    """Option type: seeds as N (0 to N - 1) or A:B (A to B - 1)."""
-
-    name = "n"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
-        """Return the range of seeds."""
-        if isinstance(value, range):
-            return value
-        first, colon, last = str(value).partition(":")
-        if not colon:
-            first, last = "0", first
-        if not (first.isdecimal() and last.isdecimal() and int(first) < int(last)):
-            return self.fail(f"{value!r} is not N or A:B, whole numbers with A < B", param, ctx)
-        return range(int(first), int(last))
 
 
 def limit_to_one_thread() -> None:
@@ -274,10 +256,6 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": ListType(str), "help": "Solvers by name; default: all that are installed."}),
     ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
-    ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
-                  "relative to a reference that is solved once for each case."}),
-    ("--velocity-tolerances", {"type": ListType(float), "default": (), "metavar": "M/S,M/S,...",
-                        "help": "Motion errors to reach, in metres per second; implies --motion."}),
     ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
     ("--orders", {"type": ListType(str), "default": None,

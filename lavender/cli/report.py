@@ -21,7 +21,6 @@ from lavender.cli.options import (
     RECORDING_NAMES,
     ListType,
     MultiValueCommand,
-    SeedRange,
     is_option_set,
     make_console,
     plan_options,
@@ -58,13 +57,6 @@ from lavender.io.stored import lock_output, write_text
     show_default=True,
     help="The same with the workers of a backend of joblib, such as dask.",
 )
-@click.option(
-    "--seeds",
-    type=SeedRange(),
-    default="1",
-    metavar="N | A:B",
-    help="With --workers: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
-)
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
@@ -76,14 +68,12 @@ from lavender.io.stored import lock_output, write_text
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
-@click.option(
-    "--paper",
-    is_flag=True,
-    help="Also write PDF figures, LaTeX tables and a paragraph on the method to OUT/paper.",
-)
 @click.option("--no-figures", is_flag=True, help="Do not write SVG and PNG files.")
+@click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
 @click.pass_context
-def report(context: click.Context, /, files: tuple[str, ...], out: Path, **options: Any) -> None:
+def report(
+    context: click.Context, /, files: tuple[str, ...], out: Path, listed: bool, **options: Any
+) -> None:
     """Measure the time and the error of solvers on problems.
 
     Every solver runs on every case, to each tolerance and with each budget.
@@ -97,6 +87,11 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
     Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
     a named file cannot be read, or another report is writing to the folder.
     """
+    if listed:
+        given = [p.name for p in context.command.params if p.name and p.name != "listed"]
+        reject_unused_options(context, given, "with --list")
+        _list_suite()
+        return
     from lavender.lab import bench
     from lavender.lab.report.engine import read_engine_answers
     from lavender.lab.report.findings import Report
@@ -134,14 +129,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
     shown = Report(measured.records, old, options["time_budgets"], sweeps, engines)
     # Write the files before printing, as a closed pipe can end the command while it prints.
     index = write(shown, out, figures=not options["no_figures"])
-    paper = None
-    if options["paper"]:
-        from lavender.lab.report.latex_export import write_paper
-
-        paper = write_paper(shown, out / "paper")
     print_report(shown, make_console(), complete=options["tables"])
-    if paper is not None:
-        print_escaped(f"figures, tables and method of a paper: {paper}")
     print_escaped(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
     if measured.reuse_note:
         print_escaped(measured.reuse_note)
@@ -161,13 +149,26 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
+def _list_suite() -> None:
+    """Print the families of the suite, with parameters, defaults and purpose, and its sets of cases."""
+    from lavender.lab import suite
+
+    for text, summary in sorted(suite.families().items()):
+        print_escaped(text, style="bold")
+        print_escaped(f"    {summary}")
+    print_escaped("")
+    for name, names in suite.SETS.items():
+        print_escaped(f"@{name}", style="bold")
+        print_escaped(f"    {len(names)} cases: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}")
+
+
 def _reject_unused_options(
     context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None
 ) -> None:
     """Raise InputError for each option that would be ignored."""
     if any(f.endswith(".jsonl") for f in files):
         used = {
-            "files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures", "solvers"
+            "files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures", "solvers"
         }  # fmt: skip
         unused = [p.name for p in context.command.params if p.name and p.name not in used]
         reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
@@ -176,8 +177,6 @@ def _reject_unused_options(
         reject_unused_options(
             context, timing_options, "with --workers, which measures no times and ends by iterations"
         )
-    else:
-        reject_unused_options(context, ["seeds"], "without --workers")
     reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))
     # Records may contain solvers that are not installed here.
     if not any(f.endswith(".jsonl") for f in files):

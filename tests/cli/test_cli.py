@@ -143,13 +143,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
         (("report", "--tolerances", "many"), "not a list of numbers"),
-        (("report", "--workers", "1", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 is not positive"),
-        (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
-        (
-            ("report", "stack(n=4)", "--workers", "1", "--seeds", "3"),
-            "--seeds has no effect if no case takes one",
-        ),
+        (("report", "stack(n=4)", "--list"), "has no effect with --list"),
+        (("cases",), "unknown command 'cases'"),
         (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
         (
             ("report", "stack(n=4)", "--sequence-time-limit", "3"),
@@ -183,7 +179,6 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("nonsense",), "unknown command 'nonsense'"),
         (("slove", "stack(n=4)"), "did you mean 'solve'"),
         (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
-        (("report", "random_spd", "--workers", "1", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
         (("solve", "random_spd(n=5000000)"), "not enough memory"),  # 2e14 bytes, beyond the address space
         *((("report", "stack(n=4)", "--workers", n), f"workers is {n}") for n in (0, -2, 1_000_000_000)),
     ],
@@ -219,7 +214,7 @@ def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_to
 def test_help_is_quick_and_names_every_command():
     code = "import sys, lavender.cli as c\ntry: c.main(['--help'])\nfinally: print(*sys.modules, file=sys.stderr)"
     done = python("-c", code)
-    for name in ("report", "bench", "check", "solve", "solvers"):
+    for name in ("report", "check", "solve", "solvers"):
         assert name in done.stdout
     # What takes time to load is loaded by the command that needs it.
     assert (
@@ -258,18 +253,15 @@ def test_an_answer_is_not_written_over_its_problem(lavender, path):
         assert path.read_bytes() == before
 
 
-def test_cases_lists_families_with_parameters_and_reasons(lavender):
+def test_report_list_names_families_with_parameters_and_sets(lavender):
     from lavender.lab.suite.case import FAMILIES
 
-    code, out, _ = lavender("cases")
+    code, out, _ = lavender("report", "--list")
     assert code == 0
     for name, family in FAMILIES.items():
         assert f"\n{name}(" in "\n" + out
         assert family.summary in out
-    code, out, _ = lavender("cases", "hang")
-    assert "hang(n=" in out
-    assert "pyramid(" not in out
-    assert lavender("cases", "nosuchthing")[0] == 2
+    assert all(f"\n@{name}\n" in out for name in lv.suite.SETS)
 
 
 # -- what nobody should ask for ---------------------------------------------------------------------------
@@ -318,16 +310,16 @@ def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path
 def test_ctrl_c_that_a_library_makes_another_error_of_ends_with_130():
     code = """
 import signal, click, lavender as lv
-from lavender.cli import cases, main
+from lavender.cli import main, solvers
 for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot be imported")):
     def swallowing(**words):
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt:
             raise error from None
-    cases.cases.callback = swallowing
+    solvers.solvers.callback = swallowing
     try:
-        main(["cases"])
+        main(["solvers"])
     except SystemExit as end:
         assert end.code == 130, error
 """
@@ -338,7 +330,7 @@ for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot b
 
 @pytest.mark.parametrize("columns", ["0", "19"])
 @pytest.mark.parametrize(
-    "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]
+    "words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")]
 )
 def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words, columns):
     wide = lavender(*words)[1]

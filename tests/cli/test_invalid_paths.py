@@ -440,7 +440,7 @@ def test_a_folder_that_cannot_be_made_is_named(name, lavender, tmp_path, monkeyp
 
 COMMANDS = [
     ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--tolerances", "1e-3", "--budgets", "4",
-     "--repeats", "1", "--out", "report", "--paper"),
+     "--repeats", "1", "--out", "report"),
     ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
     ("solve", "stack(n=2)", "--output", "solution.npz"),
     ("export", "c", "c"),
@@ -488,7 +488,6 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
 
 WORDS = (
     ("report", "two_particles", "--workers", "{}"),
-    ("report", "granular", "--workers", "1", "--seeds", "0:{}"),
     ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
     ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
     ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
@@ -524,7 +523,6 @@ def test_commands_print_paths_as_text(lavender, tmp_path):
     path.write_text(scene())
     to = "to\x1b[31m"
     for line in (
-        ["bench", "mujoco", path, "--steps", "1"],
         ["record", path, "--steps", "15", "--record-every", "15", "--out", to],
         ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
         ["solve", "stack(n=2)", "--output", f"{to}.npz"],
@@ -679,12 +677,12 @@ def test_a_report_with_workers_takes_files_and_folders(lavender, tmp_path):
     for name in ("x", "y"):
         io.save(stack(), tmp_path / "problems" / f"{name}.npz")
     io.save(stack(), tmp_path / "z.npz")
-    more = (*QUICK[:6], "--workers", 1, "--seeds", "2")
+    more = (*QUICK[:6], "--workers", 1)
     code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
     assert (code, err.strip()) == (0, "")
     cases = {r.case for r in bench.read_records("lavender-report")}
-    assert cases == {"x", "y", "z", "z #2", "random_spd(n=4, seed=0)", "random_spd(n=4, seed=1)"}
-    code, _, err = lavender("report", "nothing.npz", *more[:-2])
+    assert cases == {"x", "y", "z", "z #2", "random_spd(n=4)"}
+    code, _, err = lavender("report", "nothing.npz", *more)
     assert code == 2 and "no such file" in err
 
 

@@ -55,7 +55,7 @@ CALLS = {
     "bench.Plan": Call(
         bench.Plan,
         {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
-         "orders": ("given",), "times": (), "motion": False, "warm": True, "campaign": True},
+         "orders": ("given",), "times": (), "warm": True, "campaign": True},
     ),
     "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
     "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
@@ -65,10 +65,6 @@ CALLS = {
     ),
     "bench.resolve, a problem": Call(lambda case: bench.resolve_sources([case]), {"case": LCP}),
     "bench.make_sequence": Call(bench.make_sequence, {"problems": [LCP], "name": "walk"}),
-    "bench.expand_seeds": Call(
-        bench.expand_seeds, {"cases": ["random_spd(n=3)"], "n": 2, "first": 0}, {"cases": "cases", "n": "n|seeds"},
-        accepts={"first": ("very large",)},
-    ),
     "bench.select_solver_names": Call(lambda solvers: bench.select_solver_names(solvers), {"solvers": ["pgs"]}),
     "bench.carry_impulses": Call(
         bench.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}

@@ -9,7 +9,6 @@ Nothing here draws or prints; `lavender.lab.report` reads the records.
 from lavender.lab.bench.cases import (
     Item,
     classify_structure,
-    expand_seeds,
     list_steps_in_folder,
     make_sequence,
     resolve_sources,
@@ -37,7 +36,6 @@ __all__ = [
     "Task",
     "carry_impulses",
     "classify_structure",
-    "expand_seeds",
     "format_tolerance",
     "get_cpu_name",
     "limit_to_one_thread",

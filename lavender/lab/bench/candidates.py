@@ -108,6 +108,6 @@ def time_candidates(
 ) -> Records:
     """Choose the candidates among the calls that `bench.run` measured, and time them by `bench.time_alternately`."""
     remaining = drop_cases_solved_at_zero(records)
-    if not len(remaining) or plan.velocity_tolerances:
+    if not len(remaining):
         return records
     return time_alternately(cases, choose_calls_to_time(remaining, plan.times), records, plan, store, **more)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender import io
-from lavender.base.arrays import FloatArray, check_bool, check_int, check_sequence
+from lavender.base.arrays import FloatArray, check_bool, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
@@ -26,7 +26,6 @@ from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, escape_unprintable, make_file_name
 from lavender.lab.diagnostics import diagnose
 from lavender.lab.suite import Case
-from lavender.lab.suite.case import FAMILIES, parse_case_name
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
@@ -39,7 +38,7 @@ MAX_MANIFOLD_BLOCKS = 8
 LARGE_MASS_RATIO = 1e3
 # A matrix with a larger relative asymmetry is not the A of bodies; recorded contact problems stay below 0.01.
 MAX_MECHANICAL_ASYMMETRY = 0.1
-MAX_SEEDS = 1_000_000  # Largest number of seeds in one run: name and path of each case take a kilobyte.
+
 DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
 
 
@@ -203,36 +202,6 @@ def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
     except Exception as error:  # The file was removed, or reading its folder raises an error.
         item = Item(name, str(source), _raise_when_loaded(error))
     return replace(item, name=name, reason=reason, sequence="", step=-1)
-
-
-def expand_seeds(cases: Iterable[str], n: int, first: int = 0) -> list[str]:
-    """Return each case with seed=first .. first + n - 1 if its family takes a seed; other names, sets and files once.
-
-    Raises
-    ------
-    UnknownName, InputError
-        The suite does not have the name, or there are more than `MAX_SEEDS` seeds.
-    """
-    n, first = check_int("n", n, high=None), check_int("first", first, high=None)
-    if n > MAX_SEEDS:
-        raise InputError(
-            f"{n} seeds are requested; at most {MAX_SEEDS} are possible in one run: give A:B, one part at a time"
-        )
-    out = []
-    for case in check_sequence("cases", cases, "names"):
-        if not isinstance(case, str):
-            raise InputError(f"case {case!r:.60} is not a name of the suite")
-        if is_path(case) or case.startswith("@"):
-            out.append(case)
-            continue
-        name, parameters = parse_case_name(case)
-        if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in parameters:
-            for seed in range(first, first + n):
-                inside = ", ".join(f"{k}={v}" for k, v in {**parameters, "seed": seed}.items())
-                out.append(f"{name}({inside})")
-        else:
-            out.append(case)
-    return out
 
 
 def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:

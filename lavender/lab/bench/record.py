@@ -237,12 +237,6 @@ class Record(_PrintableEntry):
         Largest velocity error of a row.
     roundoff_floor : float
         Relative residual that rounding alone can cause.
-    motion_error : float or None
-        Relative motion error; None if it was not requested, or if there is none.
-    motion_speed : float or None, m/s
-        Largest motion error of a body, or of a row if bodies are not known.
-    bound : float or None, sqrt J
-        Proved bound of the motion error.
     boundary_fraction : float or None
         Fraction of blocks that rounding could move to another state; None if no bound of the answer's error is known.
     solution_hash : str
@@ -301,9 +295,6 @@ class Record(_PrintableEntry):
     energy: float = math.inf
     velocity: float = math.inf
     roundoff_floor: float = math.nan
-    motion_error: float | None = None
-    motion_speed: float | None = None
-    bound: float | None = None
     boundary_fraction: float | None = None
     solution_hash: str = ""
     worst_row: int = -1

@@ -113,10 +113,6 @@ class Reach:
     claim_check : str
         Worst `claim_check` of all runs.
     status_conflict, form : str
-    motion_error : float
-        Relative motion error of the best run; nan without one.
-    bound : float, sqrt J
-        Proved bound of this motion error; nan without one.
     """
 
     case: str
@@ -129,8 +125,6 @@ class Reach:
     claim_check: str
     status_conflict: str
     form: str
-    motion_error: float
-    bound: float
 
     @property
     def at_floor(self) -> bool:
@@ -237,8 +231,6 @@ def summarize_runs_by_case(records: Records, tolerances: Sequence[float] | None 
                 claim_check=max((r.claim_check for r in group), key=CLAIM_CHECKS.index),
                 status_conflict=next((r.status_conflict for r in group if r.status_conflict), ""),
                 form=last.form,
-                motion_error=math.nan if best is None or best.motion_error is None else best.motion_error,
-                bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
     return out

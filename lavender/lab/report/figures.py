@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.store import Records
-from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_run_name, make_time_axis_title
 from lavender.solvers import registry
 
@@ -330,58 +328,28 @@ class Figures:
     profiles : performance profiles by law, one for each tolerance: by time, then by work
     sequences : figures by sequence
     cases : error against time and residual against iterations, by case
-    moved : figures of `cases` with motion errors [m/s] in place of residuals, if motion errors were measured
     """
 
     over: Group = field(default_factory=dict)
     profiles: Group = field(default_factory=dict)
     sequences: Group = field(default_factory=dict)
     cases: Group = field(default_factory=dict)
-    moved: Figures | None = None
 
     @property
     def groups_by_section(self) -> dict[str, Group]:
         """The groups of figures by the name of their section."""
-        return {name: group for name, group in vars(self).items() if name != "moved"}
+        return dict(vars(self))
 
     def __iter__(self) -> Iterator[Figure]:
         for group in self.groups_by_section.values():
             for some in group.values():
                 yield from some
-        yield from self.moved or ()
 
 
 def build_figures(records: Records) -> Figures:
-    """Build the figures of records by residual and, if it is known, by motion error; none for a campaign."""
+    """Build the figures of records; none for a campaign."""
     if statistics.is_campaign(records):
         return Figures()
-    by_residual = _build_figures(records)
-    return (
-        replace(by_residual, moved=_relabel_for_motion(_build_figures(convert_to_motion_errors(records))))
-        if get_velocity_tolerances(records)
-        else by_residual
-    )
-
-
-def _relabel_for_motion(figures: Figures) -> Figures:
-    """Return figures of records from `convert_to_motion_errors` with names and titles that mention motion errors."""
-
-    def relabel(figure: Figure) -> Figure:
-        return replace(
-            figure,
-            name=f"motion {figure.name}",
-            title=re.sub(r"(, to \S+) \(", r"\1 m/s (", figure.title),
-            y_title=figure.y_title.replace("relative residual [-]", "motion error [m/s]"),
-        )
-
-    groups: dict[str, Any] = {
-        place: {name: tuple(map(relabel, own)) for name, own in group.items()}
-        for place, group in figures.groups_by_section.items()
-    }
-    return Figures(**groups)
-
-
-def _build_figures(records: Records) -> Figures:
     parts: dict[str, Records] = {}  # Records by case.
     for r in records:
         if r.step < 0:

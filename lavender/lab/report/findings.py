@@ -1,4 +1,4 @@
-"""Compute the contents of a report, which the page, the terminal, the summary and a paper show."""
+"""Compute the contents of a report, which the page, the terminal and the summary show."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from lavender.lab.bench.recommendation import FamilyAdvice, choose_time_budgets
 from lavender.lab.bench.resampling import recommend_solvers
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import EngineAnswers
-from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
 from lavender.lab.report.verdict import Verdict, build_verdict
 from lavender.problem.derived import cached_property
 
@@ -105,16 +104,6 @@ class Report:
     def tolerances(self) -> tuple[float, ...]:
         """Residual tolerances, largest first."""
         return statistics.get_tolerances(self.ranked_records)
-
-    @cached_property
-    def velocity_tolerances(self) -> tuple[float, ...]:
-        """Velocity tolerances [m/s]; empty without motion errors."""
-        return get_velocity_tolerances(self.ranked_records)
-
-    @cached_property
-    def records_by_motion_error(self) -> Records:
-        """The records with motion errors in place of residuals; empty without motion errors."""
-        return convert_to_motion_errors(self.ranked_records)
 
     @cached_property
     def recommendation_times(self) -> tuple[float, ...]:

@@ -107,8 +107,7 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
     number = {name: i for i, name in enumerate(names)}
     named = [*verdict.leaders, *(name for name in names if is_plug_in(name) and name not in verdict.leaders)]
     # The drawings of a case have no title: the heading above them is the name of the case.
-    own = [f.name for some in figures.cases.values() for f in some]
-    titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
+    titles = {f.name: "" for some in figures.cases.values() for f in some}
     return {
         "drawings": {  # The texts of the drawings are escaped.
             make_file_name(figure.name): plot_for_page(figure, number, named, titles.get(figure.name))
@@ -117,17 +116,11 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
         "solvers": names,
         "named": named[:MAX_NAMED],
         "number": number,
-        "by_motion": figures.moved is not None,
-        "drawn": _list_drawing_names(figures),
-        "moved_drawn": _list_drawing_names(figures.moved or Figures()),
-    }
-
-
-def _list_drawing_names(figures: Figures) -> dict[str, dict[str, list[str]]]:
-    """Return the names of the drawings by section of the page and by subject (case, law or sequence)."""
-    return {
-        place: {name: [make_file_name(figure.name) for figure in some] for name, some in group.items()}
-        for place, group in figures.groups_by_section.items()
+        # Names of the drawings by section of the page and by subject (case, law or sequence).
+        "drawn": {
+            place: {name: [make_file_name(figure.name) for figure in some] for name, some in group.items()}
+            for place, group in figures.groups_by_section.items()
+        },
     }
 
 

@@ -1,4 +1,4 @@
-"""Draw figures with matplotlib: as SVG and PNG files, as PDF of a paper, and as SVG within a page.
+"""Draw figures with matplotlib: as SVG and PNG files, and as SVG within a page.
 
 In files a solver of lavender has the same colour, dash and mark in all reports. The colours are from Okabe and Ito
 (distinct under the common colour-vision deficiencies); dashes and marks distinguish solvers that share a colour, also

@@ -1,6 +1,6 @@
 """Define tables as data, independent of the output format.
 
-The modules `terminal`, `markdown` and `latex_export`, and the template `table.html.j2` for pages, write them. All
+The modules `terminal` and `markdown`, and the template `table.html.j2` for pages, write them. All
 times of a table have one unit, and all sizes of a column have one format.
 """
 

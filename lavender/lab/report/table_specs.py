@@ -1,4 +1,4 @@
-"""Build every table of a report. The page, the terminal, the summary and a paper show the same tables.
+"""Build every table of a report. The page, the terminal and the summary show the same tables.
 
 `list_sections` defines the order of the tables in the terminal and the summary. The page shows the same tables between
 its figures.
@@ -19,7 +19,6 @@ from lavender.lab.bench.record import Record, Skip, escape_unprintable, format_t
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, is_ranked_before, list_cases_of, rank_engine
 from lavender.lab.report.findings import Report
-from lavender.lab.report.motion_tables import format_speed, list_cases_solved_at_zero
 from lavender.lab.report.table import WORDS, Cell, Table
 from lavender.lab.report.text import (
     NONE,
@@ -75,17 +74,10 @@ def list_sections(report: Report) -> list[Section]:
     An empty table is left out, unless its section has a text for this case.
     """
     records, tolerances = report.ranked_records, report.tolerances
-    moved = "largest velocity error of a body"
     if report.is_campaign:
         shares = tabulate_solved_shares(statistics.compute_robustness(records), tolerances)
-        by_speed = tabulate_solved_shares(
-            statistics.compute_robustness(report.records_by_motion_error), report.velocity_tolerances, " m/s"
-        )
         note = "no times; share of cases brought to a tolerance, residual at each budget"
-        sections = [
-            Section("Campaign", note, shares, grouped=True),
-            Section("By motion error", moved, by_speed, grouped=True),
-        ]
+        sections = [Section("Campaign", note, shares, grouped=True)]
     else:
         timed = (
             f"{INTERLEAVED} to {format_tolerance(tolerances[len(tolerances) // 2])}, else {ALONE}"
@@ -114,8 +106,6 @@ def list_sections(report: Report) -> list[Section]:
             Section("By structure", by_structure, tabulate_recommended_solvers(report)),
             Section("By sweeps", by_sweeps, tabulate_best_solver_by_sweeps(report.rankings)),
             Section("Inside the engine", inside, tabulate_engines(report)),
-            Section("By motion error", moved, tabulate_best_solver_by_motion_error(report)),
-            Section("Motion error of each case", moved, tabulate_motion_errors(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
             Section(
                 "Difficulty", DIFFICULTY, tabulate_difficulties(statistics.compute_difficulties(records))
@@ -147,15 +137,12 @@ def build_short_table(report: Report) -> Table:
             statistics.compute_robustness(report.ranked_records), report.tolerances[middle : middle + 1]
         )
         return table.without_columns(*(head for head in table.heads if "iterations" in head), "hardest")
-    by_motion = any(run.plan.get("velocity_tolerances") for run in report.newest_run.runs.values())
-    if len(report.rankings) == 1 and not by_motion:
+    if len(report.rankings) == 1:
         return _tabulate_solvers(report, report.tolerances[middle])
-    table = (
-        tabulate_best_solver_by_motion_error(report) if by_motion else tabulate_recommended_solvers(report)
-    )
-    column = 1 + (len(report.velocity_tolerances) // 2 if by_motion else middle)
+    table = tabulate_recommended_solvers(report)
+    column = 1 + middle
     rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
-    head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) and not by_motion else ALONE}"
+    head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) else ALONE}"
     heads = ["structure", head]
     if ENGINES_OWN in table.heads:
         heads.append(ENGINES_OWN)
@@ -282,17 +269,6 @@ def tabulate_best_solver_by_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
     return Table(["structure", *heads], rows, folds=True)
 
 
-def tabulate_best_solver_by_motion_error(report: Report) -> Table:
-    """Tabulate the best solver to each motion error [m/s], for each structure."""
-    heads = [f"to {format_speed(x)}" for x in report.velocity_tolerances]
-    rows: Rows = [
-        [line.name, *(format_advice(a, False) for a in line.by_tolerance.values())]
-        for line in recommendation.recommend_from_single_runs(report.records_by_motion_error)
-        if not line.sequence
-    ]
-    return Table(["structure", *heads], rows, folds=True)
-
-
 # -- cases -------------------------------------------------------------------------------------------------
 
 
@@ -363,30 +339,24 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
     return table if any(row[5] for row in rows) else table.without_columns("same answer")
 
 
-def tabulate_motion_errors(report: Report) -> Table:
-    """Tabulate, by case and solver, the time to each motion error and the smallest [m/s], with its bound [sqrt J]."""
-    tolerances = report.velocity_tolerances
-    rows: Rows = []
-    for m in statistics.summarize_runs_by_case(report.records_by_motion_error, tolerances):
-        known = [format_residual(x) if math.isfinite(x) else NONE for x in (m.best, m.motion_error, m.bound)]
-        rows.append(
-            [m.case, format_run_name(m.solver, m.start), *(Cell.time(m.times[x]) for x in tolerances), *known]
-        )
-    heads = [f"to {format_speed(x)}" for x in tolerances]
-    return Table(["case", "solver", *heads, "best [m/s]", "relative", "bound [√J]"], rows)
+def list_cases_solved_at_zero(records: Records) -> list[tuple[str, int, str, float, float]]:
+    """List the cases that the zero impulse solves.
+
+    An entry has name, number of rows, the solver with the largest velocity error, and its velocity [m/s] and energy
+    [sqrt J].
+    """
+    worst: dict[str, tuple[str, float, float]] = {}
+    for r in sorted(records, key=lambda r: -r.velocity):
+        worst.setdefault(r.case, (r.solver, r.velocity, r.energy))
+    idle = ((name, info.rows) for name, info in records.cases.items() if info.nothing_to_do)
+    return [(name, rows, *worst.get(name, ("", 0.0, 0.0))) for name, rows in idle]
 
 
 def tabulate_cases_solved_at_zero(records: Records) -> Table:
     """Tabulate cases that the zero impulse solves, with the worst answer to each, in units."""
     rows: Rows = [
-        [
-            c.case,
-            str(c.rows),
-            c.solver or NONE,
-            format_residual(c.velocity),
-            format_residual(c.energy),
-        ]
-        for c in list_cases_solved_at_zero(records)
+        [case, str(n), solver or NONE, format_residual(velocity), format_residual(energy)]
+        for case, n, solver, velocity, energy in list_cases_solved_at_zero(records)
     ]
     return Table(["case", "rows", "solver", "velocity [m/s]", "energy [√J]"], rows)
 
@@ -430,20 +400,15 @@ def tabulate_changed_times(old: Records, new: Records) -> Table:
 # -- over many cases ---------------------------------------------------------------------------------------
 
 
-def tabulate_solved_shares(
-    rows: Sequence[statistics.Robustness], tolerances: Sequence[float], unit: str = ""
-) -> Table:
-    """Tabulate the share of cases solved to each tolerance, false claims, and residual (or motion error) by budget."""
+def tabulate_solved_shares(rows: Sequence[statistics.Robustness], tolerances: Sequence[float]) -> Table:
+    """Tabulate the share of cases solved to each tolerance, false claims, and residual by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
     cells = [
         {
             "structure": r.family,
             "solver": r.solver,
             "cases": str(r.cases),
-            **{
-                f"to {format_tolerance(x)}{unit}": format_percent(r.reached[x], r.cases, 1)
-                for x in tolerances
-            },
+            **{f"to {format_tolerance(x)}": format_percent(r.reached[x], r.cases, 1) for x in tolerances},
             "false claims": str(r.wrong),
             "died": str(r.died),
             **{

@@ -11,9 +11,13 @@ from typing import TYPE_CHECKING
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import escape_unprintable
 from lavender.lab.report.findings import Report
-from lavender.lab.report.motion_tables import list_cases_solved_at_zero
 from lavender.lab.report.table import COLOURS, Cell, Table
-from lavender.lab.report.table_specs import NOT_COMPARED, build_short_table, list_sections
+from lavender.lab.report.table_specs import (
+    NOT_COMPARED,
+    build_short_table,
+    list_cases_solved_at_zero,
+    list_sections,
+)
 from lavender.lab.report.text import format_count, format_residual, list_cases_not_loaded, list_diagnostics
 
 if TYPE_CHECKING:
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
 MAX_LINES = 25  # Largest number of lines of a short report, including the lines that the command adds.
-# Number of lines that the command adds: a blank line, page, reused runs, paper, cases that did not load.
+# Number of lines that the command adds: a blank line, page, reused runs, cases that did not load.
 COMMAND_LINES = 5
 MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
 MIN_WORD_WIDTH = 9  # [columns] A column of words does not become narrower: "CONVERGED".
@@ -191,10 +195,9 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
         yield f"Against {escape_unprintable(report.earlier_run.source)}: {text}", ""
     idle = list_cases_solved_at_zero(report.newest_run)
     if idle:
-        worst = max(idle, key=lambda case: case.velocity)
-        cases, speed = format_count(len(idle), "case"), format_residual(worst.velocity)
-        solver = worst.solver or "no solver"
+        case, _, solver, velocity, _ = max(idle, key=lambda entry: entry[3])
+        cases, speed = format_count(len(idle), "case"), format_residual(velocity)
         yield (
-            f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {worst.case}",
+            f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver or 'no solver'} on {case}",
             "dim",
         )

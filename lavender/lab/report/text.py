@@ -13,21 +13,18 @@ TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
 
 
-#: By `Record.timing_mode`: title of an axis for these times, and description of the code that they include.
+#: By `Record.timing_mode`: title of an axis for these times.
 TIMED_CODE = {
-    "call": ("time of a call [s]", "one call of lv.solve, with set-up, solve, judge and Python"),
-    "steps": (
-        "time of a call [s]",
-        "one call of lv.solve in the loop of a sequence, with set-up, solve, judge and Python",
-    ),
-    "batch": ("time per problem [s]", "a problem's share of one call of lv.solve_many"),
-    "": ("time of set-up and solve [s]", "set-up and solve, without judge and input validation"),
+    "call": "time of a call [s]",
+    "steps": "time of a call [s]",
+    "batch": "time per problem [s]",
+    "": "time of set-up and solve [s]",
 }
 
 
 def make_time_axis_title(runs: Iterable[Record]) -> str:
     """Return the title of an axis for the times of some runs."""
-    titles = {TIMED_CODE[r.timing_mode][0] for r in runs if r.is_usable}
+    titles = {TIMED_CODE[r.timing_mode] for r in runs if r.is_usable}
     return titles.pop() if len(titles) == 1 else "time [s]"
 
 
@@ -35,24 +32,6 @@ def is_external(run: Record) -> bool:
     """Return whether a run is of a solver of another package."""
     spec = registry.specs().get(run.solver)
     return run.backend_time_min is not None or (spec is not None and spec.external)
-
-
-def describe_timed_code(runs: Iterable[Record]) -> str:
-    """Return a sentence on the code that the times of some runs include, or an empty text without times.
-
-    The conversion of the problem for solvers of other packages is part of their set-up.
-    """
-    usable = [r for r in runs if r.is_usable]
-    modes = [mode for mode in TIMED_CODE if any(r.timing_mode == mode for r in usable)]
-    if not modes:
-        return ""
-    others = sorted({r.solver for r in usable if is_external(r)})
-    conversion = (
-        f" (the set-up of {', '.join(others)} includes the conversion of the problem)" if others else ""
-    )
-    return (
-        f"Each time is the duration of {'; or of '.join(TIMED_CODE[mode][1] for mode in modes)}{conversion}."
-    )
 
 
 def format_residual(x: float) -> str:

@@ -18,7 +18,7 @@ from lavender.lab.bench.recommendation import (
     Subject,
     list_subjects,
 )
-from lavender.lab.bench.record import Record, format_tolerance
+from lavender.lab.bench.record import format_tolerance
 from lavender.lab.bench.resampling import (
     STARTS,
     ResampledRanking,
@@ -32,7 +32,6 @@ from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, EngineAnswers, is_ranked_before, rank_engine
 from lavender.lab.report.figures import is_plug_in
-from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_left_out_count, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
 
@@ -91,29 +90,17 @@ def build_verdict(
 ) -> Verdict:
     """Build the recommendation for all that was measured together: single cases, then sequences.
 
-    The recommendation is by motion error if the plan has velocity tolerances. If motion errors were measured in
-    addition to residuals, a sentence names the first solver by motion error. Each of `times` [s] and `sweeps` gets a
-    sentence; the default are the budgets of the newest plan. The first sentence also
-    ranks the solver of the engine that recorded the cases, by its answers in `engines`.
+    Each of `times` [s] and `sweeps` gets a sentence; the default are the budgets of the newest plan. The first sentence
+    also ranks the solver of the engine that recorded the cases, by its answers in `engines`.
     """
     if statistics.is_campaign(records) or not len(records):
         return Verdict((), ())
     plan = next((run.plan for run in reversed(list(records.runs.values()))), {})
-    speeds = get_velocity_tolerances(records)
-    if speeds and plan.get("velocity_tolerances"):
-        return _recommend_by_motion_error(convert_to_motion_errors(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
     subjects = list_subjects(records, times)
     parts = [_recommend_solver(records, subject, times, sweeps, engines) for subject in subjects]
     statements = [statement for part in parts for statement in part.statements]
-    if speeds and parts:
-        best = list_subjects(convert_to_motion_errors(records))[0].best.best
-        if best is not None:
-            reached = _describe_velocity_tolerance(speeds[len(speeds) // 2])
-            statements.append(
-                Statement(f"By motion error {best.solver}: {format_seconds(best.score)} {reached}.")
-            )
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
     return Verdict(tuple(statements), tuple(leaders)[:3], parts[0].ranking if len(parts) == 1 else ())
 
@@ -192,54 +179,7 @@ def _recommend_solver(
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
 
 
-def _recommend_by_motion_error(records: Records) -> Verdict:
-    """Recommend the solver that is fastest to bring every body's velocity error below the middle tolerance.
-
-    Single cases decide if there are any, else sequences. Interleaved calls are not used.
-    """
-    subject = list_subjects(records)[0]
-    best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
-    cases, reached = _describe_subject(records, subject, n), _describe_velocity_tolerance(subject.best.target)
-    leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
-    first = best.best
-    if first is None:
-        return Verdict((Statement(f"No solver brings {cases} so far {reached}."),), leaders)
-    ties = (Statement(f"As good within noise: {', '.join(best.tied_solvers)}."),) if best.tied_solvers else ()
-    tol = _find_tolerance_of_fastest_runs(records, first.solver, best.target)
-    arguments = (
-        f"tol={format_tolerance(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
-    )
-    code = f'lv.solve(problem, "{first.solver}", {arguments})'
-    start = STARTS["carried" if "carried" in first.how else "cold"]
-    text = _describe_recommended_choice(records, first, f"{start}, {reached}", cases)
-    return Verdict((Statement(text, (code,)), *ties), leaders)
-
-
-def _find_tolerance_of_fastest_runs(records: Records, solver: str, tolerance: float) -> float:
-    """Return the smallest `tol` of the runs that reach the motion error `tolerance` [m/s] fastest, over the cases.
-
-    The result is rounded down to one digit; it is nan if the solver has no such run.
-    """
-    fastest: dict[str, Record] = {}
-    for r in records:
-        if r.solver != solver or r.mode != "tol" or r.relative > tolerance:
-            continue
-        if r.case not in fastest or r.time_min < fastest[r.case].time_min:
-            fastest[r.case] = r
-    tightest = min((r.tol for r in fastest.values()), default=math.nan)
-    if not tightest > 0.0:
-        return math.nan
-    power = math.floor(math.log10(tightest))
-    # Rounded down, so that it suffices for all.
-    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")
-
-
 # -- sentences -----------------------------------------------------------------------------------------------
-
-
-def _describe_velocity_tolerance(speed: float) -> str:
-    """Return words for a velocity tolerance [m/s]."""
-    return f"until no body has a velocity error above {format_speed(speed)}"
 
 
 def _describe_subject(records: Records, subject: Subject, n: int) -> str:

@@ -1,54 +1,13 @@
-"""Motion errors on records: what they say, what they cost those who do not ask, tolerances in metres per second."""
+"""Measures of difficulty of a case, and records of runs without an iteration."""
 
 from dataclasses import replace
 
 import lavender as lv
 from lavender import bench, suite
 from lavender.lab.bench import statistics
-from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.report import write
 
 SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 60.0}
-
-
-def test_a_record_has_the_motion_error_of_its_run():
-    records = bench.run(["stack(n=8)"], ["pgs"], bench.Plan(tolerances=(1e-3,), motion=True, **SHORT))
-    problem = suite.case("stack(n=8)").problem
-    for r in records:
-        again = lv.solve(problem, "pgs", tol=r.tol, max_iter=r.max_iter or None)
-        error = again.motion_error()
-        assert (r.motion_error, r.motion_speed, r.bound) == (error.relative, error.speed, error.bound)
-        assert r.motion_speed > 0.0
-        assert from_json(to_json(r)) == r
-
-
-def test_speed_levels_are_reached_by_tighter_residuals():
-    plan = bench.Plan(tolerances=(1e-1,), velocity_tolerances=(1e-2, 1e-4), **SHORT)
-    assert plan.motion
-    records = bench.run(["stack(n=16)"], ["pgs", "anderson", "jacobi"], plan)
-    for solver in ("pgs", "anderson"):
-        mine = [r for r in records if r.solver == solver and r.mode == "tol"]
-        assert min(r.motion_speed for r in mine) <= 1e-4
-        assert len({r.tol for r in mine}) == len(mine)  # nothing is asked for twice
-        # One decade of speed is about one of residual: no solve is much tighter than it must be.
-        assert min(r.tol for r in mine) >= 1e-7
-
-
-def test_speed_levels_end_where_a_solver_does():
-    """A solver that misses its residual is not asked for a tighter one; every loop is counted."""
-    plan = bench.Plan(tolerances=(1e-1,), velocity_tolerances=(1e-6, 1e-9), **{**SHORT, "time_limit": 0.02})
-    records = bench.run(["hang(n=33, tip_mass=1e4)"], ["jacobi"], plan)
-    assert sum(r.mode == "tol" for r in records) <= 2
-
-
-def test_no_speed_level_without_a_reference():
-    """An infeasible problem has no solution to be away from: one solve, and no number."""
-    problem = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0], name="infeasible")
-    records = bench.run(
-        [problem], ["pgs"], bench.Plan(tolerances=(1e-1,), velocity_tolerances=(1e-3,), **SHORT)
-    )
-    assert records.records
-    assert all(r.motion_speed is None for r in records)
 
 
 def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration(tmp_path):

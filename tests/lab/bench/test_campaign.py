@@ -19,26 +19,14 @@ from lavender.lab.bench.record import to_json
 from lavender.lab.bench.running import workers as workers_module
 from lavender.lab.report.findings import Report
 
-NAMES = bench.expand_seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
+SEEDED = [f"granular(n=2, seed={i})" for i in range(40)]
+NAMES = [*(f"random_spd(n=12, condition=100, seed={i})" for i in range(4)), *SEEDED[:4], "toy_stack"]
 PLAN = bench.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
 SHORT = bench.CampaignPlan(tolerances=(1e-6,), budgets=(), orders=())
 
 
 def lines(records):
     return [json.dumps(to_json(r)) for r in records]
-
-
-def test_seeds_are_spread_over_cases_that_take_one():
-    assert bench.expand_seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack", "@hard"], 2) == [
-        "granular(n=2, seed=0)",
-        "granular(n=2, seed=1)",
-        "random_spd(seed=5)",
-        "toy_stack",
-        "@hard",
-    ]
-    assert bench.expand_seeds(["granular(n=2)"], 1, first=7) == ["granular(n=2, seed=7)"]
-    with pytest.raises(lv.InputError):
-        bench.expand_seeds(["2 +"], 2)
 
 
 def test_one_worker_and_two_give_the_same_bits_and_no_times():
@@ -165,7 +153,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     distributed = pytest.importorskip(
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
     )
-    names = bench.expand_seeds(["granular(n=2)"], 16)
+    names = SEEDED[:16]
     plan = bench.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64), orders=())
     expected = bench.run(names, ["pgs", "jacobi"], plan)
     with (
@@ -193,7 +181,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
 @pytest.mark.slow
 def test_after_a_cluster_that_goes_midway_the_next_run_goes_on(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
-    names, path = bench.expand_seeds(["granular(n=2)"], 40), tmp_path / "records.jsonl"
+    names, path = SEEDED, tmp_path / "records.jsonl"
     plan = bench.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64), orders=())
     code = (
         "import sys, distributed\n"

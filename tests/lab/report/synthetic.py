@@ -74,9 +74,6 @@ def example(folder):
             "auto",
             size,
             1e-9,
-            motion_speed=1e-4,
-            motion_error=1e-3,
-            bound=1e-5,
             solution_hash="a",
         )
         interleaved(
@@ -85,7 +82,6 @@ def example(folder):
             "direct",
             2.0 * size,
             1e-13,
-            motion_speed=1e-8,
             solution_hash="b",
             boundary_fraction=0.25,
         )

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from lavender.lab.report.figures import build_figures
-from lavender.lab.report.latex_export import write_paper
 from lavender.lab.report.write import write
 from tests.lab.report.synthetic import EVIL, example, shown
 
@@ -76,7 +75,6 @@ def written(tmp_path_factory):
     folder.mkdir()
     found = example(folder)
     write(found, folder / "out")
-    write_paper(found, folder / "out" / "paper")
     return found, folder
 
 
@@ -102,42 +100,26 @@ def test_the_page_is_well_formed_stands_alone_and_shows_every_part(written):
     assert page.links <= page.ids
     assert "<script>alert" not in text and "<b>row" not in text and EVIL not in text
     drawn = build_figures(found.ranked_records)
-    assert text.count("<svg") == len(list(drawn)) - len(
-        drawn.moved.over
-    )  # the first screen has the residual alone
+    assert text.count("<svg") == len(list(drawn))
     first = text[text.index("<body>") : text.index('<details class="part"')]
     assert first.count("<svg") == 1 and 'class="b"' in first and "<table" not in first
     check("page.txt", page.shown, folder)
 
 
-def test_the_summary_and_the_paper(written):
+def test_the_summary(written):
     _, folder = written
     out = folder / "out"
     summary = (out / "summary.md").read_text(encoding="utf-8")
     check("summary.md", re.sub(r"(?m)^\|.*\n", "", summary), folder)  # its tables are those of tables.txt
     assert len(re.findall(r"(?m)^\| pile \|", summary)) > 10
-    texts = [
-        (out / "paper" / name).read_text(encoding="utf-8")
-        for name in ("tables.tex", "figures.tex", "method.tex")
-    ]
-    check("paper.tex", "\n".join(texts), folder)
 
 
-def test_files_are_whole_and_a_paper_has_no_clock(written):
+def test_files_are_whole(written):
     found, folder = written
     out = folder / "out"
     assert {p.name for p in out.iterdir()} == {
-        "records.csv", "records.json", "index.html", "summary.md", "figures", "paper"
+        "records.csv", "records.json", "index.html", "summary.md", "figures"
     }  # fmt: skip
     saved = {p.name for p in (out / "figures").iterdir()}
     assert len(saved) == 2 * len(list(build_figures(found.ranked_records)))
     assert all(p.stat().st_size > 1000 for p in (out / "figures").iterdir())
-    pdf = {p.name: p.read_bytes() for p in (out / "paper").glob("*.pdf")}
-    captions = (out / "paper" / "figures.tex").read_text(encoding="utf-8")
-    assert set(re.findall(r"includegraphics\[width=.linewidth\]{(.*?)}", captions)) == set(pdf)
-    assert all(
-        data.startswith(b"%PDF") and b"/Type3" not in data for data in pdf.values()
-    )  # publishers refuse such fonts
-    before = {p.name: p.read_bytes() for p in (out / "paper").iterdir()}
-    write_paper(found, out / "paper")
-    assert {p.name: p.read_bytes() for p in (out / "paper").iterdir()} == before

@@ -1,6 +1,5 @@
 """Figures hold the runs that they show; one plotter draws them for files, papers and the page."""
 
-import dataclasses
 import math
 import re
 from xml.etree import ElementTree
@@ -8,9 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-import lavender as lv
-from lavender.lab.report import figures, latex_export
-from lavender.lab.report.findings import Report
+from lavender.lab.report import figures
 from lavender.lab.report.plotting import (
     assign_styles,
     choose_limits,
@@ -135,50 +132,6 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
     assert repr(figures.build_overall_figure(records_of(*made, *more))) == repr(found)  # whose floor is NaN
 
 
-@pytest.mark.slow
-def test_a_paper_has_a_figure_for_each_folder_and_one_time_for_all_solvers(tmp_path, monkeypatch):
-    """osqp is drawn although five solvers are better, at the time of its call; captions define the time."""
-    made, places = [], {"a": "piles", "b": "piles", "c": "chains", "d": "chains"}
-    others = ("admm", "anderson", "jacobi", "newton", "nncg", "pgs")
-    call = {"timing_mode": "call"}
-    for case in places:
-        made += [
-            record(case, name, 1e-3 * (1 + i), 10.0 ** (i - 14), **call) for i, name in enumerate(others)
-        ]
-        made.append(record(case, "osqp", 12.7e-3, 1e-7, backend_time_min=1.1e-3, **call))
-    found = records_of(*made)
-    for case, folder in places.items():
-        found.add(dataclasses.replace(found.cases[case], source=f"mine/{folder}/{case}.npz"))
-    drawn, plot = {}, latex_export.plot_figure
-    monkeypatch.setattr(
-        latex_export, "plot_figure", lambda f, *more: drawn.update({f.name: f}) or plot(f, *more)
-    )
-    latex_export.write_paper(Report(found), tmp_path)
-    for name in ("over all", "class piles", "class chains"):
-        (osqp,) = (c for c in drawn[name].curves if c.solver == "osqp")
-        assert osqp.x[0] == pytest.approx(12.7e-3, rel=0.06)  # a step of the grid: 12.7^(1/48)
-        assert len(drawn[name].curves) == figures.MAX_CURVES and len(drawn[name].left_out) == 2
-        assert drawn[name].x_title == "time of a call [s]"
-    solvers = ["osqp", *others]
-    canvas = plot(dataclasses.replace(drawn["over all"], title=""), assign_styles(solvers))
-    place = canvas.axes[0].get_position()
-    assert place.x0 < 0.15 and place.x1 > 0.95  # no third of it is left to a legend
-    assert canvas.axes[0].get_legend().get_title().get_text() == "5 of 7 solvers"
-    tex = {name: (tmp_path / f"{name}.tex").read_text() for name in ("figures", "tables", "method")}
-    assert all(
-        "duration of one call of lv.solve, with set-up, solve, judge and Python" in text
-        for text in tex.values()
-    )
-    assert all("(the set-up of osqp includes the conversion of the problem)" in text for text in tex.values())
-    assert "osqp & 12.7 (4/4)" in tex["tables"]  # like all others
-    assert (
-        re.search(r"osqp & 4 & 12\.7 & 1\.10 & 11\.6 & 0 ", tex["tables"])
-        and "(without set-up: osqp)" in tex["tables"]
-    )
-    with pytest.raises(lv.InputError, match="runs with times"):
-        latex_export.write_paper(Report(records_of()), tmp_path / "none")
-
-
 def test_an_axis_of_time_names_the_code_that_was_timed():
     titles = {"call": "time of a call [s]", "steps": "time of a call [s]", "": "time of set-up and solve [s]"}
     for mode, title in titles.items():
@@ -231,43 +184,3 @@ def test_an_axis_of_iterations_names_their_unit():
         figures.build_budget_figure(records_of(*sweeps, other), "a").x_title
         == "iterations, each solver's own unit"
     )
-
-
-@pytest.mark.slow
-def test_a_paper_draws_every_plug_in_profiles_by_work_and_gives_no_advice(tmp_path, monkeypatch):
-    """The plug-in is slower than six others, which fill a figure without it; it makes the fewest passes."""
-    others, made = ("anderson", "jacobi", "nncg", "pgs", "sequential_impulses", "sor"), []
-    for case in "ab":
-        made += [
-            record(case, name, 1e-3 * (1 + i), 1e-7, work={"sweeps": 40 + i}, load=99.0)
-            for i, name in enumerate(others)
-        ]
-        made.append(record(case, "my_solver", 5e-2, 2e-7, work={"matvecs": 20}, load=99.0))
-        made.append(record(case, "direct", 5e-4, 1e-15, work={"factorisations": 1}, load=99.0))
-    found, drawn, plot = records_of(*made), {}, latex_export.plot_figure
-    monkeypatch.setattr(
-        latex_export, "plot_figure", lambda f, *more: drawn.update({f.name: f}) or plot(f, *more)
-    )
-    report = Report(found)
-    assert "measure again" in report.busy_warning and "measure again" not in report.high_load
-    latex_export.write_paper(report, tmp_path)
-    for name in ("over all", "profile lcp 1e-6", "work profile lcp 1e-6"):
-        assert "my_solver" in {c.solver for c in drawn[name].curves}
-        assert len({c.solver for c in drawn[name].curves}) == figures.MAX_CURVES
-    work = {c.solver: c for c in drawn["work profile lcp 1e-6"].curves}
-    assert "direct" not in work and work["my_solver"].x == (1.0,) and work["my_solver"].y == (100.0,)
-    assert work["anderson"].x == (1.0, 2.0) and work["anderson"].y[1] == 100.0  # 40 passes against 20
-    tex = "".join((tmp_path / f"{name}.tex").read_text() for name in ("figures", "tables", "method"))
-    assert (
-        "Load during the runs: 99.0 on average" in tex
-        and "measure again" not in tex
-        and "--no-reuse" not in tex
-    )
-    assert "A curve is flat after the last run of its solver" in tex and "fewest passes over A" in tex
-    assert "In 16 of 16 runs more processes were runnable (up to 99) than the machine has cores (2)" in tex
-    assert (
-        tex.count("16 runs more processes") == 1
-        and "The machine was busy: these times may be too long" in tex
-    )
-    (mine,) = (c for c in drawn["work over all"].curves if c.solver == "my_solver")
-    assert mine.x[-1] >= 40.0 and mine.y[-1] == 2e-7

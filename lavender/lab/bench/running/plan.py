@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
@@ -16,9 +14,6 @@ from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
-# To reach a motion error [m/s], a solver runs with `tol` from FIRST_TOL down to LAST_TOL, MAX_SPEED_TRIES times at
-# most.
-FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
 # [s] After this time, a campaign kills the process of a third-party solver and records KILLED.
@@ -48,11 +43,6 @@ class Plan:
     orders : sequence of str
         Sweep orders in addition to "given", each at the middle budget, for solvers with a sweep order; "random:3" is
         random with seed 3.
-    motion : bool
-        Measure the motion error, from a reference that is solved once for each case.
-    velocity_tolerances : sequence of float, m/s
-        Motion errors to reach; implies `motion`. Each solver is run to the residual that is estimated to reach them,
-        with tighter residuals if it does not, up to `MAX_SPEED_TRIES` times per tolerance.
     times : sequence of float, s
         Time budgets for which the report recommends a solver.
     sweeps : sequence of int
@@ -74,18 +64,15 @@ class Plan:
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
-    motion: bool = False
-    velocity_tolerances: Sequence[float] = ()
     times: Sequence[float] = ()
     sweeps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        for name in ("tolerances", "budgets", "orders", "velocity_tolerances", "times", "sweeps"):
+        for name in ("tolerances", "budgets", "orders", "times", "sweeps"):
             entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(entries))
         for name, values in (
             ("tolerance", self.tolerances),
-            ("velocity tolerance", self.velocity_tolerances),
             ("time budget", self.times),
         ):
             for value in values:
@@ -98,7 +85,7 @@ class Plan:
         check_int("repeats", self.repeats, 1)
         check_float("time_limit", self.time_limit, above=0.0)
         check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
-        for name in ("warm", "campaign", "motion"):
+        for name in ("warm", "campaign"):
             check_bool(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = str(word).partition(":")
@@ -110,16 +97,14 @@ class Plan:
                     "integer: random:3"
                 )
         # Remove duplicates: a value given twice would be run twice and change the middle value.
-        for name in ("tolerances", "velocity_tolerances"):
-            object.__setattr__(
-                self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
-            )
+        object.__setattr__(
+            self, "tolerances", tuple(sorted({float(x) for x in self.tolerances}, reverse=True))
+        )
         for name in ("budgets", "sweeps"):
             counts = {check_int("budget", n, 1) for n in getattr(self, name)}
             object.__setattr__(self, name, tuple(sorted(counts)))
         object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
-        object.__setattr__(self, "motion", self.motion or bool(self.velocity_tolerances))
 
     timing_mode = "call"  # Value of `Record.timing_mode` for single problems.
 
@@ -161,10 +146,6 @@ class Plan:
                     spec.resumable or _rules_out_tighter_tolerances(record)
                 ):
                     break
-            if not spec.exact:
-                self._solve_to_velocity_tolerances(
-                    partial(measure_one, "tol", max_iter=max_iterations, start=start)
-                )
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
                     measure_one("budget", 0.0, n, start)
@@ -177,22 +158,6 @@ class Plan:
                 measure_one(
                     "budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {})
                 )
-
-    def _solve_to_velocity_tolerances(self, solve_to: Callable[[float], Record]) -> None:
-        """Solve to each velocity tolerance. The ratio of motion error to residual is taken from the previous solve."""
-        tol = FIRST_TOL
-        last: Record | None = None
-        for tolerance in self.velocity_tolerances:
-            for _ in range(MAX_SPEED_TRIES):
-                if last is not None:
-                    speed = math.inf if last.motion_speed is None else last.motion_speed
-                    if speed <= tolerance:
-                        break
-                    # Stop if the residual was missed, if the motion error is unknown, or at the tightest `tol`.
-                    if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
-                        return
-                    tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * tolerance / speed))
-                last = solve_to(tol)
 
 
 @dataclass(frozen=True)

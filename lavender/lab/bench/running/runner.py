@@ -22,7 +22,6 @@ from typing import Any
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.judge.states import compute_states
-from lavender.lab import motion
 from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
@@ -31,12 +30,10 @@ from lavender.lab.bench.running.timing import CallSpec, Task, limit_to_one_threa
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.bench.store import Records, Store, open_store
-from lavender.lab.motion import load_reference
 from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
-MOTION_SEARCH_RUNS = 6  # Number of solves that search for several motions, once for each Coulomb problem.
 # If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
 UNGUARDED_TIME_RATIO = 0.05
 # Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies
@@ -73,25 +70,6 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
     """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
     check_problem(problem)
     return problem.carry((before, impulse))
-
-
-def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
-    """Return the record with `motion_error`, `motion_speed` and `bound` of its impulses (m,) [N s].
-
-    It is called outside timed code. The reference solution, and under Coulomb's law the motions that are found, are
-    cached in `problem`.
-    """
-    if impulse is None:
-        return record
-    problem, impulse = problem.disk, problem.on_disk(impulse)
-    found = motion.get_solutions(problem, MOTION_SEARCH_RUNS) if problem.law == "coulomb" else None
-    error = (
-        motion.motion_error(problem, impulse)
-        if found is None
-        else motion.measure_distance_to_nearest(problem, impulse, found)
-    )
-    speed = error.rows if error.speed is None else error.speed
-    return replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
 
 
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
@@ -363,8 +341,6 @@ class Runner:
             info = self.described.get(item.name)
             if info is None or info.sha != hash_problem(item.problem):
                 info = describe_case(item, self.this.run)
-            if self.plan.motion:
-                load_reference(item.problem, item.source)
         except Exception as error:  # A reader may raise any exception; only its own case is lost.
             self.add_entry(
                 Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
@@ -516,8 +492,6 @@ class Runner:
             record, found = measure_task(problem, task, impulse)
         if found is not None:
             record = add_solution_hash(record, problem, found)
-        if self.plan.motion:
-            record = add_motion_error(record, problem, found)
         return remove_times(record, self.plan.time_limit) if self.plan.campaign else record, found
 
 
