@@ -31,9 +31,8 @@ ACCELERATED_PATIENCE = 500
 # are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570
 # rows of 17, which exceed the second-level cache.
 MAX_ENTRIES_PER_ROW, MAX_SWEPT_ENTRIES = 40, 600_000
-CONVEX_OPTION = (
-    "iterations under the cone law before those under Coulomb's law, for piles that stick; default 0"
-)
+CONVEX_OPTION = "iterations under the cone law before those under Coulomb's law, for piles that stick"
+AUTOMATIC = -1  # Value of the kernel's `convex`: it selects the law by tests.
 SWEEP_OPTION = (
     "'pgs' or 'blocks' (each contact and joint is solved exactly); default 'pgs', under the cone law 'blocks'"
 )
@@ -55,7 +54,7 @@ class Accelerated(Sweeping):
     """Base class of accelerated sweeps. A `_memory` of 0 selects nncg, other values Anderson acceleration."""
 
     sweep: str | None = None
-    convex: int = 0
+    convex: int | None = 0
 
     @property
     def _memory(self) -> int:
@@ -91,7 +90,7 @@ class Accelerated(Sweeping):
                 "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give "
                 "sweep='blocks'"
             )
-        if not isinstance(self.convex, int) or self.convex < 0:
+        if self.convex is not None and (not isinstance(self.convex, int) or self.convex < 0):
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
 
     def _build_state(
@@ -101,7 +100,8 @@ class Accelerated(Sweeping):
 
     def _build_state_over_data(self, problem: Problem, order: Order, data: Any) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
-        convex = self.convex if problem.law == "coulomb" else 0
+        convex = AUTOMATIC if self.convex is None else self.convex
+        convex = convex if problem.law == "coulomb" else 0
         return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
 
     def _add_work_to_claim(self, state: AcceleratedState, claim: Claim, restarts: int) -> Claim:

@@ -4,7 +4,9 @@
     gamma = argmin | f - sum_i gamma_i (f_{i+1} - f_i) |       over the last `memory` sweeps
 
 On a linear problem this is a truncated GMRES with the sweep as preconditioner. It needs neither a symmetric A nor an
-energy, so it also accelerates friction. A step that doubles |f| is undone, and the memory is cleared.
+energy, so it also accelerates friction. A step that doubles |f| is undone, and the memory is cleared. Sweeps under
+Coulomb's law alone do not converge on large piles. From 900 rows on, sweeps 17 to 512 are therefore under the cone law,
+unless a test shows that contacts slip (`lavender_ext/accelerate/accelerated.pyx`, (4) and (5)).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from lavender.solvers.registry import SolverSpec
 class Anderson(Accelerated):
     """Anderson-accelerated sweeps; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
+    convex: int | None = None
     memory: int = 5
 
     def __post_init__(self) -> None:
@@ -42,7 +45,7 @@ SPEC = SolverSpec(
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,
-        "convex": CONVEX_OPTION,
+        "convex": CONVEX_OPTION + "; default None: sweeps 17 to 512 from 900 rows on, unless contacts slip",
         "memory": "number of sweeps that are combined, from 1 to 16; default 5",
     },
     summary="Anderson acceleration of Gauss-Seidel sweeps",

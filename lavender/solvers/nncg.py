@@ -53,7 +53,7 @@ SPEC = SolverSpec(
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,
-        "convex": CONVEX_OPTION,
+        "convex": CONVEX_OPTION + "; default 0",
         "restart": "'growth' (restart if the factor beta of the search direction exceeds 1; the default) or 'against' "
         "(restart only if the direction also points against the sweep; much faster on piles under Coulomb's law)",
     },

@@ -46,7 +46,7 @@ class SolverOptions(TypedDict, total=False):
     form: str
     relaxation: float
     memory: int
-    convex: int
+    convex: int | None
     restart: str
     sweep: Literal["pgs", "blocks"]
     omega: float

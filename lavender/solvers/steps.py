@@ -28,7 +28,7 @@ NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 #: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    "anderson": ("anderson", {}),
+    "anderson": ("anderson", {"convex": 0}),
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),

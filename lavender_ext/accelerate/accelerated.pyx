@@ -13,12 +13,21 @@ is a sweep followed by the same sweep backwards. The returned iterate is always 
 order.
 
 (2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
-which has the same solution as Coulomb's law if all contacts stick.
+which has the same solution as Coulomb's law if all contacts stick. If `convex` is AUTOMATIC and there are MIN_CONVEX_ROWS rows,
+anderson sweeps FIRST_LAW_TEST times under Coulomb's law, then under the cone law. At doubling numbers of iterations it compares
+the steps f of one sweep under each law, and returns to Coulomb's law for good if
+
+    |f_cone| < 0.5 |f_coulomb|,  |f_coulomb| > 0.8 |f_coulomb of the test before|     contacts slip at the cone solution  (4)
+    |f_coulomb| < 0.95 |f_cone|   (0.15 |f_cone| at the first test)                   Coulomb's law is no harder          (5)
+
+Measured: at the first test, |f_coulomb| / |f_cone| is 0.22 to 0.75 in piles that stick, 0.01 to 0.13 in piles of balls that slip,
+0.34 to 0.6 in pyramids, and below 0.02 after a warm start with slip. Later, |f_coulomb| falls by 0.01 to 0.6 from test to test
+in piles that stick, by 0.85 to 1 in pyramids that slip, and is 0.83 to 0.93 times |f_cone| in towers and walls.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.accelerate.accelerated cimport acceleration_t
+from lavender_ext.accelerate.accelerated cimport AUTOMATIC, acceleration_t
 from lavender_ext.accelerate.mixing cimport (
     CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
 )
@@ -35,6 +44,11 @@ cdef enum:
     # Number of nncg iterations after which v is recomputed, because rounding errors accumulate in it.
     VELOCITY_REFRESH_INTERVAL = 64
 
+cdef enum:
+    MIN_CONVEX_ROWS = 900       # With fewer rows, sweeps under Coulomb's law alone converge nearly as often.
+    MAX_CONVEX_ITERATIONS = 512     # Piles that stick need up to 320 iterations under the cone law (57,840 rows).
+    FIRST_LAW_TEST = 16         # Sweeps under Coulomb's law before the first test of (5). Easy problems are solved by then.
+
 cdef enum:                      # indices in `control` of nncg
     NORM = 0                    # g.Dg of the last sweep
     RESTARTS = 1                # number of dropped directions p
@@ -45,7 +59,7 @@ cdef inline void sweep_once_in_order(acceleration_t* c, double* lam, int32_t fir
     cdef const blocks_t* p = c.sweeps.blocks
     cdef bint exact = c.sweeps.exact
     cdef int32_t k
-    if c.iterations < c.convex:
+    if c.convex_begin <= c.iterations < c.convex:
         p = &c.cone
         exact = True
     for k in range(2 if c.sweeps.mode == SYMMETRIC else 1):
@@ -121,6 +135,31 @@ cdef inline void extrapolate_nesterov(double* y, double* x, double* p, double be
         x[i] = q
 
 
+cdef inline double compute_sweep_step(acceleration_t* c, const blocks_t* p, bint exact, const double* lam) noexcept nogil:
+    """Return |f| of one sweep from lam (m) under the law of p. The velocities are those of lam before and afterwards."""
+    cdef int32_t i
+    cdef double* x = c.work
+    for i in range(p.n_rows):
+        x[i] = lam[i]
+    sweep_over_form(c.sweeps, p, exact, x, False)
+    compute_sweep_velocities(c.sweeps, lam)
+    return sqrt(subtract_and_weighted_norm(p.d, x, lam, p.n_rows))
+
+
+cdef inline void test_law(acceleration_t* c, const mixing_t* mixing, const double* lam) noexcept nogil:
+    """Compare both laws at lam (m) [N s]: begin the iterations under the cone law, or end them if (4) or (5) holds."""
+    cdef bint is_first = c.iterations == c.convex_begin, slips
+    cdef double coulomb = compute_sweep_step(c, c.sweeps.blocks, c.sweeps.exact, lam)
+    cdef double cone = compute_sweep_step(c, &c.cone, True, lam)
+    slips = not is_first and cone < 0.5 * coulomb and coulomb > 0.8 * c.last_coulomb_step
+    if slips or coulomb < (0.15 if is_first else 0.95) * cone:
+        c.convex = c.iterations
+    if is_first != (c.convex == c.iterations):          # The law changes.
+        clear_mixing_memory(mixing)
+    c.last_coulomb_step = coulomb
+    c.next_law_test = 2 * c.iterations
+
+
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """Run n iterations (1) of nncg on lam (m) [N s] in place; first_sweep is 1 if no sweep was made before."""
     cdef acceleration_t* c = <acceleration_t*>context
@@ -187,6 +226,8 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
+        if c.iterations == c.next_law_test and c.iterations < c.convex:
+            test_law(c, &mixing, lam)
         # Do not limit sum |gamma|: recorded rockfalls need large sums to reach a residual of 1e-10.
         mixed = mix_anderson_iterates(&mixing, lam, 1.0 / 0.0)
         if mixed:
@@ -225,18 +266,27 @@ cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) 
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
+cdef int32_t count_convex_iterations(int32_t m, int32_t convex) noexcept nogil:
+    """Return the largest number of iterations under the cone law for m rows and the option `convex`."""
+    if convex != AUTOMATIC:
+        return convex
+    return MAX_CONVEX_ITERATIONS if m >= MIN_CONVEX_ROWS else 0
+
+
 cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
                      double* workspace) noexcept nogil:
     """Accelerate a run of sweeps x that has been started and has made no sweep.
 
-    memory is the number of sweeps that Anderson mixing combines; 0 selects nncg. workspace has `accelerated_workspace_size`
-    doubles, all 0.
+    memory is the number of sweeps that Anderson mixing combines; 0 selects nncg, for which convex is not AUTOMATIC. workspace
+    has `accelerated_workspace_size` doubles, all 0.
     """
     cdef sweep_context_t* sweeps = &x.context
     x.step, x.step_context, x.forget = lav_nncg if memory == 0 else lav_anderson, c, restart_acceleration
     c.sweeps, c.cone = sweeps, sweeps.blocks[0]
     c.cone.law = CONE
-    c.memory, c.convex, c.keeps, c.iterations = memory, convex, keeps, 0
+    c.memory, c.convex, c.keeps, c.iterations = memory, count_convex_iterations(sweeps.blocks.n_rows, convex), keeps, 0
+    c.convex_begin = FIRST_LAW_TEST if convex == AUTOMATIC else 0
+    c.next_law_test = FIRST_LAW_TEST if convex == AUTOMATIC else -1
     c.work = workspace
     c.gram = workspace + 3 * (sweeps.blocks.n_rows + sweeps.n_v) + (1 + 2 * <int64_t>memory) * sweeps.blocks.n_rows
     c.control = c.gram + MAX_MEMORY * MAX_MEMORY
@@ -257,7 +307,7 @@ cdef class AcceleratedSweeps(Sweeps):
     memory : int
         Number of sweeps that Anderson mixing combines, up to 16; 0 selects nncg.
     convex : int
-        Number of iterations at the beginning that use the cone law and solve blocks exactly.
+        Number of iterations at the beginning that use the cone law and solve blocks exactly; -1: automatic (anderson only).
     keeps : bool
         If true, nncg with beta > 1 drops a direction only if it points against the sweep, (3) of the module.
     """
@@ -268,7 +318,7 @@ cdef class AcceleratedSweeps(Sweeps):
         cdef int64_t n = accelerated_workspace_size(v.p.n_rows, count_sweep_velocities(&v), memory)
         self.x.packing.single = True
         start_accelerated_sweeps(&self.x, &self.acceleration, memory, convex, keeps,
-                   self.allocate(p, order, split, mode, rng, exact, exact or convex > 0, n))
+                   self.allocate(p, order, split, mode, rng, exact, exact or count_convex_iterations(v.p.n_rows, convex) > 0, n))
 
     cdef double undone(self) noexcept:
         """Return the number of restarts."""

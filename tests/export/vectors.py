@@ -20,6 +20,7 @@ from lavender.base.errors import InputError
 from lavender.export import HEADER
 from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.solvers import registry
+from lavender.solvers._accelerated import AUTOMATIC
 from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
@@ -136,10 +137,11 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     remaining = dict(options)
     order = remaining.pop("order", "given")
     sweep, restart = remaining.pop("sweep", None), remaining.pop("restart", "growth")
+    convex = remaining.pop("convex", None if solver == "anderson" else 0)
     numbers = (
         remaining.pop("memory", 10 if solver == "admm" else 5),
         SWEEPS.get(sweep, -1),
-        remaining.pop("convex", 0),
+        AUTOMATIC if convex is None else convex,
         int(restart == "against"),
     )
     omega = remaining.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0

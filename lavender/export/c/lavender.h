@@ -148,7 +148,7 @@ typedef struct lav_options {
   int32_t order;               /* LAV_GIVEN | LAV_SYMMETRIC | LAV_RANDOM | LAV_REVERSE */
   int32_t memory;              /* anderson, admm: iterations that are combined, 1 to 16 */
   int32_t sweep;               /* anderson, nncg: LAV_DEFAULT_SWEEP (blocks under the cone law, else pgs) | ... */
-  int32_t convex;              /* anderson, nncg: iterations under the cone law first */
+  int32_t convex;              /* anderson, nncg: iterations under the cone law first; anderson: -1 selects them by tests */
   int32_t keeps;               /* nncg: 1 restarts only against the sweep */
   uint64_t seed;               /* of LAV_RANDOM */
   double omega;                /* sor: 0 to 2; jacobi: > 0, or 0 for the safe damping */

@@ -107,6 +107,7 @@ int32_t lav_default_options(int32_t method, lav_options *out) {
   out->size = (uint32_t)sizeof *out;
   out->method = method;
   out->memory = method == LAV_ADMM ? 10 : 5;
+  out->convex = method == LAV_ANDERSON ? accelerate_accelerated_AUTOMATIC : 0;
   out->omega = method == LAV_SOR ? 1.5 : method == LAV_GAUSS_SEIDEL ? 1.0 : 0.0;
   return LAV_OK;
 }
@@ -164,7 +165,7 @@ static int32_t check_options(const lav_options *o) {
   if (o->size != sizeof *o) return LAV_ERROR_VERSION;
   if (!lav_name(o->method) || o->order < LAV_GIVEN || o->order > LAV_REVERSE) return LAV_ERROR_OPTION;
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
-  if (o->convex < 0 || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
+  if (o->convex < (o->method == LAV_ANDERSON ? accelerate_accelerated_AUTOMATIC : 0) || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
   if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_validate_is_valid_number(o->omega))) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;

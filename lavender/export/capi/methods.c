@@ -24,14 +24,15 @@ static int32_t start_sweeps(lav_solver *s) {
   double *workspace;
 #ifndef LAV_SWEEPS_ONLY
   const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
-  const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0;
+  const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0,
+                cone_sweeps = accelerate_accelerated_count_convex_iterations(s->p.n_rows, convex);
   x->packing.single = is_accelerated(o);
   x->context.exact = o->method == LAV_BLOCK_GAUSS_SEIDEL;
   if (x->packing.single) {
     x->context.exact = o->sweep == LAV_BLOCK_SWEEP || (o->sweep == LAV_DEFAULT_SWEEP && is_cone);
     more = accelerate_accelerated_accelerated_workspace_size(s->p.n_rows, s->n_v, memory);
   }
-  if (x->context.exact || (x->packing.single && convex > 0)) {
+  if (x->context.exact || (x->packing.single && cone_sweeps > 0)) {
     place = TAKE(s, int32_t, s->p.n_blocks);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
   }

@@ -75,7 +75,7 @@ static int64_t sweeps_workspace_size(const lav_problem *q, const lav_options *o,
   const int32_t exact = o->method == LAV_BLOCK_GAUSS_SEIDEL || (fast && (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE));
   if (!exact && packs)
     numbers += sweep_packed_packed_workspace_size(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
-  if (exact || (fast && o->convex > 0)) numbers += 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
+  if (exact || (fast && accelerate_accelerated_count_convex_iterations(q->n_rows, o->convex) > 0)) numbers += 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
   if (fast) numbers += accelerate_accelerated_accelerated_workspace_size(q->n_rows, n_v, o->method == LAV_NNCG ? 0 : o->memory);
 #else
   (void)q, (void)o;

@@ -94,3 +94,40 @@ def test_first_iterations_are_least_squares_over_the_last_sweeps(memory):
         dy, df = (np.diff(v, axis=0).T for v in (ys, fs))
         gamma = np.linalg.lstsq(df, fs[-1], rcond=None)[0] if df.size else np.zeros(0)
         x = y - dy @ gamma if gamma.size else y
+
+
+@pytest.mark.parametrize("parameters", [{"n": 6}, {"n": 6, "sliding": 0.5}])
+def test_anderson_large_pile_at_rest_converges_from_the_cone_law(parameters):
+    """Under Coulomb's law alone, the sweeps end at a residual of about 1e-3."""
+    problem = make_suite_problem("granularF", **parameters)
+    assert lv.solve(problem, "anderson", tol=1e-6, max_iter=100).success
+    assert not lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=1000).success
+
+
+def test_anderson_warm_start_of_slipping_contacts_stays_under_coulomb():
+    """From close to a solution with slip, the sweeps stay under Coulomb's law: the cone law would move away from it."""
+    problem = make_suite_problem("pyramidF", k=10)
+    start = lv.solve(problem, "newton", tol=1e-8).impulse * (1.0 + 1e-4)
+    found, exact = (
+        lv.solve(problem, "anderson", impulse=start, tol=1e-6, max_iter=100, **options)
+        for options in ({}, {"convex": 0})
+    )
+    assert exact.success
+    assert exact.iterations > 16  # The law has been tested after 16 sweeps.
+    assert found.iterations == exact.iterations
+
+
+def test_anderson_slipping_pyramid_leaves_the_cone_law():
+    """The tests of the law cost a few sweeps, not the 512 sweeps that the cone law may take."""
+    problem = make_suite_problem("pyramidF", k=10)
+    found = lv.solve(problem, "anderson", tol=1e-6, max_iter=2000)
+    assert found.success
+    assert (
+        found.iterations < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
+    )
+
+
+def make_suite_problem(name, **parameters):
+    """Return a problem of the suite."""
+    words = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    return lv.suite.case(f"{name}({words})").problem
