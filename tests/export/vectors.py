@@ -20,7 +20,6 @@ from lavender.base.errors import InputError
 from lavender.export import HEADER
 from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.solvers import registry
-from lavender.solvers._accelerated import AUTOMATIC
 from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
@@ -141,7 +140,7 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     numbers = (
         remaining.pop("memory", 10 if solver == "admm" else 5),
         SWEEPS.get(sweep, -1),
-        AUTOMATIC if convex is None else convex,
+        -1 if convex is None else convex,  # -1 selects them by tests.
         int(restart == "against"),
     )
     omega = remaining.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
