@@ -58,7 +58,6 @@ FIGURES = (
     "which_contact",
     "residual_or_motion",
     "motion_over_a_run",
-    "two_motions",
 )
 TOLERANCES = (1e-3, 1e-6, 1e-9)
 CASES = (
@@ -632,7 +631,6 @@ def api_page(site):
         "lab.suite",
         "lab.bench",
         "lab.report",
-        "lab.motion",
         "judge.measures",
         "judge.certificates",
     ):

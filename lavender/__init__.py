@@ -59,11 +59,11 @@ if TYPE_CHECKING:
     from lavender.batch.solve import Solutions, solve_many
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
-    from lavender.lab import bench, motion, report, suite
+    from lavender.lab import bench, report, suite
     from lavender.lab.check import CrossCheck, cross_check
     from lavender.lab.diagnostics import Diagnostic, diagnose
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
-    from lavender.lab.motion import MotionError, SolutionSet, find_solutions, motion_error
+    from lavender.lab.motion import MotionError, motion_error
     from lavender.lab.slip import SlipExplanation, explain_slip
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
@@ -84,7 +84,7 @@ _LAZY_NAMES = {
     "lavender.lab.check": ("CrossCheck", "cross_check"),
     "lavender.lab.diagnostics": ("Diagnostic", "diagnose"),
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
-    "lavender.lab.motion": ("MotionError", "SolutionSet", "find_solutions", "motion_error"),
+    "lavender.lab.motion": ("MotionError", "motion_error"),
     "lavender.lab.slip": ("SlipExplanation", "explain_slip"),
     "lavender.problem.row_builder": ("RowBuilder",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
@@ -103,7 +103,6 @@ _LAZY_MODULES = {
     "errors": "lavender.base.errors",
     "export": "lavender.export",
     "io": "lavender.io",
-    "motion": "lavender.lab.motion",
     "registry": "lavender.solvers.registry",
     "report": "lavender.lab.report",
     "scene": "lavender.sim.scene",
@@ -145,7 +144,6 @@ __all__ = [
     "SlipExplanation",
     "Snapshot",
     "Solution",
-    "SolutionSet",
     "Solutions",
     "SolveFailed",
     "SolverSpec",
@@ -163,12 +161,10 @@ __all__ = [
     "engine",
     "explain",
     "explain_slip",
-    "find_solutions",
     "get",
     "io",
     "known",
     "load",
-    "motion",
     "motion_error",
     "prepare",
     "redundancy",

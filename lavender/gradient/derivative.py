@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.lazy_import import import_module_lazily, issparse
+from lavender.base.lazy_import import issparse
 from lavender.gradient.chains import BodyChain, CoefficientRows
 from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
@@ -579,15 +579,6 @@ class Derivative:
         """Whether the derivative exists: no block is about to switch, and each target can change separately."""
         return not self.switching and bool(self.unique.target.all())
 
-    @property
-    def motions(self) -> Any:
-        """The `SolutionSet` of this problem, computed by `lavender.find_solutions` at the first use.
-
-        Under Coulomb's law there may be several solutions. The derivative belongs to the given solution. It does not
-        describe that a solver may find another solution if the data change.
-        """
-        return import_module_lazily("lavender.lab.motion").get_solutions(self.problem.disk)
-
     def __repr__(self) -> str:
         return f"<Derivative of {self.m} rows: {self}>"
 
@@ -616,7 +607,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     -------
     Derivative
         `.vjp(velocity=, impulse=)` computes gradients by all data, `.jvp(b=, mu=, ...)` changes of the solution.
-        `.states`, `.distance`, `.switching`, `.unique` and `.motions` show whether the derivative exists and is
+        `.states`, `.distance`, `.switching` and `.unique` show whether the derivative exists and is
         unique.
 
     Raises

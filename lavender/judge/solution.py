@@ -386,7 +386,7 @@ class Solution:
         )
 
     def motion_error(self, reference: Any = None) -> Any:
-        """Return the error of the motion in units, with a bound: see `lavender.motion_error`."""
+        """Return the error of the motion in units: see `lavender.motion_error`."""
         return import_module_lazily("lavender.lab.motion").motion_error(
             self.residual._problem, self.impulse, reference
         )

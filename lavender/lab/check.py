@@ -1,8 +1,17 @@
 """Compare solvers with the judge and with a reference optimum, by default from a QP solver.
 
-If the problem is convex, the distance of two answers is bounded by their residuals (`lavender.lab.motion.bound`,
-inequality (3)). A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy
-norm of the difference of velocities, which are unique even if impulses are not.
+If the problem is convex, the distance of two answers is bounded by their residuals. With two answers l1, l2 and their
+errors e1, e2 by the judge, Delta = l1 - l2 and eps = e1 - e2 satisfy
+
+    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
+
+Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
+Cauchy-Schwarz. If A is not symmetric, as in a quadratic program with a singular P, Delta.A Delta >= 0 all the same:
+
+    Delta.A Delta <= |eps.A Delta| + |eps|_D |Delta|_D                                            (2)
+
+A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy norm of the
+difference of velocities, which are unique even if impulses are not.
 """
 
 from __future__ import annotations
@@ -19,7 +28,6 @@ from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
-from lavender.lab.motion.bound import compute_separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_budget, check_time_limit
@@ -64,7 +72,7 @@ class CrossCheckRow:
     distance : float or None, sqrt J
         |Delta|_A to the reference.
     allowed : float or None, sqrt J
-        Largest distance that (3) allows.
+        Largest distance that (1) and (2) allow.
     slack : float or None, m/s
         Largest difference of a row's slack from the reference's.
     objective : float or None, J
@@ -95,7 +103,7 @@ class CrossCheckRow:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the judge contradicts the solver's claim, or inequality (3) is violated."""
+        """Whether the judge contradicts the solver's claim, or inequality (1) is violated."""
         return self.verdict in (CLAIM_CONTRADICTED, BREACH)
 
 
@@ -154,7 +162,7 @@ class CrossCheck:
         """Whether all solvers that accept the problem solve it and agree with the reference; False if none does.
 
         Without a reference nothing is compared: `reference` is None, as always under Coulomb's law, and solvers may
-        have found different motions (see `lavender.find_solutions`).
+        have found different motions.
         """
         verdicts = {row.verdict for row in self.rows} - {REFUSED}
         return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO}
@@ -385,3 +393,45 @@ def _compute_objective(problem: Problem, solution: Solution) -> float:
         return float(problem.qp.solution(solution).objective)
     lam = solution.impulse
     return float(0.5 * (lam @ (solution.slack - problem.b)))
+
+
+def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
+    """Compute |Delta|_A [sqrt J] of two judged answers and the largest value that (1), (2) allow, with rounding."""
+    delta = problem.on_disk(one.impulse - two.impulse)
+    eps = problem.on_disk(one.residual.error - two.residual.error)
+    problem = problem.disk
+    d: Any = problem.d
+    a_delta, a_eps = _multiply_by_a(problem, delta), _multiply_by_a(problem, eps)
+    delta_norm = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    # The errors e are known up to the round-off floors of both residuals, in the norm of D.
+    uncertainty = float(sum(s.residual.floor_energy for s in (one, two)))
+    root = 1.0 / np.sqrt(d)
+    max_stiffness = float(np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0)))
+    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + uncertainty
+    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + max_stiffness * uncertainty
+    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    if problem.has_singular_program:
+        allowed_square = (
+            abs(eps @ a_delta) + uncertainty * np.sqrt(np.sum((root * a_delta) ** 2)) + eps_d * delta_d
+        )
+        rounding_square = 2.0**-50 * (max_stiffness * delta_d) ** 2
+        return delta_norm, float(np.sqrt((1.0 + 1e-9) * allowed_square + rounding_square))
+    # x^2 <= x eps_a + eps_d delta_d bounds x = |Delta|_A by the larger root. `rounding` is the error of Delta.A Delta.
+    rounding = 2.0**-50 * max_stiffness * delta_d
+    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
+    return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
+
+
+def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
+    """Compute A x (m,), without forming A if J and M are known.
+
+    `transform` is applied to the entries of each factor; with `abs`, the result is a bound of |A| x for x >= 0.
+    """
+    if problem.generalized is not None:
+        y = transform(problem.whitened)
+        return y @ (y.T @ x) + problem.compliance * x
+    if problem.rows is None:
+        return transform(problem.csr) @ x
+    assert problem.compliance is not None
+    jac = transform(problem.jacobian)
+    return jac @ (transform(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x

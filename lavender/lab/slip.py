@@ -17,8 +17,7 @@ computed from the impulses of these variants; each variant includes the replacem
 The difference of v_t between two consecutive variants is the part of the slip that the replaced property causes:
 unfinished iterations, the shape of the cone, compliance, the relaxation. The sliding in the last variant cannot be
 prevented by Coulomb friction, because the load along the surface exceeds mu times the normal force. The parts are
-norms of vector differences, so the parts of one contact can add up to more than its speed. If the last problem has
-several solutions, the range of the speed over the solutions that were found is given.
+norms of vector differences, so the parts of one contact can add up to more than its speed.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_float
 from lavender.base.errors import InputError
 from lavender.judge.residuals import residual
-from lavender.lab.motion import find_solutions
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import NONE, format_size
 from lavender.problem import Problem
@@ -60,7 +58,6 @@ REMEDIES = {
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
-MAX_SEARCHED_ROWS = 120  # Several solutions are searched for only in problems of at most this many rows.
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +74,12 @@ class SlipVariant:
         Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
     note : str
         Reason why the variant equals the previous one, or why its solution is not accepted; "" otherwise.
-    speed_range : (2, contacts) array or None, m/s
-        Smallest and largest speed of each contact over several solutions; None if one solution was found.
     """
 
     name: str
     velocity: tuple[FloatArray, ...]
     relative: float
     note: str = ""
-    speed_range: FloatArray | None = None
 
     @property
     def speeds(self) -> FloatArray:
@@ -236,7 +230,7 @@ def explain_slip(
     ) -> FloatArray:
         if note:
             last = variants[-1]
-            variants.append(replace(last, name=name, note=note, speed_range=None))
+            variants.append(replace(last, name=name, note=note))
             return np.zeros(0) if start is None else start
         solution = solve(changed, impulse=start, tol=tol)
         failed = "" if solution.residual.relative <= max(tol, solution.residual.roundoff_floor) else (
@@ -262,7 +256,6 @@ def explain_slip(
     )  # fmt: skip
     rigid = hard if law_note else hard.relaxed("coulomb")
     start = solve_and_add_variant("coulomb", rigid, start, law_note)
-    variants[-1] = replace(variants[-1], speed_range=_find_speed_ranges_over_solutions(rigid, slip))
     names = tuple(measured.block_name(k) for k in blocks)
     return SlipExplanation(names, tuple(variants))
 
@@ -331,23 +324,10 @@ def _replace_soft_friction(problem: Problem, surface: FloatArray) -> tuple[Probl
     return replace(problem, b=b, compliance=soft), True
 
 
-def _find_speed_ranges_over_solutions(problem: Problem, slip: Any) -> FloatArray | None:
-    """Return the smallest and largest speed of each contact over the solutions that are found, or None for one."""
-    if problem.m > MAX_SEARCHED_ROWS:
-        return None
-    motions = find_solutions(problem).motions
-    if len(motions) < 2:
-        return None
-    speeds = np.array([[np.linalg.norm(v) for v in slip(problem, x.impulse)] for x in motions])
-    return np.array([speeds.min(axis=0), speeds.max(axis=0)])
-
-
 def _format_contact_speed(variant: SlipVariant, i: int) -> str:
-    """Format a contact's speed, or its range over several solutions."""
+    """Format a contact's speed."""
     if variant.note.startswith("not solved") or variant.note == UNDEFINED_LAW:
         return NONE
-    if variant.speed_range is not None and np.ptp(variant.speed_range[:, i]) > MIN_EXPLAINED_SLIP:
-        return " to ".join(map(format_size, variant.speed_range[:, i]))
     return format_size(float(variant.speeds[i]))
 
 

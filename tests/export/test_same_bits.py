@@ -429,13 +429,6 @@ def test_motion_errors_are_those_of_the_package(library):
         if wanted.speed is not None:
             assert (out.body, out.speed) == (wanted.body, pytest.approx(wanted.speed, rel=1e-6))
             assert out.spin == pytest.approx(wanted.spin or 0.0, rel=1e-6)
-        if wanted.bound is not None:
-            assert out.bound == pytest.approx(wanted.bound, rel=1e-4)
-        else:
-            rough = (
-                given.cones.mu.any()
-            )  # without friction Coulomb's law is convex, which the package does not use
-            assert out.bound == np.inf or given.law != "coulomb" or not rough
     assert looked >= 5
 
 

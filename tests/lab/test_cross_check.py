@@ -279,7 +279,6 @@ def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
     for ask in (
         lambda: lv.solve_many([random_lcp(14)] * 3, name),
         lambda: lv.cross_check(random_lcp(14), [name, "pgs"]),
-        lambda: lv.find_solutions(random_lcp(14)).picks([name, "pgs"]),
     ):
         before = len(asked)
         with pytest.raises(KeyboardInterrupt):
@@ -292,16 +291,13 @@ def test_where_nothing_is_solved_nobody_agrees_and_there_is_no_reference():
     problem = lv.Problem.contact(ray @ ray.T, [0.2, -1.1, 1.4, -1.9], [0.3, 0.6])
     found = {row.verdict for row in lv.cross_check(problem, lv.available(problem, external=False))}
     assert found <= {"not solved", "no solution within rounding"}
-    assert not lv.motion.get_reference(problem).is_accepted
+    assert lv.motion_error(problem, problem.start()).rows is None
 
 
 def test_an_impulse_no_better_than_none_is_excused_by_nobody():
     problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
     assert lv.residual(problem, problem.guess).roundoff_floor > 1.0
-    reference = lv.motion.store_reference_if_better(problem, problem.guess)
-    assert not reference.is_accepted
-    assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
-    assert len(lv.find_solutions(problem)) == 0
+    assert lv.motion_error(problem, [0.5, 0.0], reference=problem.guess).relative is None
     assert lv.cross_check(problem, ["pgs"]).agreed == ()
 
 
@@ -338,7 +334,7 @@ def test_known_tells_of_everybody_and_available_of_those_that_can():
 @pytest.mark.parametrize(
     "ask",
     [
-        lv.solve, lv.available, lv.known, lv.cross_check, lv.explain, lv.diagnose, lv.redundancy, lv.find_solutions,
+        lv.solve, lv.available, lv.known, lv.cross_check, lv.explain, lv.diagnose, lv.redundancy,
         lambda p: lv.motion_error(p, [0.0, 0.0]), lambda p: lv.residual(p, [0.0, 0.0]),
     ],
 )  # fmt: skip

@@ -149,23 +149,6 @@ def test_velocity_of_the_engines_impulses_is_the_engines_own():
     np.testing.assert_allclose(after, data.qvel, atol=1e-6)
 
 
-def test_several_solutions_give_a_range():
-    # A ball between two walls that touch it with opposite normals: any pair of equal normal impulses is a solution, and
-    # friction of a pair can be anything up to their sum.
-    jac = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 1.0]])
-    problem = lv.Problem.from_jacobian(
-        jac,
-        np.eye(2),
-        [0.0, -1.0],
-        cones=lv.Cones.contacts(0.5, tangents=1, count=2),
-        names=["left", "right"],
-    )
-    explanation = explain_slip(problem, np.zeros(4))
-    low, high = explanation.variants[-1].speed_range
-    assert low.max() < 1e-6 and high.min() > 0.9
-    assert " to " in str(explanation.table.rows[0][5])
-
-
 def test_chosen_contacts_and_summary():
     explanations = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
     table = summarize_slip(explanations)

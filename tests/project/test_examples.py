@@ -108,19 +108,17 @@ def test_worlds_of_a_training_loop_have_a_verdict_each(capsys, monkeypatch):
     assert "12 steps, not to learn from" in capsys.readouterr().out
 
 
-def test_every_motion_of_the_example_is_a_solution_and_they_differ(drawn):
-    module = drawn("two_motions")
+def test_every_motion_of_the_example_is_a_solution_and_solvers_find_two_of_them():
+    module = example("two_motions")
     found = module.numbers()
-    motions = found["motions"]
-    i, j = module.furthest(motions)
-    assert len(motions) > 3
-    for k in (i, j):
-        assert lv.residual(found["problem"], motions[k].impulse).relative < 1e-10
-    assert (
-        lv.motion.measure_motion_distance(found["problem"], motions[i].impulse, motions[j].impulse).speed
-        == motions.spread
-    )
-    assert found["cone"].separation_speed > 0.1
+    problem, motions = found["problem"], found["motions"]
+    assert set(motions) == {"open", "sticks", "slides forwards"}
+    for impulse in motions.values():
+        judged = lv.residual(problem, impulse)
+        assert judged.relative <= max(1e-15, 2.0 * judged.roundoff_floor)
+    assert {"open", "sticks"} <= set(found["picks"].values())
+    # Away from the paradox the rod leaves the ground, whatever the start.
+    assert set(module.motions(lv.suite.case("painleve(slide=0.5)").problem)) == {"open"}
 
 
 def test_drift_follows_the_motion_error_over_runs(monkeypatch):

@@ -185,7 +185,6 @@ typedef struct lav_motion { /* distance of the motion of an impulse from the mot
   double relative;             /* kinetic over that of the reference's own impulses; infinite where these move nothing */
   double speed, spin;          /* m/s and rad/s of the bodies furthest off; of a generalised velocity its own unit, and 0 */
   double rows;                 /* m/s, largest |A (lambda - reference)| */
-  double bound;                /* sqrt J: `energy` to the solution is no more, to rounding; infinite under Coulomb's law */
 } lav_motion;
 
 typedef struct lav_result {

@@ -120,8 +120,7 @@ static double energy_of(lav_solver *s, const double *x, double *v, double *out, 
 int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double *reference, int32_t n, lav_motion *out) {
   lav_solver *s = solver;
   lav_motion found;
-  lav_verdict verdict;
-  double *delta, *slope, *v, own = 0.0, wrong = 0.0, x = 0.0, y = 0.0;
+  double *delta, *slope, *v, own = 0.0, x = 0.0, y = 0.0;
   int32_t i, k;
   GIVE_BACK(enter(s));
   if (!s->ready) return leave(s, LAV_ERROR_NO_PROBLEM);
@@ -133,17 +132,14 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   found.size = out->size;
   found.row = found.body = -1;
   delta = s->compare, slope = delta + n, v = slope + n;
-  judge(s, reference, 0, INFINITY, &verdict);
   for (i = 0; i < n; i++) delta[i] = impulse[i] - reference[i];
   if (n > 0) {
-    wrong = energy_of(s, s->stopping_test.e, v, slope, &y);
     energy_of(s, reference, v, slope, &own);
     x = energy_of(s, delta, v, slope, &y);
   }
   found.energy = sqrt(x);
   found.kinetic = sqrt(y);
   found.relative = y == 0.0 ? 0.0 : own > 0.0 && y < INFINITY ? sqrt(y / own) : INFINITY;
-  found.bound = s->p.law == LAV_COULOMB && core_block_types_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
   for (i = 0; i < n; i++)
     if (fabs(slope[i]) > found.rows || found.row < 0) found.rows = fabs(slope[i]), found.row = i;
   for (i = 0; n > 0 && i < (s->form == LAV_BODIES ? s->n_v / 6 : s->n_v); i++) {

@@ -147,7 +147,7 @@ def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
 
     Length 2, mass 1, inclined by 1.2 rad, one tangent: A = [[1 + 3 c^2, 3 c s], [3 c s, 1 + 3 s^2]], c, s of 1.2.
     Without contact it would lift off with `lift` and slide with `slide` [m/s]. Open (lambda = 0) is a solution;
-    sticking and sliding may be solutions, too: `lavender.find_solutions` finds all of them.
+    sticking and sliding may be solutions, too (`examples/two_motions.py` has them in closed form).
     """
     check_positive(lift=lift)
     c, s = math.cos(1.2), math.sin(1.2)

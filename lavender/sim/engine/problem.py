@@ -121,24 +121,12 @@ def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
 
 
 def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
-    """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies.
-
-    With Coulomb friction, several solutions may exist. `auto` then solves twice, from its default start and from these
-    impulses, and the errors are distances from the nearer of the two solutions.
-    """
-    error, distance = motion.measure_distance(problem, impulse, motion.get_reference(problem)), 0.0
-    if problem.law == "coulomb":
-        branch_solution = motion.converge_to_solution(problem, impulse)
-        branch_error = motion.measure_distance(problem, impulse, branch_solution)
-        if branch_solution.is_accepted and error.reference.is_accepted:
-            distance = motion.measure_distance(problem, branch_solution.impulse, error.reference).speed or 0.0
-        if branch_error.kinetic is not None and (
-            error.kinetic is None or branch_error.kinetic < error.kinetic
-        ):
-            error = branch_error
-    names = ("relative", "kinetic", "speed", "spin", "bound", "bound_speed")
+    """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies."""
+    error = motion.motion_error(problem, impulse)
     body = moving_bodies[error.body] if error.body >= 0 else ""
-    return {**{name: getattr(error, name) for name in names}, "body": body, "open": distance}
+    return {
+        "relative": error.relative, "kinetic": error.kinetic, "speed": error.speed, "spin": error.spin, "body": body
+    }  # fmt: skip
 
 
 def _compute_energy_fractions(problem: Problem, result: Residual) -> dict[str, float]:

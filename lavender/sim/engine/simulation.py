@@ -108,15 +108,14 @@ class Simulation(Stepping):
     def motion(self) -> dict[str, Any]:
         """Return the motion error of the last substep: the distance to its solution, see `lavender.motion_error`.
 
-        With Coulomb friction, several motions may be solutions. `auto` then solves twice, from its default start and
-        from the impulses of the step, and the error is the distance from the nearer of the two solutions.
+        With Coulomb friction, several motions may be solutions; the reference is the solution that `auto` finds from
+        the impulses of the step.
 
         Returns
         -------
         dict
-            relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s], bound [sqrt J] and
-            bound_speed [m/s]; a value that cannot be computed is None. open [m/s] is the distance between the two
-            solutions of `auto`, 0 without friction.
+            relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s]; a value that cannot be
+            computed is None.
 
         Raises
         ------

@@ -52,18 +52,9 @@ def test_the_threshold_is_between_stick_and_slip():
         assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL_SPEED, abs=1e-17)
 
 
-def test_painleve_has_three_solutions():
-    problem = painleve().problem
-    a = problem.dense()
-    assert a[0, 0] - 2.0 * a[0, 1] < 0.0  # the condition of the paradox
-    presses_and_moves = set()
-    for lam in (motion.impulse for motion in lv.find_solutions(problem)):
-        judged = lv.residual(problem, lam)
-        assert judged.relative <= max(1e-15, 2.0 * judged.roundoff_floor)
-        presses_and_moves.add((lam[0] > 1e-9, abs(problem.slack(lam)[1]) > 1e-9))
-    assert presses_and_moves == {(False, True), (True, False), (True, True)}  # open, stuck, slides
-    (only,) = lv.find_solutions(painleve(slide=0.5).problem)
-    assert not only.impulse.any()
+def test_painleve_meets_the_condition_of_the_paradox():
+    a = painleve().problem.dense()
+    assert a[0, 0] - 2.0 * a[0, 1] < 0.0  # tests/project/test_examples.py has its three solutions
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,253 @@
+"""The motion error of an impulse: the distance of its velocities from those of a reference impulse, in units of motion.
+
+```python
+error = lv.motion_error(problem, solution.impulse)     # or solution.motion_error()
+error.relative, error.speed, error.body_name
+```
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, mark_read_only
+from lavender.judge.residuals import Residual, residual
+from lavender.judge.solution import Solution, raise_if_interrupted
+from lavender.problem import Problem, check_problem
+from lavender.solving.solve import solve
+
+# Relative residual tolerance of the reference solve; it is below the round-off floor, where `auto` stops.
+REFERENCE_TOL = 1e-15
+# The same under Coulomb's law: an impulse that is a solution to rounding is its own reference. At REFERENCE_TOL, `auto`
+# would leave it and may end at another solution.
+COULOMB_REFERENCE_TOL = 1e-12
+# An impulse counts as a solution up to this relative residual, or at its round-off floor.
+REFERENCE_MAX_RESIDUAL = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class MotionError:
+    """Distance of one impulse from a reference; `str()` gives one line. A number that does not apply is None.
+
+    Parameters
+    ----------
+    kinetic : float or None, sqrt J
+        Energy norm of the difference of body velocities; None if M is not known.
+    energy : float or None, sqrt J
+        `kinetic` with the energy in compliance added under the root.
+    relative : float or None
+        `kinetic` (or `energy`) divided by the norm of the reference's own motion M^-1 J^T lambda*.
+    speed : float or None, m/s
+        Velocity error of the body with the largest one; m/s or rad/s of a generalised velocity.
+    spin : float or None, rad/s
+        Angular velocity error of the body with the largest one; None in generalised coordinates.
+    rows : float or None, m/s (rad/s on angular rows)
+        max |w - w*|.
+    body, spin_body, row : int
+        Body of `speed`, body of `spin`, and row of `rows`; -1 without one.
+    reference : (m,) N s
+        The impulse that was compared with.
+    reference_residual : Residual
+        Its residual.
+    note : str
+        Reason why a number is missing.
+    """
+
+    kinetic: float | None
+    energy: float | None
+    relative: float | None
+    speed: float | None
+    spin: float | None
+    rows: float | None
+    body: int
+    spin_body: int
+    row: int
+    reference: FloatArray = field(repr=False)
+    reference_residual: Residual
+    note: str = ""
+    _problem: Problem | None = field(default=None, repr=False)
+
+    @property
+    def body_name(self) -> str:
+        """Name of the body (or generalised velocity) with the largest error, e.g. "body 3"; empty without one."""
+        return self._name_body(self.body)
+
+    @property
+    def row_name(self) -> str:
+        """Name of the row with the largest error, e.g. "contact 3, normal"; empty without one."""
+        return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
+
+    def _name_body(self, body: int) -> str:
+        """Return the name of a body or generalised velocity; empty for -1."""
+        if self._problem is None or body < 0:
+            return ""
+        general = self._problem.generalized
+        return f"body {body}" if general is None else general.velocity_name(body)
+
+    def _get_row_unit(self) -> str:
+        """Return the unit of `rows`: " m/s" or " rad/s", or " m/s or rad/s" if bodies are not known."""
+        if self._problem is None or self._problem.rows is None or self.row < 0:
+            return " m/s or rad/s"
+        row = self._problem.jacobian[[self.row]]
+        return " m/s" if row.data[row.indices % 6 < 3].any() else " rad/s"
+
+    def __str__(self) -> str:
+        speed_unit = " m/s or rad/s" if self.spin is None else " m/s"
+        numbers = (
+            ("relative", self.relative, "", ""),
+            ("kinetic", self.kinetic, " sqrt(J)", ""),
+            ("energy", self.energy if self.kinetic is None else None, " sqrt(J)", ""),
+            ("speed", self.speed, speed_unit, self.body_name),
+            ("spin", self.spin, " rad/s", self._name_body(self.spin_body)),
+            ("rows", self.rows, self._get_row_unit(), self.row_name),
+        )
+        parts = [
+            f"{name} {x:.2g}{unit}{f' ({where})' if where else ''}"
+            for name, x, unit, where in numbers
+            if x is not None
+        ]
+        text = f"motion error: {', '.join(parts)}; reference: {self.reference_residual}"
+        return f"{text}; {self.note}" if self.note else text
+
+
+def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
+    """Compute the error of an impulse's motion: the distance of its velocities from those of a reference impulse.
+
+    With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
+
+        kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
+
+    so that two impulses with a difference that moves no body (a table on four legs) have distance 0.
+
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s
+    reference : (m,) N s or Solution, optional
+        The solution to compare with. Default: the result of `auto` at the round-off floor. It is solved once and stored
+        with the problem. Under Coulomb's law, under which several motions may be solutions, `auto` starts from
+        `impulse` at each call instead.
+
+    Returns
+    -------
+    MotionError
+        Distances are None if the reference is not a solution, that is, if its relative residual is above 1e-10 and
+        above twice its floor. Energies are None if A is asymmetric or indefinite. `note` gives the reason.
+
+    Raises
+    ------
+    InputError
+        An impulse or reference has a wrong length or is not finite.
+    """
+    check_problem(problem)
+    x = problem.impulse_array(impulse)
+    if reference is None:
+        reference = _solve_reference(problem, x)
+    elif isinstance(reference, Solution):
+        reference = reference.impulse
+    reference = mark_read_only(np.array(problem.impulse_array(reference, "reference")))
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # Numbers that are not finite are None; `note` names them.
+        return _compute_error(problem, x, reference)
+
+
+def _solve_reference(problem: Problem, impulse: FloatArray) -> FloatArray:
+    """Solve the problem to the round-off floor; under Coulomb's law from an impulse (m,) [N s], else once a problem."""
+    if problem.law == "coulomb":
+        return raise_if_interrupted(solve(problem, impulse=impulse, tol=COULOMB_REFERENCE_TOL)).impulse
+    cache = problem.derived.cache
+    if __name__ not in cache:
+        best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
+        with problem.derived.lock:
+            cache.setdefault(__name__, best)
+    stored: FloatArray = cache[__name__]
+    return stored
+
+
+def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> MotionError:
+    """Compute the distance of an impulse x (m,) [N s] from a reference (m,) [N s]."""
+    judged = residual(problem, reference, "float64")
+    values: dict[str, Any] = dict.fromkeys(("kinetic", "energy", "relative", "speed", "spin", "rows"))
+    values |= {"body": -1, "spin_body": -1, "row": -1}
+    notes = []
+    if not (judged.relative <= REFERENCE_MAX_RESIDUAL or judged.at_floor):
+        notes.append("the reference is not a solution, so there is no estimate")
+    else:
+        delta = x - reference
+        velocity = _compute_velocity_change(problem, delta)
+        values["row"], values["rows"] = _find_index_and_max(
+            np.abs(_compute_slack_change(problem, delta, velocity))
+        )
+        if velocity is not None and problem.generalized is not None:
+            values["body"], values["speed"] = _find_index_and_max(np.abs(velocity))
+        elif velocity is not None:
+            bodies = velocity.reshape(-1, 6)
+            values["body"], values["speed"] = _find_index_and_max(np.linalg.norm(bodies[:, :3], axis=1))
+            values["spin_body"], values["spin"] = _find_index_and_max(np.linalg.norm(bodies[:, 3:], axis=1))
+        if not problem.is_semidefinite:
+            asymmetry = f"not symmetric (by {problem.asymmetry:.1e})"
+            notes.append(
+                f"A is {'not positive semidefinite' if problem.is_symmetric else asymmetry}: no energies"
+            )
+        else:
+            values["kinetic"], values["energy"] = _compute_energy_norms(problem, delta, velocity)
+            own_velocity = _compute_velocity_change(problem, reference)
+            own = _compute_energy_norms(problem, reference, own_velocity)
+            size, scale = (
+                (values["energy"], own[1]) if values["kinetic"] is None else (values["kinetic"], own[0])
+            )
+            values["relative"] = 0.0 if size == 0.0 else size / scale if scale else math.inf
+            if values["relative"] == math.inf and math.isfinite(size):
+                notes.append("no relative error, because the constraints cause almost no motion")
+                values["relative"] = None
+    missing = [name for name, value in values.items() if value is not None and not math.isfinite(value)]
+    if missing:
+        notes.append(f"beyond float64: {', '.join(missing)}")
+        values |= dict.fromkeys(missing)
+    return MotionError(
+        **values, reference=reference, reference_residual=judged, note="; ".join(notes), _problem=problem
+    )
+
+
+def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArray | None:
+    """Compute M^-1 J^T x (6 n,) or (nv,) [m/s, rad/s] of an impulse x (m,); None if M is not known."""
+    if problem.generalized is not None:
+        return problem.generalized.change(impulse)
+    if problem.rows is None:
+        return None
+    velocity: FloatArray = problem.rows.inverse_mass_matrix() @ (problem.jacobian.T @ impulse)
+    return velocity
+
+
+def _compute_slack_change(problem: Problem, impulse: FloatArray, velocity: FloatArray | None) -> FloatArray:
+    """Compute A x (m,) [m/s] of an impulse x (m,) with velocity change `velocity`."""
+    change: FloatArray = (
+        problem.csr @ impulse
+        if velocity is None
+        else problem.jacobian @ velocity + problem.compliance * impulse
+    )
+    return change
+
+
+def _compute_energy_norms(
+    problem: Problem, impulse: FloatArray, velocity: FloatArray | None
+) -> tuple[float | None, float]:
+    """Compute sqrt(1/2 dv.M dv), None if M is not known, and sqrt(1/2 x.A x) [sqrt J] of an impulse x (m,)."""
+    if velocity is None:
+        return None, math.sqrt(max(0.5 * float(impulse @ (problem.csr @ impulse)), 0.0))
+    kinetic = max(0.5 * float((problem.jacobian.T @ impulse) @ velocity), 0.0)
+    elastic = 0.5 * float(np.sum(problem.compliance * impulse * impulse))
+    return math.sqrt(kinetic), math.sqrt(kinetic + elastic)
+
+
+def _find_index_and_max(x: FloatArray) -> tuple[int, float]:
+    """Return (index, value) of the largest number; (-1, 0) if there is none."""
+    if not len(x):
+        return -1, 0.0
+    i = int(np.argmax(x))
+    return i, float(x[i])
