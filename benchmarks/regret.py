@@ -48,8 +48,8 @@ MAX_RUNS = 5
 
 
 def draw_from_generators(rng: np.random.Generator, seed: int) -> Problem:
-    """Draw a problem of `lavender.contract` or of the tests' generators: kind, law, form and size at random."""
-    from lavender.contract.problems import CONTACTS, FORMS, random_generalized_problem, random_lcp
+    """Draw a problem of the tests' generators: kind, law, form and size at random."""
+    from random_problems import CONTACTS, FORMS, random_generalized_problem, random_lcp
 
     rows = round(10.0 * (MAX_ROWS / 10.0) ** rng.random())
     kind = str(rng.choice([*CONTACTS, "lcp", "lcp", "velocities", "velocities", "velocities"]))

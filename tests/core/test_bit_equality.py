@@ -18,14 +18,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import driven, facts
-from random_problems import as_matrix, touching
+from enumeration import random_bounds
+from random_problems import as_matrix, make_problem_with_other_numbers, make_problems_of_every_kind, touching
 
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
-from lavender.contract.checks import make_problems_of_every_kind
-from lavender.contract.enumeration import random_bounds
-from lavender.contract.problems import make_problem_with_other_numbers
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers.auto import DecisionTree, create_solver_step
 from lavender.solvers.newton_systems import general

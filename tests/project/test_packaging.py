@@ -171,19 +171,15 @@ def test_every_import_is_declared():
         declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     )
     # If installed:
-    known |= (
-        declared("contract")
-        | declared("newton")
-        | {
-            "lavendersim",
-            "mujoco_warp",
-            "pinocchio",
-            "pydrake",
-            "qoco",
-            "siconos",
-            "warp",
-        }
-    )
+    known |= declared("newton") | {
+        "lavendersim",
+        "mujoco_warp",
+        "pinocchio",
+        "pydrake",
+        "qoco",
+        "siconos",
+        "warp",
+    }
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub

@@ -1,36 +1,163 @@
-"""Every registered solver meets the contract (`lavender.contract`), and results of failures of built-in solvers."""
+"""Every registered solver meets the contract and solves every kind of problem; failures of built-in solvers."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from enumeration import enumerate_lcp, random_bounds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, seeds
+from random_problems import (
+    make_problems_of_every_kind,
+    make_well_posed_problems,
+    random_contact_problem,
+    seeds,
+    touching,
+)
 
 import lavender as lv
 from lavender import contract, registry
 from lavender.base.errors import TooLarge
-from lavender.contract.checks import UNSOLVABLE_MATRICES, make_well_posed_problems
-from lavender.contract.enumeration import enumerate_lcp, random_bounds
 from lavender.problem import operators
 from lavender.solvers import steps
 
 OURS = lv.available(external=False)
-#: (solver, check); backends are slow where the kernels run with every check on, and no kernel of ours is behind them.
-REQUIREMENTS = [
-    pytest.param(
-        name, check, id=f"{name}-{check.name}", marks=[pytest.mark.slow] * registry.get(name).external
-    )
-    for check in contract.CHECKS.values()
-    for name in lv.available()
-    if check.applies(registry.get(name))
-]
+#: Backends that must solve every problem that they accept; others may fail if the result reports it.
+REQUIRED_BACKENDS = ("osqp", "clarabel", "piqp", "daqp", "clarabel_cone")
+#: Matrices with a zero and a negative diagonal entry, and an indefinite one: sweeps do not solve these problems.
+UNSOLVABLE_MATRICES = ([[0.0, 1.0], [1.0, 2.0]], [[2.0, 3.0], [3.0, -1.0]], [[1.0, 3.0], [3.0, 1.0]])
 
 
-@pytest.mark.parametrize("name, check", REQUIREMENTS)
-def test_a_solver_meets_a_requirement(name, check):
-    check.run(registry.get(name))
+def mark_external(names):
+    """Mark backends as slow: in the tests with sanitizers they take long and run no kernel of this package."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * registry.get(name).external) for name in names]
+
+
+@pytest.mark.parametrize("name", mark_external(lv.available()))
+def test_solver_meets_the_contract(name):
+    failures = {check.name: failure for check, failure in contract.check_solver(name) if failure}
+    assert not failures
+
+
+@pytest.mark.parametrize("name", mark_external(lv.available()))
+def test_solver_solves_every_kind_of_problem_in_every_form(name):
+    spec = registry.get(name)
+    tol = 1e-6 if spec.external else 1e-8
+    for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
+        for problem in forms:
+            if spec.refuses(problem) is not None:
+                with pytest.raises(lv.CapabilityError):
+                    lv.solve(problem, name)
+                continue
+            budget = max(spec.max_iter, 20_000) if spec.resumable else None
+            solution = lv.solve(problem, name, tol=tol, max_iter=budget)
+            if spec.external and (name not in REQUIRED_BACKENDS or kind.startswith("round")):
+                assert solution.success or solution.status_conflict or solution.status != "CONVERGED"
+                continue
+            assert solution.success and solution.claim_check == "confirmed", (law, kind, solution)
+            if (
+                law != "coulomb"
+            ):  # The slack is unique; an impulse error of tol moves it by at most 1e3 times as much.
+                size = np.abs(problem.slack(problem.start())).max()
+                np.testing.assert_allclose(
+                    solution.slack, slack, rtol=0, atol=1e3 * tol * size + 1e-7 * np.abs(slack).max()
+                )
+
+
+@pytest.mark.parametrize("name", [name for name in lv.available() if "form" in registry.get(name).options])
+def test_every_form_of_a_solver_has_the_same_slack(name):
+    spec = registry.get(name)
+    for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
+        if kind.startswith("round") or spec.refuses(forms[0]) or (kind == "boxes" and law not in spec.laws):
+            continue  # These problems have one form only.
+        for form in ("impulse",) if kind == "ellipses" else ("impulse", "velocity"):
+            solution = lv.solve(forms[0], name, tol=1e-6, form=form)
+            assert str(solution.solver.form).startswith(form)
+            assert solution.success or (spec.external and name not in REQUIRED_BACKENDS)
+            if solution.success and law != "coulomb":
+                size = np.abs(forms[0].slack(forms[0].start())).max()
+                np.testing.assert_allclose(
+                    solution.slack, slack, rtol=0, atol=1e-3 * size + 1e-7 * np.abs(slack).max()
+                )
+        with pytest.raises(lv.LavenderError, match="velocity"):
+            lv.solve(forms[0], name, form="velocities")
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_impulses_scale_with_the_units_of_mass_and_velocity(name):
+    mass, velocity = 2.0**10, 2.0**-20  # Powers of two are exact in float64.
+    for problem in make_well_posed_problems(registry.get(name)):
+        if problem.operator == "matrix":
+            c, unit = problem.cones, mass * velocity
+            bounds = replace(c, lower=unit * c.lower, upper=unit * c.upper)
+            scaled = lv.Problem(problem.b * velocity, bounds, problem.csr / mass, friction=problem.friction)
+            first, second = (lv.solve(p, name, tol=1e-8, max_iter=20_000) for p in (problem, scaled))
+            assert first.success and second.success
+            np.testing.assert_allclose(second.impulse / unit, first.impulse, rtol=0, atol=1e-4)
+
+
+SOFT = touching(
+    [[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3))
+)  # a body that cannot move
+UNUSUAL = {
+    "no rows, linear": lv.Problem.linear(np.zeros((0, 0)), []),
+    "one free row": lv.Problem.linear([[2.0]], [1.0]),
+    "one inactive row": lv.Problem.lcp([[2.0]], [-1.0]),
+    "a negative A": lv.Problem.lcp([[-2.0]], [1.0]),
+    "a zero row that is inactive": lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, -1.0]),
+    "a zero row with an upper bound": lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0], upper=3.0),
+    "three equal bounded rows": lv.Problem.lcp(np.ones((3, 3)), [1.0, 1.0, 1.0]),
+    "three equal free rows": lv.Problem.linear(np.ones((3, 3)), [1.0, 1.0, 1.0]),
+    "a zero diagonal": lv.Problem.lcp([[0.0, 1.0], [1.0, 0.0]], [1.0, 1.0]),
+    "an indefinite A": lv.Problem.lcp([[-1.0, 2.0], [2.0, -1.0]], [1.0, 1.0]),
+    "an asymmetric A": lv.Problem.lcp([[2.0, 1.0], [-1.0, 2.0]], [1.0, 1.0]),
+    "tangents that cannot move": lv.Problem.contact(np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]),
+    "soft contacts of a static body": lv.Problem.from_rows(
+        SOFT, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", mark_external(lv.available()))
+def test_unusual_problems_have_a_finite_result_or_are_refused(name):
+    spec = registry.get(name)
+    for kind, problem in UNUSUAL.items():
+        if spec.refuses(problem) is None:
+            solution = lv.solve(problem, name)
+            assert np.isfinite(solution.impulse).all(), kind
+            assert spec.external or solution.claim_check == "confirmed", (kind, solution)
+            assert problem.m or solution.success, kind
+
+
+@pytest.mark.parametrize("name", OURS)
+@given(seed=seeds, m=st.integers(1, 6))
+@settings(max_examples=20)
+def test_claims_about_small_matrices_are_true(name, seed, m):
+    rng = np.random.default_rng(seed)
+    a = np.rint(2.0 * rng.normal(size=(m, m)))
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(a, np.rint(3.0 * rng.normal(size=m)), low, high)
+    if registry.get(name).refuses(problem) is None:
+        solution = lv.solve(problem, name, tol=1e-9)
+        assert solution.claim_check == "confirmed" and np.isfinite(solution.impulse).all()
+        assert solution.status != "INFEASIBLE" or not enumerate_lcp(a, problem.b, low, high)
+
+
+@pytest.mark.parametrize("name", [name for name in OURS if registry.get(name).impulse])
+def test_normal_without_inverse_mass_bears_friction_of_the_relaxed_law(name):
+    """The solution has w_n = mu |w_t| > 0 and lambda_n > 0."""
+    b, impulse = np.array([-0.5, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])  # The slack is w = (0.5, -1, 0) m/s.
+    one = lv.Cones.contacts([0.5])
+    for problem in (
+        lv.Problem.contact(np.diag([0.0, 1.0, 1.0]), b, [0.5], friction="cone"),
+        lv.Problem.from_jacobian(np.eye(3)[:, 1:], np.eye(2), [0, 0], target=b, cones=one, friction="cone"),
+    ):
+        if registry.get(name).refuses(problem) is None:
+            kept = lv.solve(problem, name, tol=1e-9, impulse=impulse)
+            assert kept.status == "CONVERGED" and not kept.iterations
+            np.testing.assert_array_equal(kept.impulse, impulse)
+            assert lv.solve(problem, name, tol=1e-9).success
 
 
 @pytest.mark.parametrize("name", ["auto", "direct", "lemke", "newton"])
@@ -78,6 +205,7 @@ def test_divergence_of_sweeps_names_the_row(name, matrix, words):
         if registry.get(name).refuses(problem) is not None:
             continue
         solution = lv.solve(problem, name, tol=1e-6)
+        assert solution.message or solution.status not in ("DIVERGED", "STALLED", "NUMERICAL_ERROR")
         if solution.status is lv.Status.DIVERGED and words.startswith("row"):
             assert words in str(solution)
         if problem.law == "linear" and second < 0.0:

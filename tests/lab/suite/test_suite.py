@@ -6,10 +6,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from enumeration import enumerate_lcp
 
 import lavender as lv
 from lavender import suite
-from lavender.contract.enumeration import enumerate_lcp
 from lavender.judge.certificates import check_certificate
 from lavender.lab.bench.cases import hash_problem
 from lavender.lab.suite import hard

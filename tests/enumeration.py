@@ -1,15 +1,11 @@
 """Exact solutions of small bounded problems, found by trying every choice of active bounds."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
 
-
-def random_bounds(rng: np.random.Generator, m: int) -> tuple[FloatArray, FloatArray]:
+def random_bounds(rng, m):
     """Draw lower and upper bounds (m,) of rows: only lower, both, only upper, none, or equal bounds."""
     kind = rng.integers(0, 5, m)
     return np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5]), np.choose(
@@ -17,9 +13,7 @@ def random_bounds(rng: np.random.Generator, m: int) -> tuple[FloatArray, FloatAr
     )
 
 
-def enumerate_lcp(
-    a: FloatArray, b: FloatArray, lower: FloatArray, upper: FloatArray, tol: float = 1e-9
-) -> list[tuple[FloatArray, FloatArray]]:
+def enumerate_lcp(a, b, lower, upper, tol=1e-9):
     """Return every (impulse, slack) that solves the bounded problem up to `tol` with a nonsingular block of free rows.
 
     The time grows as 3^m: m is at most about 8.
