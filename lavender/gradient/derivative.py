@@ -525,7 +525,7 @@ class Derivative:
 
     @cached_property
     def states(self) -> States:
-        """State of each block, as `solution.states`, with a proved bound of the answer's error."""
+        """State of each block, as `solution.states`."""
         return compute_states(self.problem, self._impulse, self._linear)
 
     @cached_property

@@ -339,7 +339,7 @@ class Solution:
 
     @property
     def states(self) -> States:
-        """State of each block (open, sticks, slides, at a bound or free), and which states are uncertain."""
+        """State of each block (open, sticks, slides, at a bound or free), and its distance to another state."""
         attributes = self.__dict__
         if "_states" not in attributes:
             from lavender.judge.states import compute_states

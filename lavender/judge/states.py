@@ -1,7 +1,8 @@
-"""State of each block at an answer (open, sticks, slides, at a bound or free), and whether this state is certain.
+"""State of each block at an answer (open, sticks, slides, at a bound or free), and its distance to another state.
 
-y = lambda - w / d determines the case of a row, as in the judge's map (`lavender_ext/derivative/natural.pxd`). The
-distance between the answer and an exact solution is bounded by `lavender.judge.error_bound`.
+Both are computed from impulse and slack: y = lambda - w / d determines the case of a row, as in the judge's map
+(`lavender_ext/derivative/natural.pxd`), and the margin is the distance of y [N s] from another case. They belong to
+this impulse: a solution may have a block in another state if the impulse is not accurate.
 """
 
 from __future__ import annotations
@@ -13,10 +14,8 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
-from lavender.judge.error_bound import bound_errors
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
-from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
 NAMES = (
@@ -43,34 +42,17 @@ class State:
     rows : tuple of str
         State of each row; the normal of a contact is open or closed.
     margin : float, N s (N m s on angular rows)
-        Distance to the nearest other state; inf if there is none.
-    tolerance : float, N s
-        Error bound: an exact solution exists at which the block's impulse (by the norm of its rows) and margin differ
-        from the answer's by up to this; inf if no bound is known.
+        Distance of this impulse to the nearest other state; inf if there is none.
     """
 
     name: str
     rows: tuple[str, ...]
     margin: float
-    tolerance: float
-
-    @property
-    def at_boundary(self) -> bool:
-        """Whether the exact solution may have this block in another state: margin <= tolerance; True if unknown."""
-        return self.margin <= self.tolerance and self.margin < np.inf
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the error has a bound: `tolerance` is finite."""
-        return self.tolerance < np.inf
 
     def __str__(self) -> str:
         if self.margin == np.inf:
             return f"{self.name}, no other state"
-        far = f"{self.name}, {self.margin:.3g} N s from another state"
-        if not self.is_known:
-            return f"{far}, error unknown"
-        return f"at a boundary: {far}, known to {self.tolerance:.2g} N s" if self.at_boundary else far
+        return f"{self.name}, {self.margin:.3g} N s from another state"
 
 
 class States(Sequence[State]):
@@ -92,7 +74,7 @@ class States(Sequence[State]):
     """
 
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
-        self._problem, self._impulse, self._linear = problem, impulse, linear
+        self._problem, self._impulse = problem, impulse
         self.case: Any = linear.case
         first = problem.cones.ptr[:-1]
         if len(first):
@@ -105,42 +87,10 @@ class States(Sequence[State]):
     def __reduce__(self) -> tuple[Any, ...]:
         return compute_states, (self._problem, self._impulse)
 
-    @cached_property
-    def tolerance(self) -> FloatArray:
-        """`State.tolerance` of each block (k,) [N s], computed at first access."""
-        first = self._problem.cones.ptr[:-1]
-        if not len(first):
-            return np.zeros(0)
-        impulse_error, margin_error = bound_errors(self._problem, self._impulse, self._linear)
-        with np.errstate(over="ignore"):
-            error = np.sqrt(np.add.reduceat(impulse_error**2, first))
-        return np.maximum(error, np.maximum.reduceat(margin_error, first))
-
     @property
     def names(self) -> tuple[str, ...]:
         """Name of the state of each block (k,)."""
         return tuple(NAMES[code] for code in self._code)
-
-    @property
-    def boundary(self) -> tuple[int, ...]:
-        """Indices of blocks with uncertain states (`State.at_boundary`), including blocks without an error bound."""
-        return tuple(int(i) for i in np.flatnonzero((self.margin <= self.tolerance) & (self.margin < np.inf)))
-
-    @property
-    def unknown(self) -> tuple[int, ...]:
-        """Indices of blocks without an error bound: they share a load, or the answer is far from a solution."""
-        return tuple(int(i) for i in np.flatnonzero(self.tolerance == np.inf))
-
-    @property
-    def boundary_fraction(self) -> float | None:
-        """Fraction, of the blocks with an error bound, whose margin to the next state is within that bound.
-
-        None if no block has a bound; 0 if there are no blocks.
-        """
-        known = self.tolerance < np.inf
-        if not known.any():
-            return None if len(known) else 0.0
-        return float(np.mean((self.margin <= self.tolerance)[known]))
 
     def __len__(self) -> int:
         return len(self._code)
@@ -153,7 +103,7 @@ class States(Sequence[State]):
             raise IndexError(f"block {i} does not exist; there are {len(self)} blocks, numbered from 0")
         ptr = self._problem.cones.ptr
         rows = tuple(NAMES[case] for case in self.case[ptr[i] : ptr[i + 1]])
-        return State(NAMES[self._code[i]], rows, float(self.margin[i]), float(self.tolerance[i]))
+        return State(NAMES[self._code[i]], rows, float(self.margin[i]))
 
     def __repr__(self) -> str:
         names = self.names

@@ -237,8 +237,6 @@ class Record(_PrintableEntry):
         Largest velocity error of a row.
     roundoff_floor : float
         Relative residual that rounding alone can cause.
-    boundary_fraction : float or None
-        Fraction of blocks that rounding could move to another state; None if no bound of the answer's error is known.
     solution_hash : str
         Hash of the answer: equal for answers with equal bits.
     worst_row : int
@@ -295,7 +293,6 @@ class Record(_PrintableEntry):
     energy: float = math.inf
     velocity: float = math.inf
     roundoff_floor: float = math.nan
-    boundary_fraction: float | None = None
     solution_hash: str = ""
     worst_row: int = -1
     worst_name: str = ""

@@ -144,8 +144,6 @@ class Difficulty:
         Sweeps of `pgs` to EASY_RESIDUAL; None if it did not reach it or did not run.
     condition : float or None
         See `CaseInfo.condition`.
-    boundary_fraction : float or None
-        Fraction of blocks at a boundary in the best answer, of the blocks with a bounded error.
     same : tuple of str
         Solvers that returned bit-identical answers without an iteration. They took the same shortcut, so their
         times measure the shortcut and not the solvers.
@@ -155,7 +153,6 @@ class Difficulty:
     rows: int
     sweeps: int | None
     condition: float | None
-    boundary_fraction: float | None
     same: tuple[str, ...]
 
 
@@ -265,7 +262,6 @@ def compute_difficulties(records: Records) -> list[Difficulty]:
             for r in runs
             if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY_RESIDUAL
         ]
-        judged = [r for r in runs if r.boundary_fraction is not None]
         idle = [r for r in runs if r.solution_hash and r.iterations == 0 and r.claims]
         groups = defaultdict(set)
         for r in idle:
@@ -277,7 +273,6 @@ def compute_difficulties(records: Records) -> list[Difficulty]:
                 rows=info.rows,
                 sweeps=min(swept, default=None),
                 condition=info.condition,
-                boundary_fraction=min(judged, key=lambda r: r.relative).boundary_fraction if judged else None,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
         )

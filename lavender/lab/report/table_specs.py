@@ -38,7 +38,6 @@ CLAIM_MARKS = {CONFIRMED: "", NOT_PROVEN: NOT_PROVEN, CONTRADICTED: "✗ contrad
 SHOWN_TIES = 2
 DIFFICULTY = (
     "sweeps of pgs to a thousandth of the error of the zero impulse; condition of A scaled to a unit diagonal; "
-    "share of blocks at the boundary between two states, among blocks with an error bound; "
     "solvers with bit-identical results and no iteration, whose times are times of one shortcut"
 )
 INTERLEAVED, ALONE = (
@@ -329,14 +328,13 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
             str(d.rows),
             NONE if d.sweeps is None else str(d.sweeps),
             NONE if d.condition is None else format_residual(d.condition),
-            NONE if d.boundary_fraction is None else format_percent(round(1e6 * d.boundary_fraction), 10**6),
             ", ".join(d.same),
         ]
         for d in difficulties
     ]
-    heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer"]
+    heads = ["case", "rows", "sweeps", "condition", "same answer"]
     table = Table(heads, rows)
-    return table if any(row[5] for row in rows) else table.without_columns("same answer")
+    return table if any(row[4] for row in rows) else table.without_columns("same answer")
 
 
 def list_cases_solved_at_zero(records: Records) -> list[tuple[str, int, str, float, float]]:

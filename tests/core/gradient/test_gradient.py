@@ -81,7 +81,7 @@ def test_states_of_rows_and_parts():
     solution = lv.solve(p, tol=1e-12)
     assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
     assert [s.margin for s in solution.states[:3]] == pytest.approx([1.0, 1.0, 1.0])
-    assert solution.states.boundary == (3,) and "at a boundary" in str(solution.state(3))
+    assert solution.state(3).margin == 0.0 and str(solution.state(0)) == "free, 1 N s from another state"
     with pytest.raises(IndexError, match="block 4 does not exist; there are 4"):
         solution.state(4)
     spin = lv.Problem(np.array([10.0, 9.0, 0.0, 0.5]), lv.Cones.contacts(0.5, 2, 1.0), np.eye(4))

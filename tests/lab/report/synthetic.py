@@ -83,7 +83,6 @@ def example(folder):
             2.0 * size,
             1e-13,
             solution_hash="b",
-            boundary_fraction=0.25,
         )
         interleaved(made, case, "nncg", 9.0 * size, 1e-7)
         made.append(record(case, "osqp", 3.0 * size, 1e-8, backend_time_min=0.5 * size))

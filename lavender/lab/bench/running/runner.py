@@ -21,7 +21,6 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
-from lavender.judge.states import compute_states
 from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
 from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
@@ -70,13 +69,6 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
     """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
     check_problem(problem)
     return problem.carry((before, impulse))
-
-
-def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
-    """Return the record with the hash of its impulses (m,) [N s] and the fraction of blocks at a boundary."""
-    fraction = compute_states(problem, impulse).boundary_fraction
-    solution_hash = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
-    return replace(record, solution_hash=solution_hash, boundary_fraction=fraction)
 
 
 def remove_times(record: Record, time_limit: float) -> Record:
@@ -491,7 +483,7 @@ class Runner:
         else:
             record, found = measure_task(problem, task, impulse)
         if found is not None:
-            record = add_solution_hash(record, problem, found)
+            record = replace(record, solution_hash=hashlib.sha256(found.tobytes()).hexdigest()[:16])
         return remove_times(record, self.plan.time_limit) if self.plan.campaign else record, found
 
 
