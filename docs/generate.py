@@ -569,15 +569,13 @@ def scene_page():
             "`warm_start`, …). Lengths are in m, masses in kg, angles in rad."
         ),
     ]
+    lines = ["| scene, with its own parameters | description |", "|---|---|"]
     for name, build in SCENES.items():
         if build.__module__ != "lavender.sim.scene.gallery":  # a scene of a user or of a doctest
             continue
-        parts += [
-            f"## {name}",
-            f'```python\nlv.Scene("{name}", {_signature(build, ("scene",))})\n```',
-            docstrings.markdown(build.__doc__),
-        ]
-    return "\n\n".join(parts).replace("```python\nlv.Scene", "```text\nlv.Scene")
+        text = " ".join(docstrings.markdown(build.__doc__).replace("|", "\\|").split())
+        lines.append(f"| `{name}({_signature(build, ('scene',))})` | {text} |")
+    return "\n\n".join([*parts, "\n".join(lines)])
 
 
 def suite_page(site):
