@@ -16,6 +16,7 @@ import contextlib
 import heapq
 import json
 import os
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +30,16 @@ from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io import npz
 from lavender.io.engine_step import Claims, EngineStep
-from lavender.io.stored import ENGINE, lock_step_folder, make_folder, write_arrays, write_text
+from lavender.io.stored import (
+    ENGINE,
+    STATES_FOLDER,
+    lock_step_folder,
+    make_folder,
+    write_arrays,
+    write_text,
+)
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
-
-STATES_FOLDER = "states"
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,8 @@ class Recorder:
             tuple[float, str]
         ] = []  # Heap of (velocity error, file) with the smallest error first.
         self._unjudged: set[int] = set()  # Worlds with a line about their first step that cannot be judged.
+        self._removed: list[str] = []  # Files without a line, to be deleted after the lines are written.
+        self._is_closed = False
 
     def __enter__(self) -> Recorder:
         return self
@@ -133,6 +141,7 @@ class Recorder:
 
     def close(self) -> None:
         """Release the folder's lock; the recording is complete after each `add`."""
+        self._is_closed = True
         self._stack.close()
 
     @property
@@ -159,7 +168,8 @@ class Recorder:
         claims : Claims, optional
             The engine's claims, unless `problems` contains them.
         state : dict of arrays, optional
-            State before the step. Arrays have one entry for each world of a batch in their first dimension.
+            State before the step: names and arrays of numbers or texts. Arrays have one entry for each world of a batch
+            in their first dimension.
 
         Returns
         -------
@@ -169,9 +179,14 @@ class Recorder:
         Raises
         ------
         InputError
-            The impulses are missing or have another shape, a state has another number of worlds, or a file cannot be
-            written. Worlds that cannot be judged raise no error; their first step has a line with the reason.
+            The impulses are missing or have another shape, a state has another number of worlds or holds objects, or
+            the recorder is closed: nothing of the step is then recorded. Or a file cannot be written. Worlds that
+            cannot be judged raise no error; their first step has a line with the reason.
         """
+        if self._is_closed:
+            raise InputError(
+                f"the recording {self.folder} is closed: call add before close, or make another Recorder"
+            )
         if isinstance(problems, EngineStep):
             state = problems.state if state is None else state
             problems, impulse, claims = problems[:3]
@@ -189,6 +204,12 @@ class Recorder:
         if changed:
             lines = "".join(f"{json.dumps(line)}\n" for line in self._lines.values())
             write_text(self.folder / ENGINE, lines)
+        for (
+            name
+        ) in self._removed:  # If the process is killed before, files have no line, which no reader needs.
+            for path in (self.folder / name, self.folder / STATES_FOLDER / name):
+                Path(path).unlink(missing_ok=True)
+        self._removed.clear()
         self.n_steps += 1
         return verdicts
 
@@ -222,7 +243,19 @@ class Recorder:
         """Return a function that returns the state of a world, or None without states."""
         if state is None:
             return None
-        arrays = {name: to_numpy(f"state {name!r}", x) for name, x in state.items()}
+        if not isinstance(state, Mapping) or not all(
+            isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in state
+        ):
+            raise InputError(
+                f"state is {state!r:.60}; a dict of arrays is needed, with texts without / and \\ as names"
+            )
+        arrays = {name: np.asarray(to_numpy(f"state {name!r}", x)) for name, x in state.items()}
+        for name, x in arrays.items():
+            if x.dtype.hasobject:
+                raise InputError(
+                    f"state {name!r} holds objects ({x.dtype}), which no reader could load: an array of numbers or "
+                    "texts is needed; fill up lists of different lengths"
+                )
         if is_single:
             return lambda i: arrays
         for name, x in arrays.items():
@@ -269,6 +302,8 @@ class Recorder:
         try:
             judged = residual(problem, own, threshold=self.threshold)
             line["worst"], line["floor"] = judged.worst_name, judged.roundoff_floor
+            if states is not None:
+                write_arrays(make_folder(self.folder / STATES_FOLDER) / name, states(i))
             npz.write(problem, self.folder / name, impulse=own)
         except LavenderError as failure:
             self._lines[name] = {"file": name, "step": verdict.step, "world": i, "left_out": str(failure)}
@@ -276,8 +311,6 @@ class Recorder:
         if claims is not None:
             line["claimed"], line["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
             line["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
-        if states is not None:
-            write_arrays(make_folder(self.folder / STATES_FOLDER) / name, states(i))
         self._lines[name] = line
         if is_worst:
             self._add_to_worst_files(error, name)
@@ -286,15 +319,14 @@ class Recorder:
         return True
 
     def _add_to_worst_files(self, error: float, name: str) -> None:
-        """Add a file to the `keep_worst` files with the largest errors; delete the one it replaces, unless selected."""
+        """Add a file to the `keep_worst` files with the largest errors; remove the one it replaces, unless selected."""
         if len(self._worst) < self.keep_worst:
             heapq.heappush(self._worst, (error, name))
             return
         _, removed = heapq.heapreplace(self._worst, (error, name))
         if not self._lines[removed].get("selected"):
             del self._lines[removed]
-            for path in (self.folder / removed, self.folder / STATES_FOLDER / removed):
-                Path(path).unlink(missing_ok=True)
+            self._removed.append(removed)
 
 
 def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, np.ndarray]:
@@ -303,7 +335,7 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
     Raises
     ------
     InputError
-        The file has no state.
+        The file has no state, or the state cannot be read.
     """
     path = Path(folder) / STATES_FOLDER / file
     if not path.is_file():
@@ -311,5 +343,8 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
             f"{path} does not exist, because {file} was recorded without state=; record the steps again "
             "with state="
         )
-    with np.load(path, allow_pickle=False) as stored:
-        return dict(stored)
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return dict(stored)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot read the state {path}: {error}; record the steps again") from None

@@ -9,6 +9,7 @@ import os
 import re
 import stat
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -26,6 +27,7 @@ from lavender.problem import Problem
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
 ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
+STATES_FOLDER = "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
 
 MAX_BYTES = (
     2**31
@@ -325,12 +327,13 @@ def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Cal
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
-    """Write an archive of arrays (.npz) with `write_atomically`."""
+    """Write an archive of arrays (.npz) with `write_atomically`; their names may be those of arguments of NumPy."""
 
     def write_to(temporary: Path) -> None:
-        with open(temporary, "xb") as stream:
-            # Without allow_pickle: NumPy before 2.1 stores it as an entry.
-            np.savez_compressed(stream, **arrays)
+        with zipfile.ZipFile(temporary, "x", zipfile.ZIP_DEFLATED) as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
     write_atomically(path, write_to)
 

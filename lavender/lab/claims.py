@@ -23,8 +23,8 @@ from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
 from lavender.io.engine_step import EngineStep
-from lavender.io.recorder import STATES_FOLDER, Recorder, read_recorded_state
-from lavender.io.stored import write_arrays
+from lavender.io.recorder import Recorder, read_recorded_state
+from lavender.io.stored import STATES_FOLDER, write_arrays
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.summary_page import PageSection, SummaryPage

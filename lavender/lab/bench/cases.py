@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lavender import io
 from lavender.base.arrays import FloatArray, check_bool, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
+from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, escape_unprintable, make_file_name
@@ -39,6 +39,8 @@ LARGE_MASS_RATIO = 1e3
 # A matrix with a larger relative asymmetry is not the A of bodies; recorded contact problems stay below 0.01.
 MAX_MECHANICAL_ASYMMETRY = 0.1
 
+# Archives in the folder of an audit that are no problems.
+AUDIT_RESULTS = ("records.npz", "states.npz")
 DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
 
 
@@ -171,6 +173,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
                 if p.is_dir()
                 and p.resolve() not in visited
                 and os.access(p, os.R_OK)
+                and not _is_states_folder(p)
                 and _list_problem_files(p)
             ]
             sources += inner
@@ -256,7 +259,7 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     unlisted = [p.name for p in paths if listed and p.name not in listed]
     if twice or len(series) > 1 or unlisted:
         reason = (
-            f"{unlisted[0]} is not listed in its {ENGINE}"
+            f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
             if unlisted
             else "two files have the same number"
             if twice
@@ -288,11 +291,21 @@ def _read_unrecorded_steps(folder: Path) -> dict[Path, str]:
 
 
 def _list_problem_files(folder: Path) -> list[Path]:
-    """List the problem files of a folder, in the numeric order of their names."""
+    """List the problem files of a folder, in the numeric order of their names, without the results of an audit."""
     try:
-        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural_sort_key)
+        results = AUDIT_RESULTS if (folder / "numbers.json").is_file() else ()
+        files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.name not in results)
+        return sorted(files, key=_natural_sort_key)
     except OSError as error:
         raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
+
+
+def _is_states_folder(folder: Path) -> bool:
+    """Whether a folder holds the states before recorded steps, whose problems are in its parent."""
+    parent = folder.parent
+    if folder.name != STATES_FOLDER:
+        return False
+    return (parent / ENGINE).is_file() or any((parent / p.name).is_file() for p in folder.glob("*.npz"))
 
 
 def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
@@ -368,6 +381,10 @@ def _make_item_of_file(path: Path) -> Item:
     """Create the item of a problem file."""
 
     def load() -> Problem:
+        if _is_states_folder(path.parent):
+            raise InputError(
+                f"{path} holds the state before a recorded step; its problem is {path.parent.parent / path.name}"
+            )
         if path.exists() and not path.is_file():
             # A pipe may never end.
             raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
