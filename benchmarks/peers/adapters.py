@@ -366,7 +366,7 @@ def check_siconos(python: str) -> None:
 # -- all contestants--------------------------------------------------------------------------------
 
 
-def _installed(module: str) -> bool:
+def is_installed(module: str) -> bool:
     return importlib.util.find_spec(module) is not None
 
 
@@ -394,8 +394,8 @@ def contestants(siconos: str = "") -> list[Contestant]:
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
-    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in PROGRAM_FORMS[:2]]
-    if _installed("pinocchio"):
+    made += [_cone(name, form) for name in ("scs", "qoco") if is_installed(name) for form in PROGRAM_FORMS[:2]]
+    if is_installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
     made += [_scipy("banded"), _scipy("spsolve")]
     if siconos:

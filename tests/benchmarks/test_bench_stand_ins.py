@@ -90,7 +90,7 @@ def test_each_qp_backend_runs_or_its_stand_in(problems, monkeypatch):
 
     monkeypatch.setattr(Backend, "run", run)
     monkeypatch.setattr(type(registry.get("clarabel")), "missing", lambda _: None)
-    monkeypatch.setattr(adapters, "_installed", lambda name: False)
+    monkeypatch.setattr(adapters, "is_installed", lambda name: False)
     contestants = adapters.contestants()
     assert len(contestants) >= 2 * len(BACKENDS)
     for contestant in contestants:
@@ -163,7 +163,7 @@ def make_pinocchio():
 def test_each_solver_with_an_adapter_of_its_own_runs_on_a_stand_in(package, make, problems, monkeypatch):
     pytest.importorskip("clarabel", reason="the stand-in of qoco (extra: qp)")
     monkeypatch.setitem(sys.modules, package, make())
-    monkeypatch.setattr(adapters, "_installed", lambda name: name == package)
+    monkeypatch.setattr(adapters, "is_installed", lambda name: name == package)
     chosen = [c for c in adapters.contestants() if c.name.startswith(package)]
     assert len(chosen) == 2
     for contestant in chosen:
