@@ -367,6 +367,7 @@ def check_siconos(python: str) -> None:
 
 
 def is_installed(module: str) -> bool:
+    """Return whether a package can be imported."""
     return importlib.util.find_spec(module) is not None
 
 
@@ -394,7 +395,9 @@ def contestants(siconos: str = "") -> list[Contestant]:
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
-    made += [_cone(name, form) for name in ("scs", "qoco") if is_installed(name) for form in PROGRAM_FORMS[:2]]
+    made += [
+        _cone(name, form) for name in ("scs", "qoco") if is_installed(name) for form in PROGRAM_FORMS[:2]
+    ]
     if is_installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
     made += [_scipy("banded"), _scipy("spsolve")]

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,7 @@ from typing import Any
 import click
 
 from lavender._version import __version__
-from lavender.base.errors import LavenderError, UnknownName
+from lavender.base.errors import InputError, LavenderError, UnknownName
 from lavender.cli.options import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
@@ -52,6 +53,17 @@ class Commands(click.Group):
             )
         return super().parse_args(ctx, args)
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; an error about a parameter names the command's option instead."""
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            command = self.get_command(ctx, ctx.invoked_subcommand or "")
+            message = _name_options(str(error), command.params if command else ())
+            if message == str(error):
+                raise
+            raise InputError(message) from error
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
         return sorted(COMMANDS)
@@ -75,6 +87,19 @@ class Commands(click.Group):
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
         return command
+
+
+def _name_options(message: str, parameters: Sequence[click.Parameter]) -> str:
+    """Replace names of parameters in an error message by the names of their options.
+
+    A name is replaced everywhere if the message states its value ("steps is 0"), or begins with it ("contacts names").
+    """
+    for parameter in parameters:
+        name, options = parameter.name, [option for option in parameter.opts if option.startswith("--")]
+        if name and options and re.search(rf"(?<![\w-]){name} is |^{name} names ", message):
+            message = re.sub(rf"(?<![\w-]){name}(?= is | names | must )", options[0], message)
+            message = re.sub(rf"(?<= of ){name}$", options[0], message)
+    return message
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

@@ -35,17 +35,19 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
     """
     from lavender.base.arrays import check_int
     from lavender.io.recording import load_model
+    from lavender.io.states import can_sleep
     from lavender.lab.report.terminal import print_table
     from lavender.lab.slip import explain_slip_of_states, summarize_slip
     from lavender.lab.slip_figure import draw_slip
 
-    steps = check_int("--steps", steps, 1)
+    steps = check_int("steps", steps, 1)
     if out is not None:
         out = check_writable(check_figure_path(out))
     limit_to_one_thread()
-    explanations = explain_slip_of_states(
-        load_model(model)[1], states, contacts=contacts or None, steps=steps
-    )
+    mj, loaded = load_model(model)
+    explanations = explain_slip_of_states(loaded, states, contacts=contacts or None, steps=steps)
+    if can_sleep(mj, loaded):
+        print_escaped('Sleep was off, although the model has <flag sleep="enable"/>.')
     if not explanations:
         print_escaped(
             f"{model}: no contact with friction in these states; give other --states, or more --steps"

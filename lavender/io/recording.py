@@ -19,7 +19,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.states import read_states
-from lavender.io.stored import ENGINE, as_path, lock_step_folder, read_first_bytes, write_text
+from lavender.io.stored import ENGINE, SUFFIXES, as_path, lock_step_folder, read_first_bytes, write_text
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
@@ -261,9 +261,14 @@ def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
     Raises
     ------
     InputError
-        MuJoCo is not installed, or cannot read the file.
+        MuJoCo is not installed, or cannot read the file, or the file is a problem.
     """
     mj, path = adapter.import_mujoco(), str(as_path(path))
+    if Path(path).suffix.lower() in SUFFIXES:
+        raise InputError(
+            f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed: `lavender check` and "
+            "`lavender report` read problems"
+        )
     try:
         return mj, mj.MjModel.from_xml_path(path)
     except ValueError as error:  # MuJoCo raises it for a file that it cannot read.

@@ -62,6 +62,7 @@ from lavender.lab.simulated_worlds import (
 )
 from lavender.problem import PRECISIONS, Problem
 
+UNCONVERGED_OR_WRONG = f"{UNCONVERGED} or wrong"
 AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
 VELOCITY_UNIT = "m/s, rad/s"  # Linear rows have the first unit, angular rows the second.
@@ -343,21 +344,24 @@ class Audit:
         """Summary in a few sentences."""
         unconverged, judged = self.is_unconverged, self.n_judged
         worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
-        n = int(unconverged.sum())
+        wrong = int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
+        n = int(unconverged.sum()) - wrong
         text = (
             f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in "
             f"{worlds} stopped before convergence"
         )
         if n:
+            text += f" ({format_percent(n, judged, 1)})"
+        if wrong:
+            answers = f"{wrong} {'is' if wrong == 1 else 'are'} wrong"
+            text += f", and {answers} ({format_percent(wrong, judged, 1)}): no better than zero forces"
+        if n or wrong:
             text += (
-                f" ({format_percent(n, judged, 1)}), in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
+                f", in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
                 f"the worst error is {format_size(self.max_velocity_error)} m/s (rad/s if its row is angular)"
             )
             if self.worst and self.worst[0].velocity == self.max_velocity_error:
                 text += f", in {self.worst[0].where}"
-            wrong = int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
-            if wrong:
-                text += f"; {format_count(wrong, 'answer')} {'is' if wrong == 1 else 'are'} no better than zero forces"
         warning = "" if self.judged_sizes.has_enough_contact else (
             f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
             "Start from other states with --states."
@@ -426,10 +430,13 @@ class Audit:
 
     @property
     def table_of_errors(self) -> Table:
-        """Quantiles of the errors over all steps judged, and over those that stopped before convergence."""
+        """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
         heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
         rows: list[list[str | Cell]] = []
-        for of, selected in (("all steps judged", self.is_judged), (UNCONVERGED, self.is_unconverged)):
+        for of, selected in (
+            ("all steps judged", self.is_judged),
+            (UNCONVERGED_OR_WRONG, self.is_unconverged),
+        ):
             for name, unit, x in (
                 ("velocity", VELOCITY_UNIT, self.numbers[0]),
                 ("impulse", "N s", self.numbers[1]),
@@ -455,10 +462,10 @@ class Audit:
 
     @property
     def table_of_rows(self) -> Table:
-        """The worst rows of steps that stopped before convergence, most frequent first."""
+        """The worst rows of steps that stopped before convergence or are wrong, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
         rows: list[list[str | Cell]] = [[name, str(n), Cell.size(largest)] for name, (n, largest) in ranked]
-        return Table(["worst row", UNCONVERGED, f"at most [{VELOCITY_UNIT}]"], rows)
+        return Table(["worst row", UNCONVERGED_OR_WRONG, f"at most [{VELOCITY_UNIT}]"], rows)
 
     @property
     def table_of_diverged(self) -> Table:
@@ -546,7 +553,8 @@ class Audit:
             "head": self.summary_text, "engine": self.engine, "model": runs.model, "worlds": runs.worlds,
             "steps": runs.steps,
             "seed": runs.seed, "judged": self.n_judged, "unjudged": self.n_unjudged, "diverged": self.n_diverged,
-            "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
+            "unconverged": int(unconverged.sum()), "wrong": int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum()),
+            "worlds_unconverged": int(unconverged.any(axis=1).sum()),
             "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
             "divergences": divergences, **self.judged_sizes.as_dict,
             "engine_warnings": dict(self.engine_warnings), "busy": self.busy, "start_warning": self.start_warning,
@@ -566,7 +574,7 @@ class Audit:
                 PageSection("Rows and contacts", [self.judged_sizes.size_table], short=2, note=SIZES_NOTE),
                 PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
                 PageSection("Worst rows", [self.table_of_rows], short=3,
-                        note="Rows that were the worst of a step that stopped before convergence."),
+                        note="Rows that were the worst of a step that stopped before convergence or is wrong."),
                 PageSection("The worst worlds", [self.table_of_worst], short=N_WORST_WORLDS, note=FILES_NOTE),
             ],
             self.totals,

@@ -169,7 +169,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),
-        (("run", "stack", "--iterations", "3"), "solver_iterations"),
+        (("run", "stack", "--iterations", "3"), "--iterations is 3"),
         (("run", "stack", "--order", "given", "--set", "order=reverse"), "set the same parameter, order"),
         (
             ("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"),

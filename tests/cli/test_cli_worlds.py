@@ -147,3 +147,34 @@ def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, box
 def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes, option):
     code, _, err = lavender("audit", boxes(), "--engine", "kamino", *option)
     assert code == 2 and f"{option[0]} has no effect with --engine kamino" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("audit", "--steps", 0), "lavender: --steps is 0;"),
+        (("audit", "--worlds", 0), "lavender: --worlds is 0;"),
+        (("audit", "--keep", 0), "lavender: --keep is 0;"),
+        (("tune", "--worlds", 1), "lavender: --worlds is 1;"),
+        (
+            ("tune", "--steps", 3, "--horizon", 2),
+            "lavender: --steps is 3 and --horizon is 2; --steps must be a multiple of --horizon",
+        ),
+        (("record", "--out", "r", "--steps", 0), "lavender: --steps is 0;"),
+        (("slip", "--steps", 0), "lavender: --steps is 0;"),
+        (
+            ("slip", "--contact", "wheel"),
+            "lavender: --contact names 'wheel', but no contact's name contains it",
+        ),
+    ],
+)
+def test_an_invalid_number_names_the_option_of_the_command(lavender, boxes, words, message):
+    code, _, err = lavender(words[0], boxes(), *words[1:])
+    assert code == 2 and err.startswith(message), err
+
+
+@pytest.mark.parametrize("command", ["audit", "tune", "slip"])
+def test_a_problem_file_in_place_of_a_model_is_named(lavender, tmp_path, command):
+    (tmp_path / "here" / "a.npz").write_bytes(b"")
+    code, _, err = lavender(command, "a.npz")
+    assert code == 2 and "a.npz has the suffix of a problem file; a model of MuJoCo (MJCF) is needed" in err

@@ -618,3 +618,20 @@ def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_
     assert "1 step was not judged, because numbers are not finite" in found.summary_text
     assert "no better than zero forces" not in found.summary_text
     assert "--engine mujoco" in found.summary_text
+
+
+def test_audit_counts_each_verdict_once(boxes):
+    found = audit(boxes(EARLY), worlds=2, steps=20, workers=1)
+    counts = {row[0]: int(row[1]) for row in found.table_of_verdicts.cell_texts}
+    unconverged, wrong = counts["stopped before convergence"], counts["wrong"]
+    assert unconverged and wrong
+    assert (
+        f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence (" in found.summary_text
+    )
+    assert (
+        f", and {wrong} are wrong ({2.5 * wrong:.1f} %): no better than zero forces, in "
+        in found.summary_text
+    )
+    assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
+    assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
+    assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
