@@ -36,7 +36,7 @@ def make_problem():
     sideways[-1] = PUSH
     a = np.kron(jacobian @ jacobian.T, np.eye(2))  # rows of a contact: normal, tangent
     b = -np.stack([jacobian @ down, jacobian @ sideways], axis=1).ravel()
-    return lv.Problem.contact(a, b, np.full(N, MU), name="toy stack with friction")
+    return lv.Problem.contact(a, b, np.full(N, MU), tangents=1, name="toy stack with friction")
 
 
 def get_sideways_velocity(impulse):

@@ -14,6 +14,7 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
+    check_int,
     check_unmasked,
     get_common_precision,
     get_shape,
@@ -133,6 +134,7 @@ class Builders(Operators):
         patch_radius: ArrayLike | None = None,
         *,
         rolling: ArrayLike | None = None,
+        tangents: int | None = None,
         **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build a problem of k contacts with m / k rows each: normal, up to two tangents, spin, rolling.
@@ -149,45 +151,22 @@ class Builders(Operators):
             If given, each contact has a spin row.
         rolling : scalar or (k,) m, optional
             mu_r: if given, the last two rows of each contact are rolling rows; two tangents are needed.
+        tangents : {0, 1, 2}, optional
+            Number of tangent rows of each contact. Default: as many as the rows and the values of mu leave.
         **more
             Keywords of `Problem`: name, names, ...
 
         Raises
         ------
         InputError
-            The number of rows does not fit the number of contacts, or mu > 0 for contacts without friction rows.
+            The number of rows does not fit the number of contacts, or mu > 0 for contacts without friction rows. Or
+            the contacts would have one tangent, and the rows are also those of contacts with two: give `tangents`.
         """
-        check_keywords("contact", more, ("mu", "patch_radius", "rolling"))
+        check_keywords("contact", more, ("mu", "patch_radius", "rolling", "tangents"))
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
-        check_unmasked("mu", mu)
-        if len(get_shape("mu", mu)) > 1:
-            return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
-        angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
-        if np.ndim(mu) == 0:
-            contact_rows = 3 + angular_rows
-            mu = np.full(len(b) // contact_rows if len(b) % contact_rows == 0 else 1, mu)
-        mu = as_array("mu", mu, (None,))
-        if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
-            raise InputError(
-                f"b has {len(b)} rows, which is not a multiple of the {len(mu)} values of mu; every contact "
-                "needs the same number of rows"
-            )
-        tangents = len(b) // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
-        if not 0 <= tangents <= 2:
-            raise InputError(
-                f"b has {len(b)} rows for {len(mu)} contacts; each contact needs a normal row, up to two "
-                "tangent rows, a spin row if patch_radius is given, and two rolling rows if rolling is "
-                "given"
-            )
-        if patch_radius is not None:
-            patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
-        elif tangents == 0 and np.any(mu > 0.0):
-            raise InputError(
-                f"mu has {len(mu)} values for {len(b)} rows, so each contact has a normal row only and no row for "
-                "friction: give one mu for each contact, not for each row, or mu = 0"
-            )
-        return cls(b, Cones.contacts(mu, tangents, patch_radius, rolling=rolling), A, **more)
+        cones = _make_contacts_of_rows("b", len(b), mu, tangents, patch_radius, rolling)
+        return cls(b, cones, A, **more)
 
     @classmethod
     def from_findex(
@@ -360,7 +339,9 @@ class Builders(Operators):
         v_free: ArrayLike,
         *,
         target: ArrayLike = 0.0,
-        cones: Cones,
+        cones: Cones | None = None,
+        mu: ArrayLike | None = None,
+        tangents: int | None = None,
         compliance: ArrayLike | None = None,
         friction: str = "coulomb",
         names: Sequence[str] | None = None,
@@ -382,6 +363,8 @@ class Builders(Operators):
             Required relative velocity after the step: 0 stops the motion, +depth/dt removes a penetration (depth
             positive inside), -e v_n is a bounce after an approach v_n < 0. A gap is a negative depth.
         cones : Cones
+        mu, tangents : optional
+            Instead of `cones`, if all rows are those of contacts: as for `contact`.
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
         precision : {"float64", "float32"}, optional
@@ -413,9 +396,18 @@ class Builders(Operators):
         >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
         0.01
         """
-        check_keywords("from_jacobian", more, ("target", "cones", "dof_names"))
+        check_keywords("from_jacobian", more, ("target", "cones", "mu", "tangents", "dof_names"))
+        if (cones is None) == (mu is None):
+            raise InputError(
+                f"cones and mu are {'missing' if mu is None else 'both given'}; one of them is needed: mu= if all rows "
+                "are those of contacts, else cones=, such as lavender.Cones.free(6) + lavender.Cones.contacts(0.5)"
+            )
+        if mu is None and tangents is not None:
+            raise InputError("tangents has no effect without mu: leave it out, or give mu in place of cones")
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
+        if cones is None:
+            cones = _make_contacts_of_rows("J", m, mu, tangents)
         if isinstance(cones, Cones) and cones.n_rows != m:
             hint = (
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
@@ -579,6 +571,47 @@ def _make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
     )
     zeros = np.zeros(rows.n_joints)
     return Cones(rows.joint_ptr, zeros.astype(np.int32), low, high, mu=zeros, patch_radius=zeros)
+
+
+def _make_contacts_of_rows(
+    name: str, m: int, mu: Any, tangents: Any, patch_radius: Any = None, rolling: Any = None
+) -> Cones:
+    """Build contacts with equal numbers of rows from m rows and a mu for each contact; `name` has the rows."""
+    check_unmasked("mu", mu)
+    angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
+    is_ellipse = len(get_shape("mu", mu)) > 1
+    own = None if tangents is None else check_int("tangents", tangents, high=2)
+    if is_ellipse and own in (None, 2):
+        return Cones.contacts(mu, 2, patch_radius, rolling=rolling)
+    if np.ndim(mu) == 0:
+        rows = 1 + angular_rows + (2 if own is None else own)
+        mu = np.full(m // rows if m % rows == 0 else 1, mu)
+    mu = as_array("mu", mu, (None,))
+    if (len(mu) == 0) != (m == 0) or (len(mu) and m % len(mu)):
+        raise InputError(
+            f"{name} has {m} rows, which is not a multiple of the {len(mu)} values of mu; every contact "
+            "needs the same number of rows"
+        )
+    count = m // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
+    if not 0 <= count <= 2 or (own is not None and len(mu) and count != own):
+        asked = "up to two tangent rows" if own is None else f"{own} tangent rows"
+        raise InputError(
+            f"{name} has {m} rows for {len(mu)} contacts; each contact needs a normal row, {asked}, a spin row if "
+            "patch_radius is given, and two rolling rows if rolling is given"
+        )
+    if own is None and count == 1 and m % 3 == 0 and angular_rows == 0:
+        raise InputError(
+            f"{name} has {m} rows and mu {len(mu)} values, so that these are {len(mu)} contacts with one tangent each, "
+            f"or {m // 3} contacts with two: give tangents=1, or {m // 3} values of mu"
+        )
+    if patch_radius is not None:
+        patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
+    elif count == 0 and np.any(mu > 0.0):
+        raise InputError(
+            f"mu has {len(mu)} values for {m} rows, so each contact has a normal row only and no row for "
+            "friction: give one mu for each contact, not for each row, or mu = 0"
+        )
+    return Cones.contacts(mu, count, patch_radius, rolling=rolling)
 
 
 def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:

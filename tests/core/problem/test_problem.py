@@ -369,3 +369,57 @@ def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
 
     assert not issparse(Foreign())
     assert issparse(sp.eye_array(2))
+
+
+def test_contact_with_rows_of_two_kinds_of_contacts_needs_tangents():
+    with pytest.raises(
+        lv.InputError, match=r"3 contacts with one tangent each, or 2 contacts with two: .*tangents=1"
+    ):
+        lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5])
+    planar = lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5], tangents=1)
+    assert planar.cones.n_tangents.tolist() == [1, 1, 1]
+    assert lv.Problem.contact(np.eye(6), np.ones(6), 0.5, tangents=1) == planar
+    assert lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [1, 1]
+    assert lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [2, 2]
+    with pytest.raises(
+        lv.InputError, match="6 rows for 2 contacts; each contact needs a normal row, 1 tangent rows"
+    ):
+        lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5], tangents=1)
+    with pytest.raises(lv.InputError, match="tangents is 3"):
+        lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5], tangents=3)
+
+
+@pytest.mark.parametrize(
+    ("rows", "bounds", "tangents"),
+    [
+        (6, {"mu": 0.7}, [2, 2]),
+        (6, {"mu": [0.7, 0.2]}, [2, 2]),
+        (4, {"mu": 0.7, "tangents": 1}, [1, 1]),
+        (4, {"mu": [0.7, 0.2]}, [1, 1]),
+        (2, {"mu": 0.0, "tangents": 0}, [0, 0]),
+        (6, {"mu": [(0.7, 0.2)] * 2}, [2, 2]),
+    ],
+)
+def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangents):
+    rng = np.random.default_rng(0)
+    jac, mass, v = rng.normal(size=(rows, 7)), np.eye(7), rng.normal(size=7)
+    problem = lv.Problem.from_jacobian(jac, mass, v, **bounds)
+    cones = lv.Cones.contacts(np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0])
+    assert problem == lv.Problem.from_jacobian(jac, mass, v, cones=cones)
+    assert problem.cones.n_tangents.tolist() == tangents
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        ({}, "cones and mu are missing"),
+        ({"mu": 0.7, "cones": lv.Cones.contacts([0.7] * 2)}, "cones and mu are both given"),
+        ({"cones": lv.Cones.contacts([0.7] * 2), "tangents": 2}, "tangents has no effect without mu"),
+        ({"mu": [0.7] * 3}, "J has 6 rows and mu 3 values.*tangents=1"),
+        ({"mu": [0.7] * 4}, "J has 6 rows, which is not a multiple of the 4 values of mu"),
+        ({"mu": -0.7}, "mu"),
+    ],
+)
+def test_from_jacobian_with_bounds_that_do_not_fit_says_so(bounds, words):
+    with pytest.raises(lv.InputError, match=words):
+        lv.Problem.from_jacobian(np.eye(6), np.eye(6), np.ones(6), **bounds)
