@@ -573,18 +573,3 @@ cdef class LinearSystem:
         """Row (n,) that is eliminated first, second, ...; for a matrix in compressed rows."""
         self.analyse()
         return self.analysis[0][:self.f.n]
-
-    def list_lost_rows(self):
-        """Return the rows (ascending) whose pivots the last L L^T of compressed rows rejected; their columns of L are 0."""
-        cdef const supernodal_t* f = &self.f.rows.factor
-        cdef int32_t i, k
-        cdef int64_t ld
-        if self.numbers is None:
-            raise ValueError("there is no factor yet; `factor` must be called first")
-        rows = []
-        for i in range(f.supernodes):
-            ld = panel_width(f, i) + rows_below(f, i)
-            for k in range(panel_width(f, i)):
-                if f.values[f.value_offset[i] + k * (ld + 1)] == 0.0:
-                    rows.append(f.order[f.first[i] + k])
-        return np.sort(np.array(rows, np.intp))

@@ -596,9 +596,3 @@ cdef class Pivoting:
         at = 0 if self.t.best < self.t.x else 3 * m     # `best` and `x` exchange their memory, so the lower address decides.
         numbers = self.reals[at:at + 3 * m].copy()
         return make_judged(self.judged, numbers[:m], numbers[m:], &self.t.score, self.t.relative, self.t.floor)
-
-    def skipped(self):
-        """Return the rows whose pivots were small in the last factorisation, in order of elimination."""
-        cdef pivoting_t* s = &self.t.s
-        rows = self.order if self.order is not None else range(s.n)
-        return [i for i in rows if s.place[i] >= 0 and s.linear.matrix[<int64_t>s.place[i] * s.linear.width] == 0.0]

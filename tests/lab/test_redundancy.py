@@ -74,8 +74,6 @@ def test_blocks_of_one_row_keep_their_whole_name():
         ([[1.0, 1.0 - 1e-8], [1.0 - 1e-8 + 1e-12, 1.0]], [1.0, 1.0], 2),
         ([[1.0, 1e12], [1e12, 1e26]], [1.0, 1.0], 2),
         ([[1.0, 2.0**43], [2.0**43, 2.0**86]], [1.0, 2.0**43], 1),
-        # 1e-27 beside 1e-13: semidefinite to rounding alone, and so no size of the row.
-        ([[1e-27, 1e-13], [1e-13, 1.0]], [0.0, 0.0], 1),
     ],
 )
 def test_ranks_of_matrices_by_hand(a, b, rank):
@@ -108,7 +106,7 @@ def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
     problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
     found = redundancy(problem)
     assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))
-    assert not found.slack_is_unique and found.unique == ()
+    assert found.unique == ()
     kept = np.setdiff1d(np.arange(m + 2), found.rows)
     assert np.linalg.matrix_rank(a[kept], tol=1e-9 * np.linalg.norm(a, 2)) == found.rank
 
@@ -143,27 +141,21 @@ def test_a_row_that_is_new_by_more_than_tol_is_kept(share):
     assert matrix.rank == (4 if share > 1e-6 else 3) and matrix.tol == 1e-6
 
 
-def test_a_large_island_is_decomposed_as_sparse():
-    m = 2500
-    grid = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]).tolil()
-    grid[0, 0] = grid[m - 1, m - 1] = 1.0  # a free chain: one null vector
-    found = redundancy(lv.Problem.linear(sp.csr_array(grid), np.zeros(m)))
-    assert found.rank == m - 1
-    assert found.tol == pytest.approx(1e-6 * m**0.5)
-    assert "sparse Cholesky" in found.method
+def test_island_above_the_limit_of_rows_raises():
+    m = 3001
+    chain = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
+    with pytest.raises(lv.CapabilityError, match="3001 rows are coupled; at most 3000"):
+        redundancy(lv.Problem.linear(chain, np.zeros(m)))
 
 
-@pytest.mark.parametrize("n", [447, 1221])
-def test_the_rank_of_a_large_island_is_that_of_its_eigenvalues(n):
-    """Rows of a sparse J of fewer columns: small pivots that stay in a factor cost up to 32 of the rank."""
-    rng, m = np.random.default_rng(1), 1500
-    jac = sp.csr_array(sp.random_array((m, n), density=4.0 / n, rng=rng))
+def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
+    rng, m = np.random.default_rng(1), 300
+    jac = sp.csr_array(sp.random_array((m, 240), density=4.0 / 240, rng=rng))
     jac = jac[np.diff(jac.indptr) > 0]
     a = sp.csr_array(jac @ jac.T)
     unit = sp.diags_array(1.0 / np.sqrt(a.diagonal()))
     values = np.linalg.eigvalsh((unit @ a @ unit).toarray())
     found = redundancy(lv.Problem.linear(a, np.zeros(a.shape[0])))
-    assert found.method.count("sparse Cholesky") == 1
     assert not ((values > 1e-13) & (values < 1e-7)).any()  # zeros are roundings, all others far above
     assert found.rank == np.count_nonzero(values > 1e-7)
     kept = np.delete(np.arange(a.shape[0]), found.rows)
@@ -210,15 +202,6 @@ def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
         assert len(found.rows) == m - truth
         seen.add(m - truth)
     assert len(seen) > 1
-
-
-def test_a_rank_that_masses_hide_is_told():
-    jac = np.array([[1.0, 1.0], [1.0, -1.0]])
-    found = lv.redundancy(
-        lv.Problem.from_jacobian(jac, np.diag([1.0, 1e26]), np.zeros(2), cones=lv.Cones.free(2))
-    )
-    assert found.rank == 2
-    assert "1 by the masses and 2 without them" in str(found)
 
 
 @pytest.mark.parametrize("form", ["matrix", "J, M and compliance"])
