@@ -226,12 +226,10 @@ def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArra
 
 def _compute_slack_change(problem: Problem, impulse: FloatArray, velocity: FloatArray | None) -> FloatArray:
     """Compute A x (m,) [m/s] of an impulse x (m,) with velocity change `velocity`."""
-    change: FloatArray = (
-        problem.csr @ impulse
-        if velocity is None
-        else problem.jacobian @ velocity + problem.compliance * impulse
-    )
-    return change
+    if velocity is None:
+        return np.asarray(problem.csr @ impulse)
+    assert problem.compliance is not None
+    return np.asarray(problem.jacobian @ velocity + problem.compliance * impulse)
 
 
 def _compute_energy_norms(
@@ -241,6 +239,7 @@ def _compute_energy_norms(
     if velocity is None:
         return None, math.sqrt(max(0.5 * float(impulse @ (problem.csr @ impulse)), 0.0))
     kinetic = max(0.5 * float((problem.jacobian.T @ impulse) @ velocity), 0.0)
+    assert problem.compliance is not None
     elastic = 0.5 * float(np.sum(problem.compliance * impulse * impulse))
     return math.sqrt(kinetic), math.sqrt(kinetic + elastic)
 

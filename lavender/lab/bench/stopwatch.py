@@ -33,12 +33,6 @@ BACKEND_ENTRY_POINTS = {
 }  # fmt: skip
 
 
-def excludes_setup(solver: str) -> bool:
-    """Return whether the measured time of a backend excludes its set-up, which is then a call of its own."""
-    entry_points = BACKEND_ENTRY_POINTS.get(solver, ())
-    return bool(entry_points) and all("." in point.partition(":")[2] for point in entry_points)
-
-
 class _TimedObject:
     """A backend's object with some methods timed."""
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from lavender.lab.bench.record import Record, Skip
 from lavender.lab.bench.store import Records
-from lavender.solvers import registry
 
 TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
@@ -26,12 +25,6 @@ def make_time_axis_title(runs: Iterable[Record]) -> str:
     """Return the title of an axis for the times of some runs."""
     titles = {TIMED_CODE[r.timing_mode] for r in runs if r.is_usable}
     return titles.pop() if len(titles) == 1 else "time [s]"
-
-
-def is_external(run: Record) -> bool:
-    """Return whether a run is of a solver of another package."""
-    spec = registry.specs().get(run.solver)
-    return run.backend_time_min is not None or (spec is not None and spec.external)
 
 
 def format_residual(x: float) -> str:
