@@ -161,3 +161,14 @@ def test_other_objects_and_another_mass_matrix_are_rejected():
         lv.io.from_genesis([])
     with pytest.raises(lv.CapabilityError, match="qacc_smooth differs from qfrc_smooth"):
         lv.io.from_genesis(load("arm", mass_mat=lambda x: 1.01 * x))
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e12])
+def test_from_genesis_of_an_environment_with_a_bad_acceleration_has_no_answer(bad):
+    def spoil(acceleration):
+        acceleration[0, 1] = bad
+        return acceleration
+
+    step = lv.io.from_genesis(load("convex", qacc=spoil))
+    judged = lv.residual_many(step.batch, step.impulse, errors="status").velocity_error
+    assert np.flatnonzero(~np.isfinite(judged)).tolist() == [1]

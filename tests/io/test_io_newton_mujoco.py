@@ -77,6 +77,17 @@ def test_iterations_that_are_used_up_are_not_converged():
     assert lv.io.from_newton_mujoco(solver, velocity).claims.converged.tolist() == [True, False, True]
 
 
+@pytest.mark.parametrize("bad", [np.nan, -1e12])
+def test_from_newton_mujoco_of_a_world_with_a_bad_acceleration_has_no_answer(bad):
+    solver, velocity = stand_in()
+    acceleration = solver.mjw_data.qacc.numpy().copy()
+    acceleration[1, 0] = bad
+    solver.mjw_data.qacc = Array(acceleration)
+    step = lv.io.from_newton_mujoco(solver, velocity)
+    judged = lv.residual_many(step.batch, step.impulse).velocity_error
+    assert np.flatnonzero(~np.isfinite(judged)).tolist() == [1]
+
+
 def test_rows_without_memory_are_counted():
     solver, velocity = stand_in("pyramidal")
     solver.mjw_data.nefc = Array(solver.mjw_data.nefc.numpy() + MAX_ROWS)
