@@ -397,16 +397,23 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
     drives = [runs.make_controller(model, world) for world in range(runs.worlds)]
     names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
     start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
+    not_accepted = f"engine {engine!r} does not accept {runs.model}"
     try:
         step = {"mjx": _make_mjx_stepper, "mujoco_warp": WarpWorlds}[engine](mj, model, start_arrays)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
     except (NotImplementedError, ValueError) as error:
-        raise InputError(f"engine {engine!r} does not accept {runs.model}: {error}") from None
+        raise InputError(f"{not_accepted}: {error}") from None
     for k in range(runs.steps):
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
-        yield make_frame(mj, model, *step(ctrl))
+        try:
+            arrays = step(ctrl)
+        except (
+            NotImplementedError
+        ) as error:  # MJX raises it in the first step, for example for an integrator.
+            raise InputError(f"{not_accepted}: {error}") from None
+        yield make_frame(mj, model, *arrays)
 
 
 def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any) -> Frame:

@@ -12,6 +12,7 @@ import lavender as lv
 from lavender.io.efc import from_efc
 from lavender.io.states import read_states
 from lavender.lab import audit as module
+from lavender.lab import simulated_worlds
 from lavender.lab.audit import AUDIT_VERDICTS, audit
 from lavender.lab.simulated_worlds import Frame, Runs
 
@@ -635,3 +636,16 @@ def test_audit_counts_each_verdict_once(boxes):
     assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
     assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
+
+
+def test_audit_of_a_model_that_an_engine_rejects_in_its_first_step_says_so(boxes, monkeypatch):
+    """MJX accepts a model with the integrator "discrete", and raises an error when it steps it."""
+
+    def reject(ctrl):
+        raise NotImplementedError("integrator 4 not implemented.")
+
+    monkeypatch.setattr(simulated_worlds, "WarpWorlds", lambda mj, model, arrays: reject)
+    with pytest.raises(
+        lv.InputError, match=r"'mujoco_warp' does not accept .*boxes.xml: integrator 4 not implemented"
+    ):
+        audit(boxes(), worlds=1, steps=2, engine="mujoco_warp")
