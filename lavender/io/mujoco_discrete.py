@@ -85,8 +85,9 @@ def compute_discrete_matrix(mj: Any, model: Any, data: Any, advice: str) -> Disc
     rounding = MASS_TOLERANCE * np.linalg.norm(abs(whole) @ abs(data.qacc_smooth))
     if not (gap <= limit * size + rounding or (is_iterative and is_warned and gap < np.inf)):
         names = ", ".join(name for name in _list_arrays(data) if np.any(getattr(data, name)))
+        relative = gap / max(size, np.finfo(float).tiny)
         raise CapabilityError(
-            f"(M + h D + h^2 K) qacc_smooth differs from qfrc_smooth + efm_c + efm_ca by {gap / size:.1e} of its "
+            f"(M + h D + h^2 K) qacc_smooth differs from qfrc_smooth + efm_c + efm_ca by {relative:.1e} of its "
             f"size. The step has integrator='discrete' and the arrays {names}. {advice}"
         )
     arrays = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data
