@@ -1,14 +1,15 @@
-"""Proximal splitting (ADMM) with a reused factorisation and Anderson mixing, for redundant, ill-conditioned problems.
+"""Proximal splitting (ADMM) with a reused factor or none, and Anderson mixing, for redundant, ill-conditioned problems.
 
     z = Pi_K(u),  y = rho (u - z),  (B + rho) x = c - s + rho z - y,  u <- u + alpha (x - z), then mixed
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the product of all bounds and cones, s De Saxce's shift of
 Coulomb's law (`lavender_ext/accelerate/admm.pyx`), alpha the over-relaxation. An iteration is a forward and a backward
 substitution instead of a sweep. Large mass ratios and long chains need more factorisations (rho is adapted, at
-increasing intervals), but not more iterations. With Coulomb friction, the iteration starts from the solution of the
-convex relaxation. A is factored as L L^T in supernodes; if the bodies have fewer unknowns than there are rows, their
-matrix is factored instead. L U replaces L L^T if A is not symmetric, or if the problem is linear and A is not
-definite.
+increasing intervals), but not more iterations. With Coulomb friction, the iteration runs without the shift until
+contacts slip at the solution of the convex relaxation, unless the start is close to a solution with slip. A is
+factored as L L^T in supernodes. If the bodies have fewer unknowns than there are rows, their matrix is factored
+instead; if this takes too much work, it is solved by conjugate gradients without a factor. L U replaces L L^T if A is
+not symmetric, or if the problem is linear and A is not definite.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ _START_RHO = 0.1  # [-] First penalty rho, relative to the unit diagonal of B; f
 # The solver stops as STALLED after this many iterations without progress. At large mass ratios, the residual rises
 # while rho is adapted.
 _ADMM_PATIENCE = 5000
-
+# Above this number of multiply-adds of a factor over bodies, per entry of K, conjugate gradients replace factors. Piles
+# of spheres then take 0.7 times as long at 1,300 (7,143 rows), 0.5 at 3,400 and 0.3 at 8,000. Towers and walls have 7
+# to 140, and take 2 to 7 times as long.
+MAX_FACTOR_WORK_PER_ENTRY = 2000.0
 _LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
 # Estimated number of entries of J and J^T together per row between two bodies, and of J^T J per velocity.
 _JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
@@ -112,16 +116,16 @@ class AdmmState:
             form = problem.velocity_form()
             # `velocity_form` has scaled K and theta by the judge's d.
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
-            self.is_scaled, self.next_cost = (
-                True,
-                0.0,
-            )  # There is no matrix to analyse before the first factor.
+            self.body_work, self.body_solve = _count_body_work(problem), None
+            self.has_factor = self.body_work <= MAX_FACTOR_WORK_PER_ENTRY * form.jacobian.nnz
+            # There is no matrix to analyse before the first factor.
+            self.is_scaled, self.next_cost = True, 0.0
             return
         a = problem.csr
         values = scale_matrix_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
         self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
         self.lu = not problem.is_symmetric
-        self.is_over_bodies = False
+        self.is_over_bodies, self.has_factor = False, True
         if problem.m:
             self.matrix = make_pattern_symmetric(self.matrix)
             self.system = LinearSystem(get_sorted_csr_arrays(self.matrix)[:2], USE_WIDE_LANES)
@@ -132,15 +136,27 @@ class AdmmState:
         problem, rates = self.problem, RATES
         if self.is_over_bodies:
             assert problem.rows is not None
-            rows, n = problem.rows, 6 * problem.rows.n_bodies
+            n = 6 * problem.rows.n_bodies
             setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
             setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
-            work = Layout(rows.moving_block_bodies, rows.n_bodies, 6).work
-            return float(setup + rates["form row"] * n + rates["panels work"] * work)
+            work = rates["panels work"] * self.body_work if self.has_factor else 0.0
+            return float(setup + rates["form row"] * n + work)
         if not problem.m:
             return 0.0
         work = (1.0 + self.lu) * _analyse_panels(self.system).cost
         return float(rates["form row"] * problem.m + rates["panels work"] * work)
+
+    @property
+    def inner_iterations(self) -> int:
+        """Number of iterations of conjugate gradients; 0 with factors."""
+        return 0 if self.has_factor or self.body_solve is None else int(self.body_solve.iterations)
+
+    @property
+    def form_name(self) -> str:
+        """Name of the system that is solved in each iteration."""
+        if not self.has_factor:
+            return "conjugate gradients over bodies"
+        return "Cholesky over bodies" if self.is_over_bodies else "LU" if self.lu else "Cholesky"
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -153,11 +169,11 @@ class AdmmState:
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
     def _factor(self) -> tuple[Any, ...]:
-        """Return the factor for the present rho in the format of the kernel, and measure the time to compute it."""
+        """Return the factor, or conjugate gradients, for the present rho, and measure the time to compute it."""
         self._check_deadline()
         watch = Stopwatch()
         factor = self._factor_with_fallbacks()
-        self.factorisations += 1
+        self.factorisations += self.has_factor
         self.next_cost = 1e9 * watch.elapsed_seconds
         return factor
 
@@ -179,10 +195,13 @@ class AdmmState:
         if self.is_over_bodies:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
+            extra = (*get_sorted_csr_arrays(k), e)
+            if not self.has_factor:
+                self.body_solve = admm.BodySolve(*extra, k.shape[1], self.body_solve)
+                return self.body_solve, *extra
             matrix, shift = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # Analyse the pattern for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
-            extra = (*get_sorted_csr_arrays(k), e)
         done = _factor_shifted_matrix(system, matrix, shift, self.lu)
         if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
             # L L^T failed, as for an indefinite matrix: try L U.
@@ -204,6 +223,13 @@ class AdmmState:
 def _is_over_bodies(problem: Problem) -> bool:
     rows = problem.rows
     return rows is not None and 0 < 6 * rows.n_bodies < problem.m
+
+
+def _count_body_work(problem: Problem) -> float:
+    """Return the number of multiply-adds of one factor over bodies."""
+    rows = problem.rows
+    assert rows is not None
+    return float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)
 
 
 def _estimate_scaling_cost(problem: Problem) -> float:
@@ -297,9 +323,8 @@ class ADMM(Solver):
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
         except TooLate:
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE_MESSAGE)
-        splitting = state.splitting
+        splitting, inner = state.splitting, state.inner_iterations
         if state.watch.total == 0:
-            # Start with y = minus the shifted slack of the start, so that a solution is a fixed point.
             splitting.start(impulse, state.problem.slack(impulse))
         undone, message, total = splitting.undone, "", state.watch.total
 
@@ -321,9 +346,10 @@ class ADMM(Solver):
             "factorisations": state.factorisations - state.reported,
             "undone": splitting.undone - undone,
         }
+        if not state.has_factor:
+            work["inner"] = state.inner_iterations - inner
         state.reported = state.factorisations
-        form = "Cholesky over bodies" if state.is_over_bodies else "LU" if state.lu else "Cholesky"
-        return replace(result, work=work, form=form, message=message)
+        return replace(result, work=work, form=state.form_name, message=message)
 
 
 SPEC = SolverSpec(

@@ -7,10 +7,16 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
     (B + rho) x = c - s + rho z - y                                                               (1)
     u <- u + alpha (x - z)                          then accelerate/mixing.pxd
 
-At a fixed point x = z and B z - c + s + y = 0. The shift is added when both imbalances (3) are at most 1e-3 (or after 200
-iterations), that is, from the convex solution. If contacts stick, that is the solution, otherwise a start. (1) is solved with
-a factorisation that the caller computes (`factor/linear.pxd`), over bodies that of
-I + K^T diag(1 / (theta + rho)) K, where B = K K^T + diag(theta):
+At a fixed point x = z and B z - c + s + y = 0. If contacts stick, the convex solution without the shift is the solution. A run
+without the shift adds it when contacts slip at the convex solution, that is, when the norm of s is large relative to the
+imbalances (3) of the convex iteration:
+
+    |s| / |max(|y|, |c|)| > SLIP_RATIO max(primal, dual)                                          (4)
+
+In piles that stick, the ratio stays below 8, since |s| falls with the imbalances. It passes 15 within 10 to 100 iterations if
+contacts slip. Earlier, the shift hinders the convex iteration, which then stalls at 1e-3 to 1e-2. (1) is solved with a
+factorisation that the caller computes (`factor/linear.pxd`), over bodies that of I + K^T diag(1 / (theta + rho)) K, where
+B = K K^T + diag(theta), or without a factor by conjugate gradients (accelerate/body_solve.pxd):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
@@ -26,6 +32,9 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
+from lavender_ext.accelerate.body_solve cimport (
+    bind_body_solve, body_solve_t, body_solve_workspace_size, compute_body_inverses, solve_body_system,
+)
 from lavender_ext.accelerate.mixing cimport (
     CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
 )
@@ -43,15 +52,21 @@ from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_stric
 
 cdef enum:
     RHO_UPDATE_INTERVAL = 20    # Iterations before the first update of rho; later updates follow after a quarter of those done.
-    MAX_CONVEX_ITERATIONS = 200     # Largest number of iterations without De Saxce's shift.
+    SLIP_RATIO = 15             # With 8, piles that stick get the shift too early; with 30, piles that slip get it too late.
     # c of a block that is inactive at zero impulse is limited to this multiple of the largest c of the other blocks. With a smaller
     # limit, a block that becomes active would have a wrong c. Above 1e6, rho and the mixing lose digits of the other blocks to
     # rounding (tested with |b| up to 1e60).
     MAX_INACTIVE_RATIO = 10000
 
 
-cdef struct factor_t:           # factor of B + rho, or of the body form (2)
+cdef inline double max_start_ratio() noexcept nogil:
+    """Return the largest residual of a start under Coulomb's law, relative to the cone law, with which the shift is on."""
+    return 0.15
+
+
+cdef struct factor_t:           # factor of B + rho, or of the body form (2), or conjugate gradients on (2)
     linear_t* linear
+    body_solve_t* body          # conjugate gradients in place of `linear`, or NULL
     const int32_t* k_ptr        # K by rows if the factor is over bodies; otherwise NULL
     const int32_t* k_col
     const double* k_val
@@ -85,13 +100,17 @@ cdef inline void solve_shifted_system(const factor_t* f, int32_t m, double* x, d
     if f.k_ptr == NULL:
         solve_linear_system(f.linear, x)
         return
-    for i in range(f.linear.n):
+    for i in range(f.body.n if f.body != NULL else f.linear.n):
         t[i] = 0.0
     for i in range(m):
         s = f.e[i] * x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
             t[f.k_col[k]] += f.k_val[k] * s
-    solve_linear_system(f.linear, t)
+    if f.body != NULL:
+        solve_body_system(f.body, t)
+        t = f.body.t
+    else:
+        solve_linear_system(f.linear, t)
     for i in range(m):
         s = x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
@@ -180,6 +199,22 @@ cdef inline double compute_residual_imbalance(const admm_t* c, double* primal, d
     primal[0] = sqrt(primal[0] / x) if x > 0.0 else 0.0
     dual[0] = c.rho * sqrt(dual[0] / y) if y > 0.0 else 0.0
     return primal[0] if primal[0] > dual[0] else dual[0]
+
+
+cdef inline bint is_slip_established(const admm_t* c) noexcept nogil:
+    """Return whether the convex iteration has converged to a point where contacts slip, by (4)."""
+    cdef double shift = 0.0, y = 0.0, s, t, primal, dual, imbalance = compute_residual_imbalance(c, &primal, &dual)
+    cdef int32_t i
+    cdef const blocks_t* p = c.blocks
+    for i in range(p.n_blocks):
+        if not has_independent_rows(p, i):
+            s = compute_friction_shift_of_normal(p, c.root, i, c.y)
+            shift += s * s
+    for i in range(p.n_rows):
+        s = c.y[i] * c.y[i]
+        t = c.c[i] * c.c[i]
+        y += s if s > t else t
+    return imbalance * SLIP_RATIO < sqrt(shift / y) if y > 0.0 else False
 
 
 cdef inline double compute_balanced_rho(const admm_t* c) noexcept nogil:
@@ -283,7 +318,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         if not store_evaluation(&c.mixing, mixed, c.u, c.g):
             c.mixed = 0
             continue
-        if not c.shifted and (c.done >= MAX_CONVEX_ITERATIONS or compute_residual_imbalance(c, &primal, &dual) <= 1e-3):
+        if p.law != CONE and not c.shifted and is_slip_established(c):
             c.shifted = 1
             clear_mixing_memory(&c.mixing)
         if c.done >= c.next:
@@ -305,21 +340,84 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
 
 
 cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) noexcept nogil:
-    """Compute u = z + y / rho from a start lam and its slack w (m), with y = -(w + s) in the scale of u."""
+    """Compute u = z + y / rho from a start lam and its slack w (m), so that a solution is a fixed point.
+
+    y is -w in the scale of u. With the shift, y is -(w + s); the run begins with the shift if the start is closer to a solution of
+    Coulomb's law than to a solution of the cone law.
+    """
     cdef const blocks_t* p = c.blocks
     cdef int32_t i
+    cdef double cone, coulomb = 0.0
     for i in range(p.n_rows):
         c.y[i] = -w[i] / c.root[i]
         if c.c[i] != p.b[i] / c.root[i]:                # c was reduced by `limit_scale_of_inactive_blocks`
             c.y[i] = c.c[i] - (w[i] + p.b[i]) / c.root[i]
-    for i in range(p.n_rows):
-        c.u[i] = c.y[i]
+        c.x[i] = c.root[i] * lam[i]
+    cone = compute_start_residual(c)
     if p.law != CONE:
+        for i in range(p.n_rows):
+            c.before[i] = c.y[i]
         for i in range(p.n_blocks):
             if not has_independent_rows(p, i):
-                c.u[p.ptr[i]] -= compute_friction_shift_of_normal(p, c.root, i, c.y)
+                c.y[p.ptr[i]] -= compute_friction_shift_of_normal(p, c.root, i, c.y)
+        coulomb = compute_start_residual(c)
+        c.shifted = coulomb < max_start_ratio() * cone
+        if not c.shifted:
+            for i in range(p.n_rows):
+                c.y[i] = c.before[i]
     for i in range(p.n_rows):
-        c.u[i] = c.root[i] * lam[i] + c.u[i] / c.rho
+        c.u[i] = c.x[i] + c.y[i] / c.rho
+        c.before[i] = 0.0
+
+
+cdef inline double compute_start_residual(admm_t* c) noexcept nogil:
+    """Return |x - Pi_K(x + y)|, which is 0 at a solution of the law with this y."""
+    cdef int32_t i
+    cdef double total = 0.0
+    for i in range(c.blocks.n_rows):
+        c.u[i] = c.x[i] + c.y[i]
+    for i in range(c.blocks.n_blocks):
+        project_scaled_block(c.blocks, c.root, i, c.u, c.z)
+    for i in range(c.blocks.n_rows):
+        total += (c.x[i] - c.z[i]) * (c.x[i] - c.z[i])
+    return sqrt(total)
+
+
+cdef class BodySolve:
+    """Conjugate gradients on (2), in place of a factor.
+
+    Parameters
+    ----------
+    k_ptr, k_col, k_val : (m + 1,), (entries,), (entries,) array
+        K by rows.
+    e : (m,) array
+        Diagonal of E in (2).
+    n : int
+        Number of velocities, six for each body.
+    before : BodySolve, optional
+        Conjugate gradients for another E; its last solution is the first start.
+    """
+    cdef body_solve_t f
+    cdef object keep
+    cdef double[::1] workspace
+
+    def __init__(self, const int32_t[::1] k_ptr, const int32_t[::1] k_col, const double[::1] k_val, const double[::1] e, int n,
+                 BodySolve before=None):
+        self.keep = k_ptr, k_col, k_val, e
+        self.f.m, self.f.n = <int32_t>len(e), n
+        self.f.k_ptr, self.f.k_col, self.f.k_val, self.f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
+        self.workspace = np.zeros(<Py_ssize_t>body_solve_workspace_size(n))
+        bind_body_solve(&self.f, &self.workspace[0])
+        if before is not None:
+            self.workspace[:n] = before.workspace[:n]
+            self.f.iterations = before.f.iterations
+        with nogil:
+            compute_body_inverses(&self.f)
+
+    @property
+    def iterations(self):
+        """Number of iterations of all solves, including those of the predecessors."""
+        return int(self.f.iterations)
 
 
 cdef class Splitting:
@@ -363,8 +461,8 @@ cdef class Splitting:
     def run(self, double[::1] lam, int n, factor):
         """Run at most `n` iterations without the GIL, write the impulse to `lam` (m,) [N s], and return the number of iterations.
 
-        If `rho` has changed afterwards, the next call needs a new factor. `factor` is a tuple: a `LinearSystem`, and over bodies
-        also the arrays of `factor_t` in its order.
+        If `rho` has changed afterwards, the next call needs a new factor. `factor` is a tuple: a `LinearSystem` or a `BodySolve`,
+        and over bodies also the arrays of `factor_t` in its order.
         """
         cdef factor_t f
         cdef int32_t remaining = n
@@ -372,12 +470,20 @@ cdef class Splitting:
         cdef double[::1] work
         cdef const double[::1] k_val, e
         cdef const int32_t[::1] k_ptr, k_col
-        cdef LinearSystem linear = factor[0]
-        f.linear, f.k_ptr = &linear.f, NULL
+        cdef LinearSystem linear
+        cdef BodySolve body
+        f.linear, f.body, f.k_ptr = NULL, NULL, NULL
         if len(factor) > 1:
             k_ptr, k_col, k_val, e = factor[1:]
             f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
-        work = np.empty(linear.f.n + 1)
+        if isinstance(factor[0], BodySolve):
+            body = factor[0]
+            f.body = &body.f
+            work = np.empty(body.f.n)
+        else:
+            linear = factor[0]
+            f.linear = &linear.f
+            work = np.empty(linear.f.n + 1)
         self.c.work = &work[0]
         with nogil:
             new_rho = lav_admm(&self.c, &f, &lam[0], &remaining)

@@ -107,3 +107,39 @@ def test_first_solves_that_rise_are_no_divergence(slide):
     problem = lv.Problem.contact(np.diag([2.4, 4.4, 0.9]), [3.7e-7, 0.2 * slide, -slide], [1.0])
     solution = lv.solve(problem, "admm", tol=1e-8)
     assert solution.success and solution.iterations > 8
+
+
+def test_admm_conjugate_gradients_give_the_answer_of_a_factor(monkeypatch):
+    """A pile that sticks has one solution of its velocities, which both forms of the linear solve must reach."""
+    problem = lv.suite.case("granularF(n=5)").problem
+    factored = lv.solve(problem, "admm", tol=1e-10)
+    monkeypatch.setattr(admm, "MAX_FACTOR_WORK_PER_ENTRY", 0.0)
+    iterated = lv.solve(problem, "admm", tol=1e-10)
+    assert factored.success
+    assert iterated.success
+    assert factored.work["factorisations"] >= 1
+    assert "inner" not in factored.work
+    assert iterated.work["factorisations"] == 0
+    # Each solve takes at least one iteration; piles take 4 to 10.
+    assert 1 <= iterated.work["inner"] / iterated.work["solves"] <= 10
+    assert iterated.iterations <= 1.5 * factored.iterations
+    velocity = [problem.velocity(s.impulse) for s in (factored, iterated)]
+    # The residual 1e-10 of a velocity of order 0.2 m/s, times the condition of A, of about 1e3.
+    np.testing.assert_allclose(*velocity, atol=1e-7)
+
+
+def test_admm_large_pile_with_a_costly_factor_is_solved_without_one():
+    """14,046 rows: a factor takes 5e8 multiply-adds, 3,400 for each entry of K; some contacts slip."""
+    found = lv.solve(lv.suite.case("granularF(n=10)").problem, "admm", tol=1e-6, max_iter=400)
+    assert found.success
+    assert found.work["factorisations"] == 0
+
+
+def test_admm_warm_start_with_slip_is_not_lost():
+    """Close to a solution with slip, the shift is on from the start: the convex iteration would move away."""
+    problem = lv.suite.case("pyramidF(k=10)").problem
+    start = lv.solve(problem, "newton", tol=1e-9).impulse * (1.0 + 1e-6)
+    cold, warm = (lv.solve(problem, "admm", impulse=x, tol=1e-8) for x in (None, start))
+    assert cold.success
+    assert warm.success
+    assert 2 * warm.iterations < cold.iterations
