@@ -49,7 +49,7 @@ SETUP_RATES = (
 NEWTON_RATES = ("start", "row", "entry", "bodies", "dense", "panels", "velocities", "velocity row",
                 "velocity contact row")  # fmt: skip
 PIVOT_RATES = ("pivot row", "pivot work")
-SWEEP_RATES = ("sweep row", "sweep entry", "sweep cone", "sweep velocities")
+SWEEP_RATES = ("sweep row", "sweep entry", "sweep cone", "sweep body cone", "sweep velocities")
 MEASURED_SWEEPS = 100  # The first sweeps cost more, and `auto` uses about as many.
 
 Fit = dict[str, float]  # Rate by name [ns].

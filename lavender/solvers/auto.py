@@ -4,10 +4,10 @@
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
                      is estimated to cost no more than the first sweeps (`small.py`); attempted once
     relaxation       under Coulomb's law, above `relaxed_rows` rows: `anderson` on the convex relaxation up to the cost
-                     of Newton's method, unless more sweeps than that are predicted to be needed; then the interior
-                     points of `newton` on it. Each iterate is judged under Coulomb's law, which it meets if no contact
-                     slips. The stage ends early if contacts slip: the residual of the relaxation is below `slip_ratio`
-                     times that of Coulomb's law
+                     of Newton's method, or `sweep_fraction` of it if more sweeps are predicted to be needed; then the
+                     interior points of `newton` on it. Each iterate is judged under Coulomb's law, which it meets if
+                     no contact slips. The stage ends early if contacts slip: the residual of the relaxation is below
+                     `slip_ratio` times that of Coulomb's law. Only islands that are not solved continue
     sweeps           `anderson`, unless the problem is linear: `first_sweeps` sweeps. Sweeping continues up to the cost
                      of the cheapest factorising solver, unless more sweeps than that are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
@@ -58,6 +58,7 @@ from lavender.solvers.costs import (
     get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
+from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.recording import Recorder
@@ -74,12 +75,14 @@ from lavender.solvers.steps import (
     Sweeps,
     estimate_cost,
 )
+from lavender_ext.judge.measure import residuals_by_island
 
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
 # Newton's method on the relaxation may use this multiple of its expected number of factorisations.
 RELAXED_BUDGET_RATIO = 2.0
+MAX_RELAXED_STAGES = 3
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
@@ -124,6 +127,7 @@ class DecisionTree:
     compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
     started_from_zero = False  # Whether the compiled call started from the zero impulse.
     sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
+    relaxed_stages = 0  # Number of stages on the relaxation that have run.
     best = nan
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -270,14 +274,22 @@ class DecisionTree:
         """Yield the stages on the convex relaxation, if it is solved first."""
         if not self.starts_relaxed:
             return
-        state, sweep = (
-            self.states.get("newton"),
+        sweep, why = (
             estimate_cost("anderson", get_relaxation(self.problem)).iteration,
+            "exact if no contact slips",
         )
-        cost, why = inf if state is None else state.cost, "the solution if no contact slips"
-        yield Stage("anderson on the relaxation", inf, cost, why, cost / sweep)
-        if state is not None:
-            yield Stage("newton on the relaxation", RELAXED_BUDGET_RATIO * state.steps, cost, why)
+        name, least = "anderson on the relaxation", self.min_newton_cost
+        stages = [Stage(name, inf, least, why, least / sweep)]
+        yield from stages[self.relaxed_stages :]  # Before any analysis.
+        state = self.states.get("newton")
+        if state is None:
+            return
+        steps = RELAXED_BUDGET_RATIO * state.steps
+        stages += [
+            Stage(name, inf, state.cost, why, state.cost / sweep),
+            Stage("newton on the relaxation", steps, state.cost, why),
+        ]
+        yield from stages[max(1, self.relaxed_stages) :]
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
@@ -394,11 +406,14 @@ class AutoState:
         Counts of a compiled call that has failed; None if it has not been made.
     loop : Loop or None
         Loop of the solve, if it records a history.
+    relaxed_stages : int
+        Number of stages on the convex relaxation that have run.
     """
 
     problem: Problem
     failed_call: tuple[int, ...] | None = None
     loop: Loop | None = None
+    relaxed_stages: int = 0
 
 
 @dataclass(frozen=True)
@@ -460,6 +475,7 @@ class Auto(Solver):
             impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = DecisionTree(problem, deadline)
+        tree.relaxed_stages = state.relaxed_stages
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
         log = SolveLog(problem, tol, max_iter, deadline)
@@ -534,7 +550,8 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
-    solve_relaxation(log, tree)
+    if solve_relaxation(log, tree):
+        return
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         Sweeps("anderson", log).sweep_until_deadline()
@@ -587,20 +604,50 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         certify_infeasibility(log)
 
 
-def solve_relaxation(log: SolveLog, tree: DecisionTree) -> None:
-    """Run the stages on the convex relaxation until one solves the problem or shows that contacts slip."""
-    slips = False
+def solve_relaxation(log: SolveLog, tree: DecisionTree) -> bool:
+    """Run the stages on the convex relaxation until one solves the problem or shows that contacts slip.
+
+    Return whether the solve has ended: the problem is solved, or the islands that a stage has not solved have been
+    solved as a problem of their own.
+    """
+    steps: dict[str, Step] = {}
     for stage in tree.iterate_relaxed_stages():
-        step = create_solver_step(stage.solver, log, tree)
-        if (
-            log.done()
-            or slips
-            or (isinstance(step, RelaxedNewton) and not tree.has_time("newton", stage.cost))
-        ):
-            return
-        step.least = stage.least
-        step.run(stage.iterations)
-        slips, tree.best = step.slips, log.best
+        if stage.solver not in steps:
+            steps[stage.solver] = create_solver_step(stage.solver, log, tree)
+        step = steps[stage.solver]
+        if isinstance(step, RelaxedNewton) and not tree.has_time("newton", stage.cost):
+            break
+        if not step.over:
+            step.least = stage.least
+            step.run(stage.iterations)
+        tree.best = log.best
+        tree.relaxed_stages = MAX_RELAXED_STAGES if step.slips else tree.relaxed_stages + 1
+        if log.done() or solve_unsolved_islands(log, tree.relaxed_stages):
+            return True
+        if step.slips:
+            break
+    return False
+
+
+def solve_unsolved_islands(log: SolveLog, relaxed_stages: int) -> bool:
+    """Solve the islands that are not solved as a problem of their own, and return whether there are other islands.
+
+    `relaxed_stages` is the number of stages on the convex relaxation that have run.
+    """
+    problem = log.problem
+    island_of_block, table = residuals_by_island(problem.metric, log.result)
+    unsolved = table[:, 0] > log.tol
+    if unsolved.all():
+        return False
+    blocks = np.flatnonzero(unsolved[island_of_block]).astype(np.int32)
+    rows = get_rows_of_blocks(problem, blocks)
+    state = AutoState(restrict_to_blocks(problem, blocks, rows), relaxed_stages=relaxed_stages)
+    impulse, result = log.result[rows], log.result.copy()
+    claim = Auto()._run(state, impulse, log.remaining_iterations, log.tol, log.time_left)
+    result[rows] = impulse
+    log.judge_and_store_best(result)
+    log.record_part(claim, rows)
+    return True
 
 
 def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:

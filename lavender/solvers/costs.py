@@ -5,7 +5,7 @@
 Costs of iterations, which `auto` compares. Their rates are fitted means:
 
     Newton   start + n (row m + entry e + work w)                                                             (1)
-    sweep    sweep_row m + entry e, with another rate of e over J and M, and under the cone law over J        (2)
+    sweep    sweep_row m + entry e, with other rates of e over J and M, and under the cone law over bodies or J  (2)
     direct   n (row m + work w)                                                                               (3)
 
 m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds
@@ -181,7 +181,7 @@ def get_sweep_rate_name(problem: Problem) -> str:
     if problem.matrix is not None:
         return "entry"
     if problem.law == "cone":
-        return "sweep cone"
+        return "sweep cone" if problem.rows is None else "sweep body cone"
     return "entry" if problem.generalized is None else "sweep velocities"
 
 

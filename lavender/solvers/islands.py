@@ -9,6 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
+from lavender.problem.data import Names
 from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
 
 
@@ -37,7 +38,7 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     The restriction is exact, except that a b that is negligible in all rows becomes 0.
     """
     cones = problem.cones._select_blocks(blocks)
-    names = None if problem.names is None else [problem.names[i] for i in blocks]
+    names = Names(len(blocks), lambda: [problem.block_name(i) for i in blocks])
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = (
         problem.b[rows] if max_abs_of_array(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))

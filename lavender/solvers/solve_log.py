@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
@@ -53,6 +53,7 @@ class SolveLog:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
+        self.remark = ""  # Message of the solve of some islands.
         self.timed_out = (
             False  # The solve ended before the deadline, because the remaining time was too short.
         )
@@ -62,8 +63,9 @@ class SolveLog:
         )  # Smallest relative residual, and the impulse (m,) [N s] with this residual.
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
-        # Given start (m,) [N s], if it is worse than the zero impulse.
-        self.bad_start: FloatArray | None = None
+        # Start (m,) [N s] of sweeps, if it is not `impulse`: a given start that is worse than the zero impulse, or the
+        # last iterate of the convex relaxation.
+        self.sweep_start: FloatArray | None = None
         self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
@@ -79,7 +81,7 @@ class SolveLog:
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
         self.judge_and_store_best(start, is_start=True)
         if self.best > 1.0:
-            self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
+            self.sweep_start = start.copy() if self.best < MAX_START_RESIDUAL else None
             self.judge_and_store_best(
                 self.problem._start, is_start=True
             )  # The relative residual of the zero impulse is 1.
@@ -104,20 +106,21 @@ class SolveLog:
             self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
 
     def compare_with_relaxation(self, impulse: FloatArray) -> tuple[float, float]:
-        """Return how well an impulse (m,) [N s] solves the convex relaxation in the islands that are not solved.
+        """Compare the residuals of an impulse (m,) [N s] on the convex relaxation and on Coulomb's law.
 
         Returns
         -------
         ratio : float
-            Largest residual of the relaxation divided by that of Coulomb's law; 0 if all islands are solved.
-        relative : float
-            Largest relative residual of the relaxation.
+            Residual of the relaxation divided by that of Coulomb's law, the largest of all islands that are not
+            solved; 0 if all are solved.
+        unsolved : float
+            Fraction of the blocks that belong to these islands.
         """
-        problems = self.problem, get_relaxation(self.problem)
-        exact, relaxed = (residuals_by_island(p.metric, impulse)[1][:, :2] for p in problems)
+        island_of_block, exact = residuals_by_island(self.problem.metric, impulse)
+        relaxed = residuals_by_island(get_relaxation(self.problem).metric, impulse)[1]
         unsolved = exact[:, 0] > self.tol
-        ratio = relaxed[unsolved, 1] / exact[unsolved, 1]
-        return float(ratio.max(initial=0.0)), float(relaxed[unsolved, 0].max(initial=0.0))
+        ratio = float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
+        return ratio, float(unsolved[island_of_block].mean())
 
     def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""
@@ -129,6 +132,26 @@ class SolveLog:
                 self.certificate = claim.certificate
             else:
                 self.direction = claim.certificate
+        if claim.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+
+    def record_part(self, claim: Claim, rows: IntArray) -> None:
+        """Record the claim of a solve of some islands, with these row numbers."""
+        self.iterations += claim.iterations
+        self.work = sum_work_counts((self.work, claim.work))
+        self.stages += claim.stages
+        remark = claim.message.removeprefix(describe_stages(claim.stages)).removeprefix("; ")
+        if claim.status is Status.NUMERICAL_ERROR:
+            self.failure = remark
+        elif claim.stages:
+            self.remark = remark
+        if claim.certificate is not None:
+            direction = np.zeros(self.problem.m)
+            direction[rows] = claim.certificate
+            if claim.status is Status.INFEASIBLE:
+                self.certificate = direction
+            else:
+                self.direction = direction
         if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
 
@@ -189,7 +212,9 @@ class SolveLog:
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
-            "; ".join(filter(None, (message, self.failure, *self._describe_conflict_in_relaxation()))),
+            "; ".join(
+                filter(None, (message, self.failure, self.remark, *self._describe_conflict_in_relaxation()))
+            ),
             certificate=self.direction if self.certificate is None else self.certificate,
             stages=tuple(self.stages),
             judged=self.judged,

@@ -42,9 +42,9 @@ MIN_PREDICTED_RESIDUAL = 1e-16
 # [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
 ITERATION_TIME_PER_COST = 4e-9
 # Sweeps over the relaxation before the first prediction of how many remain.
-FIRST_RELAXED_SWEEPS = 32
-# The relaxation counts as solved if its residual is within tol and below this multiple of that of Coulomb's law.
-SOLVED_RATIO = 0.01
+FIRST_RELAXED_SWEEPS = 8
+# Sweeps over the relaxation have solved it if its residual is below this multiple of that of Coulomb's law.
+SOLVED_RATIO = 1e-3
 # Interior points on the relaxation need at least this number of factorisations.
 FIRST_RELAXED_FACTORISATIONS = 6
 # Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
@@ -199,6 +199,7 @@ class Sweeps(Iterations):
 
     time_fraction = DECISIONS.time_share
     first_sweeps = DECISIONS.first_sweeps
+    growth = 0.5  # Between two predictions, the number of sweeps grows by this fraction.
     predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
 
     def advance(self, n: int) -> Claim:
@@ -218,7 +219,8 @@ class Sweeps(Iterations):
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
         self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
-        self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
+        start = self.log.sweep_start
+        self.impulse = self.log.impulse.copy() if start is None else start
 
     def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
@@ -230,28 +232,32 @@ class Sweeps(Iterations):
             if claim.status is not Status.MAX_ITERATIONS:
                 return claim
             loop.tol = self.log.tol
+        now = self.log.best
         while True:
-            step = (
-                min(n - due, max((done + due) // 2, 1 if done else first)) if self.least < np.inf else n - due
-            )
+            step = n - due
+            if self.least < np.inf:
+                step = min(step, max(int(self.growth * (done + due)), 1 if done else first))
             due += step
             claim = loop.run_chunks(due)
             if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
                 return replace(claim, status=Status.MAX_ITERATIONS)
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
-            before = self.log.best
-            self.store_iterate_in_log()
-            self.slips = self.finds_slip()
-            if self.slips:
-                return replace(claim, status=Status.STALLED)
-            now = self.log.best
+            before, now = now, self.measure_progress()
+            if self.is_over_early():
+                return claim
             gain = log(before / now) if 0.0 < now < before else 0.0
-            if now <= tol or gain * self.least < step * log(now / tol):
+            is_hopeless = gain * self.least < step * log(now / tol)
+            if now <= tol or (is_hopeless and done + due >= DECISIONS.sweep_fraction * self.least):
                 return claim
 
-    def finds_slip(self) -> bool:
-        """Return whether the sweeps solve the relaxation, and its solution slips."""
+    def measure_progress(self) -> float:
+        """Return the smallest relative residual so far."""
+        self.store_iterate_in_log()
+        return self.log.best
+
+    def is_over_early(self) -> bool:
+        """Return whether the sweeps end for another reason than their prediction."""
         return False
 
     def sweep_until_deadline(self) -> None:
@@ -264,12 +270,18 @@ class Sweeps(Iterations):
 class RelaxedSweeps(Sweeps):
     """Sweeps over the convex relaxation, judged under Coulomb's law. They stop if they show that contacts slip."""
 
-    first_sweeps = FIRST_RELAXED_SWEEPS
+    first_sweeps, growth = FIRST_RELAXED_SWEEPS, 1.0
 
-    def finds_slip(self) -> bool:
-        """Return whether the relaxation is solved, and its solution does not solve Coulomb's law."""
-        ratio, relative = self.log.compare_with_relaxation(self.impulse)
-        return relative <= self.log.tol and ratio < SOLVED_RATIO
+    def measure_progress(self) -> float:
+        """Return the smallest relative residual that the stopping test has computed."""
+        return float(self.state.best[0])
+
+    def is_over_early(self) -> bool:
+        """Return whether the relaxation is solved without solving Coulomb's law, or half of the blocks are solved."""
+        self.log.sweep_start = self.impulse
+        ratio, unsolved = self.log.compare_with_relaxation(self.impulse)
+        self.slips = ratio < SOLVED_RATIO
+        return self.slips or unsolved <= 0.5
 
 
 class RelaxedNewton(Step):
@@ -297,6 +309,7 @@ class RelaxedNewton(Step):
                 break
             system.solve.write_interior_impulse(trial)
             log.judge_and_store_best(trial)
+            log.sweep_start = trial
             self.slips = log.compare_with_relaxation(trial)[0] < DECISIONS.slip_ratio
             if log.best <= log.tol or self.slips:
                 break

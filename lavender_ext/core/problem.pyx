@@ -354,7 +354,7 @@ cdef class Data:
         other.blocks.law, other.blocks.islands = law, NULL
         other.factored, other.is_general = self.factored, self.is_general
         other.ready, other.single_rows, other.empty = self.ready, self.single_rows, self.empty
-        other._numbers, other._d, other._nu, other._step = self._numbers, self._d, self._nu, self._step
+        other._numbers, other._d, other._nu, other._step = self._numbers, self.d, self._nu, self._step
         other.reference_energy = other.reference_velocity = other.relative_at_zero = -1.0
         return other
 

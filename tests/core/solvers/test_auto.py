@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import FORMS, as_matrix, random_contact_problem, seeds
+from random_problems import FORMS, as_matrix, random_contact_problem, seeds, side_by_side
 
 import lavender as lv
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
@@ -46,3 +46,47 @@ def test_an_island_may_ask_for_dust():
         restrict_to_blocks(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)
     ]
     assert [part.b.tolist() for part in parts] == [[1.0], [0.0]]
+
+
+# -- the convex relaxation -----------------------------------------------------------------------------
+
+
+def test_relaxed_problem_shares_arrays_and_differs_only_in_its_law():
+    problem = lv.suite.case("granularF(n=4)").problem
+    problem.metric, problem.csr  # noqa: B018 - computed before the relaxation is made
+    relaxed, alone = problem.relaxed("cone"), lv.suite.case("granularF(n=4)").problem.relaxed("cone")
+    assert relaxed.csr is problem.csr and np.shares_memory(relaxed.d, problem.d)
+    impulse = np.random.default_rng(0).normal(size=problem.m)
+    for tried in (impulse, np.zeros(problem.m)):
+        assert lv.residual(relaxed, tried).relative == lv.residual(alone, tried).relative
+    assert lv.residual(relaxed, impulse).relative != lv.residual(problem, impulse).relative
+
+
+def test_auto_solves_a_resting_pile_by_its_relaxation():
+    problem = lv.suite.case("granularF(n=6)").problem
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
+    assert {stage.solver for stage in solution.stages} == {"anderson on the relaxation"}
+
+
+def test_auto_stops_interior_points_on_the_relaxation_when_contacts_slip():
+    problem = lv.suite.case(
+        "pyramidF(k=10)"
+    ).problem  # The relaxation has the residual 6e-2 under Coulomb's law.
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    work = {stage.solver: stage.work for stage in solution.stages}
+    assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
+    assert work["newton on the relaxation"]["factorisations"] < 15  # 20 solve the relaxation to 1e-8.
+
+
+def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():
+    """Beside a pile that rests, a pyramid that slips takes about as many factorisations as alone."""
+    pile, pyramid = (lv.suite.case(name).problem for name in ("granularF(n=6)", "pyramidF(k=6, sliding=0.5)"))
+    problem = side_by_side([pile, pyramid])
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
+    sweeps = [s.work["sweeps"] for s in solution.stages if s.solver == "anderson on the relaxation"]
+    assert (
+        sum(sweeps) <= 128
+    )  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
+    assert solution.stages[-1].solver != "anderson on the relaxation"
