@@ -19,9 +19,15 @@ from lavender.lab.tune.mujoco_settings import list_first_settings
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
 
+def keep_values(monkeypatch, module, name, values, solvers):
+    """Let a table of settings try only some values, beside some solvers or none."""
+    lines = [f for f in getattr(module, name) if f.beside.get("solver", "") in solvers]
+    kept = [f._replace(values=tuple(x for x in f.values if x in values)) for f in lines]
+    monkeypatch.setattr(module, name, tuple(f for f in kept if f.values))
+
+
 def fewer(monkeypatch):
-    monkeypatch.setattr(mujoco_settings, "TOLERANCES", (1e-6, 1e-12))
-    monkeypatch.setattr(mujoco_settings, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
+    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
 
 
 def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, monkeypatch):
@@ -148,8 +154,7 @@ def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
 def test_the_limit_of_the_error_holds_on_the_worlds_held_back(boxes, monkeypatch, limit, is_met):
-    fewer(monkeypatch)
-    monkeypatch.setattr(mujoco_settings, "TOLERANCES", (1e-2, 1e-6, 1e-12))
+    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-3, 1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
     found = tune(boxes(EARLY), worlds=4, steps=30, repeats=1, max_velocity_error=limit)
     choice = found.limit_choice
     (held,) = (h for h in found.held if h.setting == choice.setting)
@@ -336,11 +341,9 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
 
 def test_settings_of_mujoco_warp_are_measured(boxes, monkeypatch):
     pytest.importorskip("mujoco_warp")
-    from lavender.lab.tune import warp_settings
+    from lavender.lab.tune.world_settings import WarpEngine
 
-    monkeypatch.setattr(warp_settings, "WARP_TOLERANCES", (1e-2,))
-    monkeypatch.setattr(warp_settings, "WARP_ITERATIONS", {"Newton": (1, 20)})
-    monkeypatch.setattr(warp_settings, "WARP_LINE_SEARCHES", (20,))
+    keep_values(monkeypatch, WarpEngine, "table", {1, 1e-2, 20}, {"Newton", ""})
     found = tune(boxes(EARLY), engine="mujoco_warp", worlds=2, steps=10, repeats=1)
     by = {m.setting.option_line: m for m in found.measured}
     one, twenty = (by[f'<option solver="Newton" iterations="{n}"/>'] for n in (1, 20))
@@ -350,14 +353,12 @@ def test_settings_of_mujoco_warp_are_measured(boxes, monkeypatch):
 
 def test_settings_of_kamino_are_measured(monkeypatch):
     pytest.importorskip("newton")
-    from lavender.lab.tune import kamino_settings
+    from lavender.lab.tune.world_settings import KaminoEngine
 
-    monkeypatch.setattr(kamino_settings, "KAMINO_TOLERANCES", (1e-3,))
-    monkeypatch.setattr(kamino_settings, "KAMINO_ITERATIONS", (2, 400))
-    monkeypatch.setattr(kamino_settings, "KAMINO_PENALTIES", (10.0,))
+    keep_values(monkeypatch, KaminoEngine, "table", {1e-3, 10, 400}, {""})
     found = tune("boxes_stacked_on_plane", engine="kamino", worlds=2, steps=10, repeats=1)
     by = {m.setting.option_line: m for m in found.measured}
-    few, many = (by[f"config.padmm.max_iterations = {n}"] for n in (2, 400))
+    few, many = (by[f"config.padmm.max_iterations = {n}"] for n in (10, 400))
     assert many.worst_error < 0.1 * few.worst_error and many.worst_motion < few.worst_motion
     assert "config.padmm.rho_0 = 10.0" in by
     with pytest.raises(lv.InputError, match="sets its own"):

@@ -24,9 +24,8 @@ from lavender.io.efc import from_mujoco_many
 from lavender.lab.audit import MAX_PROBLEMS_IN_MEMORY
 from lavender.lab.simulated_worlds import Runs, has_diverged, simulate_world
 from lavender.lab.tune.measured import Measured, Setting, Stage, make_unmeasured
+from lavender.lab.tune.tables import MUJOCO, list_options
 
-TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
-ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
 MERGE_NOTE = (
     "Add the line after the model's own <option>: MuJoCo merges both, and a later attribute replaces an earlier one. "
     "If the line replaces the model's own <option>, its integrator and time step are lost."
@@ -230,13 +229,8 @@ def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
 
     Settings that change the problem are last.
     """
-    enough = max(100, int(model.opt.iterations))
-    tried: list[dict[str, Any]] = []
-    for solver, budgets in ITERATIONS.items():
-        tried += [{"solver": solver, "iterations": enough, "tolerance": t} for t in TOLERANCES]
-        tried += [{"solver": solver, "iterations": n} for n in budgets]
-    tried += [{"cone": "pyramidal"}, {"cone": "elliptic"}, {"impratio": 1.0}, {"impratio": 10.0}]
-    tried += [{"noslip_iterations": n} for n in (0, 3, 10)]
+    enough = {"iterations": max(100, int(model.opt.iterations))}
+    tried = [enough | x if "tolerance" in x else x for x in list_options(MUJOCO)]
     own = MujocoSetting.from_options(mj, model)
     default = replace(MujocoSetting.from_options(mj, model, **get_default_options(mj)), is_default=True)
     return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))

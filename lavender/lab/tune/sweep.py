@@ -12,9 +12,9 @@ which are held back. `lavender.lab.tune.measured` describes the measurements. If
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +32,10 @@ from lavender.lab.simulated_worlds import (
     can_any_geoms_collide,
     count_engine_warnings,
 )
-from lavender.lab.tune.kamino_settings import KaminoStage
 from lavender.lab.tune.measured import Measured, Schedule, Setting, Stage
 from lavender.lab.tune.mujoco_settings import MujocoStage
 from lavender.lab.tune.recommendation import Tuning
-from lavender.lab.tune.warp_settings import WarpStage
+from lavender.lab.tune.world_settings import make_kamino_stages, make_warp_stages
 
 TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
 # After this many rounds of timing, variants of the settings near the Pareto front are tried.
@@ -121,7 +120,7 @@ def tune(
             )
         start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
         return run_tuning(
-            lambda: KaminoStage.split_worlds(name, worlds, steps, horizon, **start),
+            lambda: make_kamino_stages(name, worlds, steps, horizon, **start),
             name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2,
             error_limit=max_velocity_error, watch=watch,
         )  # fmt: skip
@@ -130,15 +129,15 @@ def tune(
     mj, configured = runs.load_model()
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
-    stage_type = MujocoStage if engine == "mujoco" else WarpStage
 
-    def make_stages() -> tuple[Stage, Stage]:
+    def make_stages() -> Sequence[Stage]:
         """Simulate all worlds; return the stages of the worlds with even numbers and of those with odd numbers."""
-        even, odd = (
-            stage_type.from_stretches_of_runs(mj, configured, runs, range(i, worlds, 2), horizon)
+        if engine == "mujoco_warp":
+            return make_warp_stages(mj, configured, runs, horizon)
+        return [
+            MujocoStage.from_stretches_of_runs(mj, configured, runs, range(i, worlds, 2), horizon)
             for i in (0, 1)
-        )
-        return cast("tuple[Stage, Stage]", (even, odd))
+        ]
 
     with count_engine_warnings(mj):  # Settings with which worlds diverge are left out.
         tuning = run_tuning(
@@ -149,7 +148,7 @@ def tune(
 
 
 def run_tuning(
-    make_stages: Callable[[], tuple[Stage, Stage]],
+    make_stages: Callable[[], Sequence[Stage]],
     model: str,
     horizon: int,
     repeats: int,
