@@ -7,27 +7,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from calls import dense, over_velocities
-from random_problems import FORMS, random_contact_problem, random_ellipse_friction_contacts, random_lcp
+from random_problems import FORMS, random_contact_problem, random_ellipse_friction_contacts
 from worked import python
 
 import lavender as lv
-from benchmarks.core_problems import fresh, stacks
+from benchmarks.core_problems import fresh
 from lavender import registry
-from lavender.base.lazy_import import import_numerical_modules
 from lavender.problem.derived import computed_once
 from lavender.problem.operators import Operators
-from lavender.solvers import admm
 from lavender.solvers.costs import (
     estimate_disk_cost,
-    estimate_formation_cost,
     estimate_judge_setup_cost,
-    estimate_result_cost,
 )
-from lavender.solvers.newton_systems import systems
-from lavender.solvers.small import AUTO
-from lavender_ext.factor.linear import LinearSystem
 
 
 def test_set_up_is_inside(clock, monkeypatch):
@@ -73,108 +65,6 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
     assert np.array_equal(late.impulse, problem.start()) and late.residual.relative == nothing
     worse = lv.solve(fresh(problem), name, impulse=1e3 * np.ones(100), time_limit=1.0)
     assert worse.residual.relative == nothing  # who brings a start has it weighed
-
-
-@pytest.fixture
-def panels(clock, monkeypatch):
-    """Sparse factors whose parts take what is counted, by a clock that is played; what was done, in turn."""
-    import_numerical_modules()  # of SciPy, which is counted, too
-    done, made = SimpleNamespace(names=[], entry=9e-8, first=0.0, flop=0.0), LinearSystem
-
-    class Played(made):
-        analysed = False
-
-        def analyse(self):
-            if not self.analysed:
-                clock.now += done.entry * len(self.indices)
-                done.names.append("analysed")
-                self.analysed = True
-            super().analyse()
-
-        def factor(self, *of):
-            clock.now += done.first + done.flop * self.cost
-            done.names.append("factored")
-            return super().factor(*of)
-
-    for module in (admm, systems):
-        monkeypatch.setattr(module, "LinearSystem", Played)
-    return done
-
-
-@pytest.mark.parametrize("name", ["newton", "admm"])
-def test_the_analysis_of_what_fills_in_ends_in_time(name, clock, panels):
-    """Counted as laid out alone, it was begun: 4.8 ms under 3 ms on 1,000 rows, 22 under 10 on 2,700."""
-    a = sp.random_array((1000, 1000), density=0.024, rng=np.random.default_rng(0))
-    problem = lv.Problem.lcp(sp.csr_array(a + a.T + 100.0 * sp.eye_array(1000)), np.ones(1000))
-    late = lv.solve(fresh(problem), name, time_limit=3e-3)
-    assert late.status is lv.Status.TIME_LIMIT and not panels.names and clock.now == 0.0
-    assert lv.solve(fresh(problem), name, time_limit=0.3).success
-    assert 3e-3 < clock.now < 0.3  # of more entries than fit into the first limit
-
-
-def wide():
-    """A grid whose points meet all within four steps."""
-    line = sp.diags_array([1.0] * 9, offsets=range(-4, 5), shape=(18, 18))
-    return lv.Problem.lcp(sp.csr_array(90.0 * sp.eye_array(324) - sp.kron(line, line)), np.ones(324))
-
-
-@pytest.mark.parametrize("make", [wide, lambda: stacks(12, 6, 0.5, False)])
-@pytest.mark.parametrize("limit", [3e-4, 1e-3, 3e-3, 1e-2])
-def test_of_admm_neither_scaling_nor_analysis_nor_a_factor_ends_late(make, limit, clock, panels, monkeypatch):
-    """All three were begun where the first was counted to fit: 2.7 ms under a limit of 1 ms."""
-    problem, form = make(), lv.Problem.velocity_form
-    panels.entry, panels.first, panels.flop = 5e-8, 2e-4, 1e-10
-
-    def scaled(of):
-        clock.now += 7e-4
-        panels.names.append("scaled")
-        return form(of)
-
-    monkeypatch.setattr(lv.Problem, "velocity_form", scaled)
-    solution = lv.solve(fresh(problem), "admm", time_limit=limit)
-    assert clock.now <= limit
-    if limit == 1e-2:
-        assert solution.success and "factored" in panels.names
-    elif limit == 3e-4:
-        assert solution.status is lv.Status.TIME_LIMIT and not panels.names
-        assert np.array_equal(solution.impulse, problem.start())
-
-
-@pytest.mark.parametrize("name", ["direct", "lemke"])
-def test_a_factor_of_exchanges_that_would_end_after_the_deadline_is_not_begun(name):
-    m = 90  # more rows than the compiled factor takes
-    problem, skew = random_lcp(3, m, boxed=False), np.random.default_rng(0).normal(size=(m, m))
-    problem = lv.Problem.lcp(problem.dense() + (name == "lemke") * (skew - skew.T), problem.b)
-    prepared = lv.prepare(problem, name)
-    state = prepared.state
-    outside = (state if name == "lemke" else state.pivot).outside
-
-    def run():
-        return prepared.solver.run(state, problem.start(), 10_000, 1e-9, time_limit=100.0)
-
-    outside.seconds = 1e9  # by which its first factor would be refused
-    refused = run()
-    assert refused.status is lv.Status.TIME_LIMIT and "factorisations" not in refused.work
-    outside.seconds = 0.0
-    assert run().status is lv.Status.CONVERGED
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_a_small_call_that_is_cut_short_ends_no_worse_than_it_began(form, law):
-    ended = []
-    for seed in range(12):
-        problem = FORMS[form](random_contact_problem(seed, "coulomb" if law == "lcp" else law, 2, False))
-        if law == "lcp":
-            problem = lv.Problem.lcp(problem.dense() + 0.1 * np.diag(problem.d), problem.b)
-        for most in (0.0, 3e3, 1e4, 1e5, 1e6):
-            small = fresh(problem)
-            found, counts = AUTO.solve_and_judge(small, None, 1e-9, most)
-            if found is not None:
-                claim = AUTO.make_claim(small, counts, None, found.relative, lv.Status.TIME_LIMIT)
-                assert claim.message and np.isfinite(found.impulse).all()
-                ended.append(found.relative <= 1e-9)
-    assert any(ended) and not all(ended)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -405,23 +295,3 @@ print(lv.solve(problem, tol=1e-13, time_limit=0.2))
     before, after = python("-c", code).stdout.splitlines()
     assert "import scipy.linalg.lapack, scipy.sparse before" in before
     assert "scipy" not in after
-
-
-@pytest.mark.parametrize(("contacts", "velocities"), [(60, 120), (100, 200), (200, 300)])
-def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatch):
-    """A of dense J and M had been formed to count what it costs: 5 times the limit, and nothing found."""
-    rng = np.random.default_rng(0)
-    jac, root = rng.normal(size=(3 * contacts, velocities)), rng.normal(size=(velocities, velocities))
-    mass = root @ root.T / velocities + 0.1 * np.eye(velocities)
-    problem = lv.Problem.from_jacobian(
-        jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
-    )
-    limit = 1e-9 * (
-        estimate_judge_setup_cost(problem)
-        + estimate_result_cost(problem)
-        + 0.5 * estimate_formation_cost(problem)
-    )
-    monkeypatch.setattr(
-        "lavender.problem.operators.assemble.form_gram_matrix", None
-    )  # which A = Y Y^T is formed by
-    assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

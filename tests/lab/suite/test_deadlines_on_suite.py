@@ -5,17 +5,13 @@ import functools
 import numpy as np
 import pytest
 from calls import dense, over_velocities
-from random_families import drawn
-from random_problems import as_matrix
 
 import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.judge import residuals
 from lavender.solvers.auto import DecisionTree
 from lavender.solvers.costs import estimate_judge_setup_cost, estimate_result_cost
-from lavender.solvers.newton_systems import augmented
 from lavender.solvers.steps import Newton, Step, estimate_cost
 from lavender.solvers.sweeping import SweepSolver
 
@@ -96,51 +92,6 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
     assert found[-1] < found[0]
 
 
-@pytest.mark.parametrize("limit", [1e-3, 1.5e-3])
-def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
-    """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
-    problem = as_matrix(drawn(seed=97112, part="rolling").problem)
-    sweep, each = SweepSolver.run, 4.5e-9 * estimate_cost("anderson", problem).iteration
-
-    def swept(*of):
-        found = sweep(*of)
-        clock.now += each * found.iterations
-        return found
-
-    monkeypatch.setattr(SweepSolver, "run", swept)
-    solution = lv.solve(fresh(problem), tol=1e-12, time_limit=limit)
-    assert 0.0 < clock.now <= limit
-    assert solution.residual.relative < 0.1
-
-
-@pytest.mark.parametrize("limit", [0.02, 0.1, 0.4])
-def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
-    """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
-    problem = drawn(seed=95402, part="rolling").problem
-    monkeypatch.setattr(augmented, "estimate_import_cost", lambda *of: 0.0)
-    made, factor, each = [], augmented.factor_sparse_lu, 0.01
-
-    def played(*of):
-        made.append(clock.now)
-        clock.now += each
-        return factor(*of)
-
-    monkeypatch.setattr(augmented, "factor_sparse_lu", played)
-    assert lv.solve(fresh(problem), "newton").success and len(made) > 20
-    for name in ("newton", "auto"):
-        made.clear()
-        clock.now = 0.0
-        solution = lv.solve(fresh(problem), name, time_limit=limit)
-        least = lv.residual(problem, problem.start()).relative
-        # The first is counted by structure; of those behind it the last one's time is known.
-        assert made and clock.now <= limit
-        assert solution.success or (
-            solution.status is lv.Status.TIME_LIMIT and solution.residual.relative < least
-        )
-        if name == "newton" or limit > 0.3:  # sweeps take no time here: `auto` may go on with them to the end
-            assert solution.success == (limit > 0.3)
-
-
 @pytest.mark.parametrize("name", OWN)
 def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
     """Nobody else solves under its name: the better of the start and of doing nothing goes back."""
@@ -201,16 +152,3 @@ def test_the_judge_begins_only_what_he_can_end(name, clock):
     solution = lv.solve(problem, "newton", time_limit=limit)
     assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
     assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
-
-
-@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel"])
-def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
-    """A was counted, and so nothing begun, for sweeps that never read it."""
-    problem = PROBLEMS["J and M, dense"]()
-    residuals.get_zero_impulse_reference(problem)
-    monkeypatch.setattr(
-        "lavender.problem.operators.assemble.form_gram_matrix", None
-    )  # which A = Y Y^T is formed by
-    assert (
-        lv.solve(problem, name, time_limit=2e-9 * estimate_result_cost(problem), max_iter=3).iterations == 3
-    )

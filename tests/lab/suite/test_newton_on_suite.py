@@ -1,6 +1,5 @@
 """`newton`, `admm` and `auto` on built-in problems, whose structure these properties need."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,10 +11,7 @@ from random_problems import as_matrix, good, seeds
 
 import lavender as lv
 from lavender import registry, suite
-from lavender.base.deadline import Deadline
 from lavender.lab.suite import box_stack
-from lavender.solvers.newton import SPEC, Newton
-from lavender.solvers.newton_systems.systems import make_system
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
@@ -24,26 +20,6 @@ def test_coulomb_with_mass_ratios(ratio, speed):
     problem = box_stack(4, ratio, "coulomb", speed).problem
     solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
     assert solution.success, solution
-
-
-def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
-    problem = box_stack(20, 10.0, "coulomb").problem
-    prepared = lv.prepare(problem, "admm")
-    solver, state = prepared.solver, prepared.state
-    impulse, made = problem.start(), state.factorisations
-    state.factor = None  # as of a problem whose first factor is large
-    solver.set_deadline(state, Deadline(-1.0))
-    claim = solver.run(state, impulse, 50, 1e-6)
-    assert claim.status is lv.Status.TIME_LIMIT
-    assert claim.iterations == 0
-    assert state.factorisations == made
-    assert "factorisation" in claim.message
-    # With time it goes on from there, with the bits of one that had its factor from the start.
-    solver.set_deadline(state, Deadline())
-    assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
-    twin, other = lv.prepare(problem, "admm"), problem.start()
-    twin.solver.run(twin.state, other, 500, 1e-6)
-    assert impulse.tobytes() == other.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -107,15 +83,6 @@ def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
         assert relative == pytest.approx(truth, rel=1e-6, abs=1e-12)
 
 
-def test_a_narrow_matrix_is_factored_by_panels_that_do_not_fill():
-    problem = as_matrix(suite.box_stack(n=40).problem)
-    system = make_system(problem, "impulse")
-    assert not system.dense
-    assert system.work <= problem.m * 8**2  # two boxes, four points each
-    # Redundant points: A is singular, to rounding of either sign.
-    assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
-
-
 BOXES = {
     "pyramid": lambda ratio: suite.pyramid(k=5, mass_ratio=ratio),
     "boxes": lambda ratio: suite.box_stack(n=8, mass_ratio=ratio),
@@ -157,27 +124,3 @@ def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert good(solution, 1e-9), solution
     assert solution.work["factorisations"] <= 300, solution
-
-
-def test_rounds_that_gain_nothing_give_way_to_interior_points():
-    """Heavy boxes on light ones at rest: no residual below the first comes from Newton steps on the natural map.
-
-    Two rounds of 20 such steps before an interior point took 58 factorisations; the interior point takes 12.
-    """
-    problem = suite.box_stack(n=12, mass_ratio=1e6, friction="coulomb").problem
-    solution = lv.solve(problem, "newton", impulse=np.zeros(problem.m), tol=1e-6)
-    assert good(solution, 1e-6) and "De Saxce steps" in solution.message
-    assert solution.work["factorisations"] < 40
-
-
-def test_a_turn_after_the_last_of_all_steps_is_an_end(monkeypatch):
-    problem = suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem
-    newton = Newton()
-    monkeypatch.setattr("lavender.solvers.newton.SPEC", replace(SPEC, max_iter=4))
-    state, lam = newton.prepare(problem), problem.start()
-    assert newton.advance(state, lam, 2, 1e-15).status is lv.Status.MAX_ITERATIONS
-    for _ in range(3):
-        claim = newton.advance(state, lam, 2, 1e-15)
-        if claim.status is not lv.Status.MAX_ITERATIONS:
-            break
-    assert claim.status is lv.Status.STALLED

@@ -1,21 +1,16 @@
 """Solvers and the judge on built-in problems, whose structure these properties need."""
 
 import dataclasses
-import itertools
-import threading
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from calls import SPENT, STUCK, driven, says
+from calls import says
 from random_problems import CONTACTS, GIVEN, as_matrix
 from scipy.linalg import block_diag
 
 import lavender as lv
 from lavender import suite
-from lavender.lab.suite.families import granular
 from lavender.solvers.auto import Auto
-from lavender.solvers.jacobi import Jacobi
 
 
 @pytest.mark.parametrize("form", GIVEN)
@@ -85,51 +80,12 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
         )  # sums in another order
 
 
-def test_what_is_worked_out_of_one_object_waits_for_none_of_another():
-    inside, leave, quick = threading.Event(), threading.Event(), threading.Event()
-
-    def reference():
-        inside.set()
-        assert leave.wait(600)
-
-    case = lv.suite.case("stack(n=2)")
-    first, second = (dataclasses.replace(case, solve_reference=f) for f in (reference, quick.set))
-    with ThreadPoolExecutor(2) as pool:
-        waiting = pool.submit(lambda: first.reference)
-        try:
-            assert inside.wait(600)
-            pool.submit(lambda: second.reference)
-            assert quick.wait(30)  # it may come at any time, and never does where it waits for the first
-        finally:
-            leave.set()
-        assert waiting.result() is None
-
-
 def test_a_step_that_goes_wrong_is_undone():
     # Faces on faces with friction: mixing overshoots and is restarted, and the residual falls all the same.
     problem = lv.suite.case("box_stackF(n=6, sliding=0.5)").problem
     solution = lv.solve(problem, "anderson", tol=0.0, max_iter=400)
     assert solution.work["restarts"] > 0
     assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
-
-
-def test_a_budget_ends_it_and_a_proof_too():
-    hard = as_matrix(suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem)
-    how, done, relative, impulse = driven(hard, 1e-12, budget=3, work=1)
-    assert how == SPENT and done <= 4
-    assert lv.residual(hard, impulse).relative == pytest.approx(relative)
-    squeeze = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), [1.0, 0.5])
-    how, *_ = driven(squeeze)
-    assert how == STUCK
-
-
-def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
-    problem = granular(n=7, friction="coulomb", seed=8).problem
-    sweeps = [
-        lv.solve(problem, "nncg", convex=60, tol=1e-6, max_iter=10_000, restart=restart).work["sweeps"]
-        for restart in ("growth", "against")
-    ]
-    assert sweeps[1] < 0.7 * sweeps[0]
 
 
 def test_what_a_callback_raises_comes_through():
@@ -141,21 +97,6 @@ def test_what_a_callback_raises_comes_through():
 
     with pytest.raises(Enough):
         lv.solve(suite.stack(64).problem, "pgs", callback=callback)
-
-
-@pytest.mark.parametrize("limit", [None, 10.0])
-def test_with_a_time_limit_the_first_look_at_the_clock_is_after_one_iteration(monkeypatch, limit):
-    asked, own = [], Jacobi.run
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        asked.append(n)
-        return own(self, state, impulse, n, tol, time_limit)
-
-    monkeypatch.setattr(Jacobi, "run", run)
-    problem = suite.stack(8).problem
-    lv.solve(problem, "jacobi", tol=1e-12, max_iter=500, time_limit=limit)
-    assert (asked[0] == 1) == (limit is not None)
-    assert all(later <= 8 * one for one, later in itertools.pairwise(asked))
 
 
 def test_a_set_up_that_was_stopped_begins_again(monkeypatch):

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 from random_families import wild
 from random_problems import warmed
@@ -102,13 +101,6 @@ def test_what_rests_is_told_within_twice_the_sweeps(text, options, sweeps):
         solution = lv.solve(problem, name, **options)
         assert solution.status is lv.Status.STALLED, name
         assert solution.iterations <= 2 * before, name
-
-
-def test_checks_over_a_weigh_rows_as_the_judge_does():
-    """In A nothing tells a hinge's angular rows from linear ones: the body's masses must come along."""
-    problem = after(20, "four_bar").constraint_problem()
-    assert np.any(problem.metric.nu != problem.metric.d)
-    np.testing.assert_array_equal(problem.csr_data.nu, problem.metric.nu)
 
 
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "block_gauss_seidel"])

@@ -4,26 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from worked import energy
 
 import lavender as lv
 from lavender.sim.scene import SCENES
-from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 STANDING = {"stack", "card_house", "heavy_on_light", "table", "ramp", "pyramid"}
 SMALLER = {"pyramid": {"base": 5}, "pile": {"n": 30, "kind": "mixed"}}  # the same with less to compute
 SETTLED = 2.0  # s, from which drift and penetration are measured
-
-
-def energy(scene, observation):
-    """Mechanical energy [J] of the moving bodies: m v.v / 2 + omega.(R I R^T omega) / 2 - m g.x."""
-    total, g = 0.0, np.array(scene.parameters.gravity)
-    for i, body in enumerate(scene.bodies):
-        if body.is_static:
-            continue
-        x, v = observation["positions"][i], observation["velocities"][i]
-        omega = convert_to_rotation_matrix(observation["quaternions"][i]).T @ v[3:]
-        total += 0.5 * body.mass * v[:3] @ v[:3] + 0.5 * omega @ body.inertia @ omega - body.mass * g @ x
-    return float(total)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a state about to be lost

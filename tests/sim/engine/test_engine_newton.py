@@ -62,28 +62,6 @@ def test_a_step_is_what_solve_returns(name, more):
     assert judged >= 15  # the scenes touch something from the first half second on
 
 
-def test_the_first_phase_ends_in_each_of_its_ways():
-    def messages(name, **more):
-        sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
-        for _ in range(40):
-            sim.step()
-            yield sim.last_solution
-
-    seen = list(messages("stack"))
-    assert seen[-1].message == "as it came" and dict(seen[-1].work) == {"factorisations": 0}
-    chain = list(messages("chain", n=12))
-    # the first step is cold: no warm start to carry on
-    assert {s.message for s in chain[1:]} == {"joints solved directly"}
-    assert all(dict(s.work) == {"factorisations": 1} for s in chain[1:])
-    assert all(s.residual.relative <= 1e-10 for s in chain[1:])
-    swept = [s for s in messages("pyramid", base=6, dt=1 / 240) if s.message == "warm sweeps"]
-    assert all(s.work["sweeps"] in (4, 8, 16, 32, 64) and s.success for s in swept)
-    problem = lv.Simulation("table").constraint_problem()
-    exact = lv.solve(problem, "newton", tol=1e-12).impulse
-    near = lv.solve(problem, "newton", impulse=exact * (1.0 + 1e-5))
-    assert near.message == "warm sweeps" and near.success and near.work["factorisations"] == 0
-
-
 def test_a_warm_start_within_tol_comes_back_as_it_is():
     sim = after(100, "pyramid", base=4)
     problem = sim.constraint_problem()
@@ -91,29 +69,6 @@ def test_a_warm_start_within_tol_comes_back_as_it_is():
     again = lv.solve(problem, "newton", impulse=exact, tol=1e-8)
     np.testing.assert_array_equal(again.impulse, exact)
     assert dict(again.work) == {"factorisations": 0} and again.message == "as it came"
-
-
-def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
-    from lavender_ext.newton import warm_start
-
-    sim = lv.Simulation(lv.Scene("four_bar", solver="newton"))  # a closed loop: its rows depend on each other
-    sim.step()
-    problem = sim.constraint_problem()
-    lam = problem.guess.copy()
-    how, _, factorisations = warm_start.solve_from_guess(problem.data, lam, 1e-6)
-    assert (how, factorisations) == (0, 1)
-    np.testing.assert_array_equal(lam, problem.guess)
-    # nothing reaches a millionth of what float64 can hold
-    problem = lv.Simulation(lv.Scene("stack", n=10)).constraint_problem()
-    lam = 0.2 * lv.solve(problem, "newton", tol=1e-10).impulse
-    before = lam.copy()
-    how, sweeps, factorisations = warm_start.solve_from_guess(problem.data, lam, 1e-22)
-    assert how == 0 and sweeps > 0
-    np.testing.assert_array_equal(lam, before)
-    found = lv.solve(problem, "newton", impulse=before, tol=1e-22)
-    assert found.status.name == "ROUNDOFF_LIMIT"
-    # what the first phase did in vain is counted; there are no other sweeps
-    assert found.work["sweeps"] == sweeps and found.work["factorisations"] > factorisations
 
 
 def test_another_newton_is_asked_itself(register):

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from calls import sweep_packed
-from worked import after
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
@@ -97,32 +95,3 @@ def test_packed_contacts_of_boxes_thrown_together(mixed):
         most = max(most, int(before.head[HEAD["contacts"]]))
     assert most > 30
     assert not mixed or rows_of >= {1, 3, 4, 5, 6}
-
-
-def test_a_joint_on_top_of_a_tower_leaves_it_packed():
-    """It is swept first and its body's contacts last: it begins late, so that slots stay wide."""
-    shapes = []
-    for joint in (False, True):
-        scene = lv.Scene("stack", n=20)
-        if joint:
-            top = scene.bodies[-1].position
-            scene.add_joint("ball", -1, len(scene.bodies) - 1, anchor=(top[0], top[1], top[2] + 0.5))
-        sim = after(5, scene)
-        problem = sim.constraint_problem()
-        shapes.append(sweep_packed(problem, [20], start=problem.start()))
-    assert shapes[1][0] <= shapes[0][0] + 2
-    assert shapes[1][1] >= shapes[0][1]
-
-
-def test_one_chain_is_swept_one_by_one():
-    """Where each contact waits for the one before, pairs gain nothing."""
-    sim = after(5, "stack", n=40)
-    assert sweep_packed(sim.constraint_problem(), [40], "nncg")[0] == 0
-
-
-@pytest.mark.parametrize("order", ["given", "reverse"])
-def test_a_tall_stack_is_packed_over_sweeps(order):
-    """Few contacts are free of each other in one sweep: those of several sweeps stand in pairs."""
-    sim = after(5, "stack", n=40)
-    problem = sim.constraint_problem()
-    assert sweep_packed(problem, [8, 1, 2, 3, 5, 30, 4], order=order, start=problem.start())[1] > 1
