@@ -24,7 +24,6 @@ NAMES = (
     "scale",
     "stability",
     "stand",
-    "worlds",
 )
 
 

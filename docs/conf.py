@@ -24,7 +24,7 @@ copyright = "The lavender developers, BSD 3-Clause licence"
 version = release = lavender.__version__
 
 extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser"]
-exclude_patterns = ["_build", "paper"]
+exclude_patterns = ["_build"]
 default_role = "code"
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
