@@ -25,13 +25,7 @@ import scipy.sparse as sp
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import (
-    PROGRAM_FORMS,
-    QP,
-    build_impulse_form,
-    build_velocity_form,
-    make_bound_rows,
-)
+from lavender.external.as_qp import PROGRAM_FORMS, QP, ConicRows, build_program
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, explain_refusal
@@ -98,7 +92,7 @@ def _limits(eps: float, n: int, limit: float) -> Limits:
 def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
     if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
         return qp.problem.start()
-    return qp.recover_impulse(x, np.zeros(0) if zeta is None else zeta, np.zeros(qp.n))
+    return qp.recover_impulse(x, np.zeros(len(qp.b)) if zeta is None else zeta, np.zeros(qp.n))
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
@@ -138,17 +132,14 @@ def _cone(name: str, form: str) -> Contestant:
     """Return the runs of a solver of second-order cone programs by its own interface."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = build_velocity_form(problem) if form == "velocity" else build_impulse_form(problem)
-        first, bounds = qp.n_zero + qp.n_nonneg, make_bound_rows(qp)
-        more = sum(len(at) for *_, at in bounds)
-        rows = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
-        rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
-        upper = sp.csc_matrix(sp.triu(qp.P))
+        qp = build_program(problem, form)
+        conic = ConicRows.from_program(qp)
+        rows, rhs, upper = conic.A, conic.b, sp.csc_matrix(sp.triu(qp.P))
 
         def scs(eps: float) -> tuple[Any, Any]:
             import scs
 
-            cone = {"z": qp.n_zero, "l": qp.n_nonneg + more, "q": list(qp.soc)}
+            cone = {"z": qp.n_zero, "l": conic.n_nonneg, "q": list(qp.soc)}
             data = {"P": upper, "A": rows, "b": rhs, "c": qp.q}
             found = scs.SCS(
                 data, cone, eps_abs=eps, eps_rel=0.0, eps_infeas=1e-14, max_iters=10**7,
@@ -163,7 +154,7 @@ def _cone(name: str, form: str) -> Contestant:
             solver = qoco.QOCO()
             equal = (rows[:z], rhs[:z]) if z else (None, None)
             solver.setup(
-                qp.n, len(rhs) - z, z, upper, qp.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], qp.n_nonneg + more,
+                qp.n, len(rhs) - z, z, upper, qp.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], conic.n_nonneg,
                 len(qp.soc), np.asarray(qp.soc, np.int32), abstol=max(eps, 1e-13), reltol=1e-16, verbose=0,
                 max_iters=200,
             )  # fmt: skip
@@ -174,7 +165,7 @@ def _cone(name: str, form: str) -> Contestant:
             begun = process_time()
             x, y = scs(eps) if name == "scs" else qoco(eps)
             seconds = process_time() - begun
-            return seconds, _impulse(qp, x, np.delete(np.asarray(y, float), np.s_[first : first + more]))
+            return seconds, _impulse(qp, x, conic.split_multipliers(np.asarray(y, float))[0])
 
         for eps in LADDER:
             yield functools.partial(once, eps)

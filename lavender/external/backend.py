@@ -1,14 +1,17 @@
 """Description of a QP backend, and one run of it by its own interface or through qpsolvers.
 
 qpsolvers returns iterates and multipliers of all backends. For some backends it solves problems without constraints by
-SciPy's LSQR instead. To prevent this, such problems are passed with infinite bounds or in the equality form, and a
-result of LSQR is rejected.
+SciPy's LSQR instead; `build_program` adds a row to such problems.
 """
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,9 +25,15 @@ from lavender.external.running import (
     Limits,
     capture_backend_output,
     clamp_tolerance,
+    classify_status,
     keep_if_infeasibility_certificate,
 )
 from lavender.judge.solution import Status
+
+MAX_PROXQP_ENTRIES = 10**6  # Larger programs are passed to proxqp as sparse matrices in repeated calls, too.
+# A backend that replaces the handler of Ctrl-C puts the previous one back. Two of them at the same time would leave the
+# handler of one, with which Ctrl-C no longer raises KeyboardInterrupt.
+_HANDLER_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -56,14 +65,17 @@ class Backend:
         Whether the backend uses a start point.
     stoppable : bool
         Whether the backend accepts a time limit.
-    linear : {"bounds", "equality", ""}
-        How problems without constraints are passed: with infinite bounds, in the equality form, or not at all.
     finite : bool
-        Whether the backend rejects infinite bounds; finite bounds are then passed as rows.
+        Whether the backend rejects infinite bounds, or qpsolvers would pass them as rows with a right-hand side of inf
+        or 1e10. Finite bounds are then passed as rows.
     noisy : bool
         Whether the backend prints even if its output is disabled.
     cones : bool
         Whether the backend accepts second-order cones, and so the convex relaxation of friction.
+    interrupts : bool
+        Whether the backend replaces the handler of Ctrl-C while it solves.
+    jax : bool
+        Whether the backend runs in JAX, which computes in 32 bits unless its option jax_enable_x64 is set.
     """
 
     name: str
@@ -79,16 +91,17 @@ class Backend:
     definite: bool = False
     warm: bool = False
     stoppable: bool = False
-    linear: str = "bounds"
     finite: bool = False
     noisy: bool = False
     cones: bool = False
+    interrupts: bool = False
+    jax: bool = False
 
     def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
         """Run the backend once, in this process."""
-        if self.call is not None:
-            return self.call(qp, impulse, limit, settings)
-        return _call_through_qpsolvers(self, qp, impulse, limit, settings)
+        call = self.call or partial(_call_through_qpsolvers, self)
+        with _HANDLER_LOCK if self.interrupts else nullcontext():
+            return call(qp, impulse, limit, settings)
 
 
 def _call_through_qpsolvers(
@@ -101,36 +114,33 @@ def _call_through_qpsolvers(
     limits = {**vars(limit), "eps": eps}
     options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
     settings = {name: x for name, x in options.items() if x is not None}  # Leave out a time limit of None.
-    if backend.warm:
-        settings.update(_make_warm_start_settings(backend.name, qp, impulse))
+    dense = backend.dense
+    if backend.name == "proxqp":
+        # Its sparse code calls a few feasible programs infeasible; its dense code is slower and does so less often.
+        dense = limit.attempt > 0 and qp.n * max(qp.n, len(qp.b)) <= MAX_PROXQP_ENTRIES
+        settings.update(_make_proxqp_start(qp, impulse) if limit.attempt == 0 else {})
     settings.update(extra)
     # Split the rows: the first `n_zero` are equalities, the others inequalities.
     z = qp.n_zero
-    dense = backend.dense
-    p = qp.P.toarray() if dense else qp.P
+    # In rows: pyqpmad factors a P in columns in place, and qpsolvers then computes multipliers from its factor.
+    p = np.ascontiguousarray(qp.P.toarray()) if dense else qp.P
     rows = qp.A.toarray() if dense else qp.A
-    lb, ub = qp.lb, qp.ub
+    lb, ub = (None, None) if backend.finite else (qp.lb, qp.ub)
     inequality, rhs = rows[z:], qp.b[z:]
-    bounds = make_bound_rows(qp) if backend.finite else []
-    if bounds:
-        lb = ub = None
-        inequality = sp.csc_matrix(sp.vstack([inequality, *(s * m for s, m, _, _ in bounds)]))
-        inequality = inequality.toarray() if dense else inequality
-        rhs = np.concatenate([rhs, *(h for _, _, h, _ in bounds)])
+    n_rows, has_bound_rows = len(rhs), backend.finite and qp.lb is not None
+    if has_bound_rows:
+        bounds, bound_rhs = make_bound_rows(qp)
+        bounds = bounds.toarray() if dense else bounds
+        stack = np.vstack if dense else sp.vstack
+        inequality, rhs = stack([inequality, bounds]) if n_rows else bounds, np.concatenate([rhs, bound_rhs])
+        inequality = inequality if dense else sp.csc_matrix(inequality)
     g, h = (inequality, rhs) if len(rhs) else (None, None)
     a, b = (rows[:z], qp.b[:z]) if z else (None, None)
-    if lb is None and g is None and a is None:
-        # If bounds are given, qpsolvers does not use LSQR.
-        lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
     with capture_backend_output(False) as warnings:
         solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
     warning = "; ".join(warnings)
-    if "LSQR" in warning:
-        return Answer(
-            Status.NUMERICAL_ERROR, f"qpsolvers ran LSQR in place of {backend.name}; its answer is not used"
-        )
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, status_text = _get_status(solution, extras)
@@ -145,13 +155,17 @@ def _call_through_qpsolvers(
     elif len(qp.b) > z:
         x = None  # In the velocity form, impulses are computed from the multipliers alone.
     xi = np.asarray(solution.z_box, float) if _has_size(solution.z_box, qp.n) else None
-    if bounds and _has_size(solution.z, len(rhs)):
+    if has_bound_rows and _has_size(solution.z, len(rhs)):
         xi = merge_bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
     iterations = _get_iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
     message = status_text or warning or _describe_result(solution.found, x)
     if backend.settings is None:
         message += ", at its own tolerance"
+    if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
+        message += (
+            "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) makes it compute in 64 bits"
+        )
     direction, contradiction = (
         keep_if_infeasibility_certificate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
     )
@@ -177,9 +191,9 @@ def _describe_result(is_solved: bool | None, x: Any) -> str:
 
 def _get_iterations(extras: Mapping[str, Any]) -> int | None:
     """Return the number of iterations from the additional data of a backend, or None if they do not contain it."""
-    info = extras.get("info", extras)
+    info = extras.get("info", extras.get("sip_output", extras))
     for source in (info, extras):
-        for name in ("iter", "iterations", "num_iterations", "nbIter", "num_iter"):
+        for name in ("iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num"):
             value = source.get(name) if isinstance(source, Mapping) else getattr(source, name, None)
             if isinstance(value, (int, np.integer)):
                 return int(value)
@@ -191,9 +205,9 @@ def _get_iterations(extras: Mapping[str, Any]) -> int | None:
 
 def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
     """Return the status, and the backend's text for it if qpsolvers returns one."""
-    info = extras.get("info", extras)
+    info = extras.get("info", extras.get("sip_output", extras))
     text = ""
-    for name in ("status", "exitFlag"):
+    for name in ("status", "exitFlag", "exit_status"):
         value = info.get(name) if isinstance(info, Mapping) else getattr(info, name, None)
         if value is None:
             value = extras.get(name)
@@ -201,33 +215,23 @@ def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
             text = str(getattr(value, "name", value))
             text = f"status {text}" if text.lstrip("-").isdigit() else text
             break
-    lower_case = text.lower()
     if solution.found:
         return Status.CONVERGED, text
     if "exitFlag" in (info if isinstance(info, Mapping) else ()):
         ecos = {1: Status.INFEASIBLE, 2: Status.INFEASIBLE, 10: Status.STALLED, -1: Status.MAX_ITERATIONS}
         return ecos.get(int(info["exitFlag"]), Status.NUMERICAL_ERROR), text
-    if "infeas" in lower_case or "unbounded" in lower_case:
-        return Status.INFEASIBLE, text
-    if "time" in lower_case:
-        return Status.TIME_LIMIT, text
-    if "max" in lower_case and "iter" in lower_case:
-        return Status.MAX_ITERATIONS, text
-    if "inaccurate" in lower_case or "unknown" in lower_case:
-        return Status.STALLED, text
-    return Status.NUMERICAL_ERROR, text
+    status = classify_status(text)
+    return Status.NUMERICAL_ERROR if status is Status.CONVERGED else status, text
 
 
-def _make_warm_start_settings(name: str, qp: QP, impulse: FloatArray) -> dict[str, Any]:
-    """Return the settings that start a backend from an impulse (m,) [N s]."""
+def _make_proxqp_start(qp: QP, impulse: FloatArray) -> dict[str, Any]:
+    """Return the settings that start proxqp, the only backend that qpsolvers can start, from an impulse (m,) [N s]."""
+    from proxsuite import proxqp
+
     x, zeta, xi = qp.make_start(impulse)
-    if name == "proxqp":
-        from proxsuite import proxqp
-
-        z = zeta[qp.n_zero :]
-        if qp.lb is not None or len(qp.b) == 0:
-            z = np.concatenate([z, xi])
-        settings = {"initvals": x, "initial_guess": proxqp.InitialGuess.WARM_START}
-        settings |= {"y": zeta[: qp.n_zero]} if qp.n_zero else {}
-        return settings | ({"z": z} if len(z) else {})
-    return {"initvals": x}
+    z = zeta[qp.n_zero :]
+    if qp.lb is not None or len(qp.b) == 0:
+        z = np.concatenate([z, xi])
+    settings = {"initvals": x, "initial_guess": proxqp.InitialGuess.WARM_START}
+    settings |= {"y": zeta[: qp.n_zero]} if qp.n_zero else {}
+    return settings | ({"z": z} if len(z) else {})

@@ -26,9 +26,6 @@ PROXIMAL = {  # Without the test of the duality gap, proxqp accepts non-zero mul
     "eps_abs": "eps", "eps_rel": 0.0, "max_iter": "max_iter",
     "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap_relative",
 }  # fmt: skip
-SCS = {
-    "eps_abs": "eps", "eps_rel": 0.0, "eps_infeas": 1e-11, "max_iters": "max_iter", "time_limit_secs": "time_limit"
-}  # fmt: skip
 CVXOPT = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "maxiters": "max_iter"}
 ECOS = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "max_iters": "max_iter"}
 GUROBI = {
@@ -48,11 +45,13 @@ QTQP = {
 }  # fmt: skip
 PYQPMAD = {"tolerance": "eps", "max_iter": "max_iter"}
 QPAX = {"solver_tol": "eps"}
+JAXOPT = {"tol": "eps", "maxiter": "max_iter"}
+SIP = {"eps_abs": "eps", "eps_rel": 0.0, "max_iterations": "max_iter", "time_limit": "time_limit"}
 
 ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic programs"
 BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
-            call=native.call_osqp, max_iter=100_000, warm=True, stoppable=True),
+            call=native.call_osqp, max_iter=100_000, warm=True, stoppable=True, interrupts=True),
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
             "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
@@ -65,30 +64,33 @@ BACKENDS: tuple[Backend, ...] = (
             call=native.call_daqp, dense=True, warm=True, stoppable=True),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
             call=native.call_highs, max_iter=100_000, stoppable=True),
-    Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
-            "O'Donoghue 2021, SCS 3", settings=SCS, max_iter=100_000, warm=True, stoppable=True),
+    Backend("scs", ("scs",), "scs", "operator splitting, homogeneous embedding",
+            "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, warm=True, stoppable=True,
+            interrupts=True),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",
-            "Goldfarb, Idnani 1983", dense=True, definite=True),
+            "Goldfarb, Idnani 1983", dense=True, definite=True, finite=True),
     Backend("cvxopt", ("qpsolvers", "cvxopt"), "cvxopt", "interior point", "Vandenberghe 2010, CVXOPT",
-            settings=CVXOPT, max_iter=100),
+            settings=CVXOPT, max_iter=100, finite=True),
     Backend("kvxopt", ("qpsolvers", "kvxopt"), "kvxopt", "interior point, CVXOPT with more factorisations",
             "Vandenberghe 2010, CVXOPT", settings=CVXOPT, max_iter=100),
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
             "Domahidi, Chu, Boyd 2013, ECOS", settings=ECOS, max_iter=100,
-            dense=True, definite=True, linear="equality", finite=True),
+            dense=True, definite=True, finite=True, interrupts=True),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
             settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
             settings=COPT, min_tolerance=1e-9, stoppable=True, noisy=True),
-    Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True),
+    Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True,
+            finite=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
-            settings=QTQP, max_iter=200, linear=""),
+            settings=QTQP, max_iter=200, finite=True),
     Backend("pyqpmad", ("qpsolvers", "pyqpmad"), "pyqpmad", "dual active set, positive definite A",
             "Goldfarb, Idnani 1983", settings=PYQPMAD, min_tolerance=1e-12, dense=True, definite=True),
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
-            settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True),
+            settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True, jax=True,
+            finite=True),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
-            dense=True, noisy=True),
+            settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
             "Frison, Diehl 2020, HPIPM", dense=True),
     Backend("nppro", ("qpsolvers", "nppro"), "nppro", "active set", "NPPro manual", dense=True),
@@ -97,8 +99,9 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpoases", ("qpsolvers", "qpoases"), "qpoases", "online active set",
             "Ferreau et al. 2014, qpOASES", dense=True),
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
-            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, linear="", finite=True),
-    Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual"),
+            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, finite=True),
+    Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual",
+            settings=SIP, max_iter=500, stoppable=True),
     Backend("clarabel_cone", ("clarabel",), "clarabel",
             "interior point on the convex relaxation of friction, second-order cones",
             "Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
@@ -108,11 +111,10 @@ BACKENDS: tuple[Backend, ...] = (
 
 def _make_spec(backend: Backend) -> SolverSpec:
     """Build the registry entry of a backend."""
-    laws = {"lcp"} | ({"linear"} if backend.linear else set()) | ({"cone"} if backend.cones else set())
     return SolverSpec(
         name=backend.name,
         factory=partial(QPSolver, backend),
-        laws=frozenset(laws),
+        laws=frozenset({"linear", "lcp", *(["cone"] if backend.cones else [])}),
         # Under the law "cone", friction boxes are written as one row for each edge of the cone, which makes A
         # singular.
         box_friction_laws=frozenset() if backend.definite else frozenset({"cone"}),

@@ -18,7 +18,7 @@ from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
-from lavender.external.as_qp import QP, build_impulse_form
+from lavender.external.as_qp import QP, build_program
 from lavender.external.backend import Backend
 from lavender.external.running import Answer, BackendFailed, Limits, capture_backend_output
 from lavender.judge.solution import Status
@@ -158,7 +158,7 @@ def run_backend(
         if backend.name not in _warmed_up:
             _warmed_up.add(backend.name)
             with suppress(Exception), capture_backend_output(backend.noisy):
-                tiny = build_impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
+                tiny = build_program(Problem.lcp(np.eye(1), np.ones(1)), "impulse")
                 backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
         return {}, ()
     with capture_backend_output(backend.noisy) as printed:

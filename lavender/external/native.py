@@ -5,7 +5,6 @@ Through qpsolvers, these backends have no warm start, and their iterations, exit
 
 from __future__ import annotations
 
-import threading
 from functools import cache
 from typing import Any
 
@@ -14,13 +13,14 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, make_bound_rows, make_two_sided_rows, merge_bound_multipliers
+from lavender.external.as_qp import QP, ConicRows, make_two_sided_rows
 from lavender.external.running import (
     MIN_TOLERANCE,
     Answer,
     Limits,
     capture_backend_output,
     clamp_tolerance,
+    classify_status,
     copy_usable_certificate,
     keep_if_infeasibility_certificate,
     set_backend_options,
@@ -30,22 +30,29 @@ from lavender.judge.solution import Status
 # [-] Weight of DAQP's proximal steps, for a P with unit diagonal. A much smaller weight makes steps fail: with 1e-8,
 # DAQP did not solve a program that takes 64 iterations with this weight.
 DAQP_PROXIMAL_WEIGHT = 1e-2
+DAQP_OVERDETERMINED = -6  # Exit flag of DAQP if its first working set, the equations, has no solution.
+# [-] Added to the diagonal of P by HiGHS, in units of about 1, in the first and in each repeated call. A large value
+# changes the solution; with a small one, its active-set method ends at wrong points if P is singular.
+HIGHS_REGULARIZATION = 1e-10, 1e-12, 1e-8
+# [-] Factor of q, b and bounds passed to HiGHS, which rounds numbers below about 1e-4 to zero or fails with them.
+HIGHS_SCALE = 1024.0
+# [-] HiGHS reports an unbounded program as optimal at a point of about the inverse of its regularisation. If the
+# product of both is larger than this, the regularisation determines the answer.
+MAX_HIGHS_SHIFT = 1e-3
+
+
+def _merge(settings: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings without those that are None (no time limit), overridden by those of the user."""
+    return {name: value for name, value in settings.items() if value is not None} | extra
 
 
 def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     """Call Clarabel: interior point, homogeneous embedding, second-order cones (Goulart, Chen 2024)."""
     import clarabel
 
-    first = qp.n_zero + qp.n_nonneg
-    bounds = make_bound_rows(qp)
-    n_bounds = sum(len(at) for *_, at in bounds)
-    stacked = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
-    rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
-    cones = []
-    if qp.n_zero:
-        cones.append(clarabel.ZeroConeT(qp.n_zero))
-    if qp.n_nonneg + n_bounds:
-        cones.append(clarabel.NonnegativeConeT(qp.n_nonneg + n_bounds))
+    rows = ConicRows.from_program(qp)
+    cones = [clarabel.ZeroConeT(qp.n_zero)] if qp.n_zero else []
+    cones += [clarabel.NonnegativeConeT(rows.n_nonneg)] if rows.n_nonneg else []
     cones += [clarabel.SecondOrderConeT(size) for size in qp.soc]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -61,23 +68,12 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
     set_backend_options(settings, extra, "clarabel")
-    solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, stacked, rhs, cones, settings)
+    solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, rows.A, rows.b, cones, settings)
     result = solver.solve()
     name = str(result.status)
-    status = {
-        "Solved": Status.CONVERGED,
-        "AlmostSolved": Status.STALLED,
-        "InsufficientProgress": Status.STALLED,
-        "PrimalInfeasible": Status.INFEASIBLE,
-        "DualInfeasible": Status.INFEASIBLE,
-        "AlmostPrimalInfeasible": Status.STALLED,
-        "AlmostDualInfeasible": Status.STALLED,
-        "MaxIterations": Status.MAX_ITERATIONS,
-        "MaxTime": Status.TIME_LIMIT,
-    }.get(name, Status.NUMERICAL_ERROR)
-    x, z = np.array(result.x), np.array(result.z)
-    zeta = np.concatenate([z[:first], z[first + n_bounds :]])
-    xi = merge_bound_multipliers(qp, z[first:])
+    name = str(result.status)
+    status = classify_status(name)
+    x, (zeta, xi) = np.array(result.x), rows.split_multipliers(np.array(result.z))
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     if almost and any(part is not None for part in keep_if_infeasibility_certificate(qp, x, zeta)):
         status = Status.INFEASIBLE  # "Almost infeasible" suffices, because the judge checks the certificate.
@@ -101,18 +97,17 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     x0, _, _ = qp.make_start(impulse)
     settings: dict[str, Any] = {
         "iter_limit": limit.max_iter,
+        "time_limit": limit.time_limit,
         "primal_tol": clamp_tolerance(limit.eps, 1e-11),
         "dual_tol": clamp_tolerance(limit.eps, 1e-13),
     }
-    if limit.repeated:
+    if limit.attempt:
         # By default, DAQP regularises a singular P by 1e-6, which leaves multipliers of this size on inactive rows.
         # Proximal steps with a small tolerance avoid them.
         settings |= {"eps_prox": DAQP_PROXIMAL_WEIGHT, "eta_prox": MIN_TOLERANCE}
-    if limit.time_limit is not None:
-        settings["time_limit"] = limit.time_limit
     dense = qp.A.toarray() if len(qp.b) else np.zeros((0, qp.n))
     x, _, flag, info = daqp.solve(
-        qp.P.toarray(), qp.q.copy(), dense, high, low, sense, primal_start=x0, **{**settings, **extra}
+        qp.P.toarray(), qp.q.copy(), dense, high, low, sense, primal_start=x0, **_merge(settings, extra)
     )
     message = {
         1: "optimal",
@@ -122,21 +117,25 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         -3: "unbounded",
         -4: "iteration limit",
         -5: "nonconvex",
-        -6: "overdetermined initial working set",
+        DAQP_OVERDETERMINED: "overdetermined initial working set",
         -7: "time limit",
     }.get(int(flag), "unknown")
-    status = {
-        1: Status.CONVERGED,
-        -1: Status.INFEASIBLE,
-        -3: Status.INFEASIBLE,
-        -4: Status.MAX_ITERATIONS,
-        -7: Status.TIME_LIMIT,
-    }
+    status = classify_status(message)
     multipliers = np.asarray(info["lam"])
     k = len(lb)
     direction, contradiction = keep_if_infeasibility_certificate(qp, np.asarray(x), multipliers[k:])
+    if flag == DAQP_OVERDETERMINED:
+        # DAQP returns no certificate: the residual of the equations' least-squares solution is one, if they contradict.
+        fixed = np.zeros(qp.n, bool) if qp.lb is None else qp.lb == qp.ub
+        rows, rhs = dense[: qp.n_zero, ~fixed], qp.b[: qp.n_zero]
+        if qp.lb is not None:
+            rhs = rhs - dense[: qp.n_zero, fixed] @ qp.lb[fixed]
+        zeta = np.zeros(len(qp.b))
+        zeta[: qp.n_zero] = rows @ np.linalg.lstsq(rows, rhs, rcond=None)[0] - rhs
+        direction, contradiction = keep_if_infeasibility_certificate(qp, None, zeta)
+        status = status if contradiction is None else Status.INFEASIBLE
     return Answer(
-        status=status.get(int(flag), Status.NUMERICAL_ERROR),
+        status=status,
         message=f"{message} (exit flag {flag})",
         x=np.asarray(x),
         zeta=multipliers[k:],
@@ -169,55 +168,56 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         lower.indices,
         lower.data,
     )
-    lp = model.lp_
-    lp.num_col_, lp.col_cost_ = qp.n, qp.q
-    lp.col_lower_ = np.full(qp.n, -np.inf) if qp.lb is None else qp.lb
-    lp.col_upper_ = np.full(qp.n, np.inf) if qp.ub is None else qp.ub
-    lp.num_row_ = len(qp.b)
-    if len(qp.b):
-        lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
-        lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
-        lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
-        lp.row_lower_, lp.row_upper_ = low, high
+    lp, k = model.lp_, HIGHS_SCALE
+    lp.num_col_, lp.col_cost_ = qp.n, k * qp.q
+    lp.col_lower_ = np.full(qp.n, -np.inf) if qp.lb is None else k * qp.lb
+    lp.col_upper_ = np.full(qp.n, np.inf) if qp.ub is None else k * qp.ub
+    if not len(qp.b):
+        # Without rows, HiGHS returns exact zeros for numbers below 1e-4; a row without bounds prevents it.
+        rows, low, high = sp.csc_matrix(sp.eye_array(1, qp.n)), np.array([-np.inf]), np.array([np.inf])
+    lp.num_row_, lp.row_lower_, lp.row_upper_ = len(low), k * low, k * high
+    lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
+    lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
     _discard_highs_banner()
     solver: Any = highspy.Highs()  # type: ignore[no-untyped-call]
     settings: dict[str, Any] = {
+        # The option `threads` is left out: HiGHS has one scheduler for the process, and every call that asks for
+        # another number of threads than the first call fails.
         "output_flag": False,
-        "threads": 1,
-        "primal_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
-        "dual_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
-        # The default shifts the diagonal by 1e-7, which changes the problem.
-        "qp_regularization_value": 1e-13,
+        "primal_feasibility_tolerance": clamp_tolerance(HIGHS_SCALE * limit.eps, 1e-10),
+        "dual_feasibility_tolerance": clamp_tolerance(HIGHS_SCALE * limit.eps, 1e-10),
+        "qp_regularization_value": HIGHS_REGULARIZATION[limit.attempt % 3],
         "qp_iteration_limit": limit.max_iter,
+        "time_limit": limit.time_limit,
     }
-    if limit.time_limit is not None:
-        settings["time_limit"] = limit.time_limit
-    for key, value in {**settings, **extra}.items():
+    for key, value in _merge(settings, extra).items():
         if solver.setOptionValue(key, value) != highspy.HighsStatus.kOk:
             raise InputError(
                 f"highs rejected the setting {key}={value!r}; a name and a value of the options of HiGHS "
                 "are needed"
             )
-    solver.passModel(model)
-    solver.run()
-    status = solver.getModelStatus()
-    name = solver.modelStatusToString(status)
+    has_failed = highspy.HighsStatus.kError in (solver.passModel(model), solver.run())
+    name, direction = solver.modelStatusToString(solver.getModelStatus()), None
     answer = solver.getSolution()
-    x = np.array(answer.col_value) if answer.value_valid else None
+    x = np.array(answer.col_value) / k if answer.value_valid else None
+    if has_failed and x is None and "threads" in extra:
+        name += "; the option threads must be that of the first call of HiGHS in the process, or be left out"
+    status = classify_status(name)
+    shift = solver.getOptionValue("qp_regularization_value")[1]
+    if status is Status.CONVERGED and x is not None and shift * np.abs(x).max(initial=0.0) > MAX_HIGHS_SHIFT:
+        name = f"Optimal with {shift:g} on the diagonal of P, which moves the answer"
+        direction, _ = keep_if_infeasibility_certificate(qp, x, None)
+        status = Status.STALLED if direction is None else Status.INFEASIBLE
     dual = answer.dual_valid
     return Answer(
-        status={
-            "Optimal": Status.CONVERGED,
-            "Infeasible": Status.INFEASIBLE,
-            "Unbounded": Status.INFEASIBLE,
-            "Iteration limit reached": Status.MAX_ITERATIONS,
-            "Time limit reached": Status.TIME_LIMIT,
-        }.get(name, Status.NUMERICAL_ERROR),
+        status=status,
         message=name,
         x=x,
-        zeta=-np.array(answer.row_dual) if dual else None,
-        xi=-np.array(answer.col_dual) if dual else None,
+        zeta=-np.array(answer.row_dual)[: len(qp.b)] / k if dual else None,
+        xi=-np.array(answer.col_dual) / k if dual else None,
         work={"iterations": max(0, solver.getInfo().qp_iteration_count)},
+        direction=direction,
     )
 
 
@@ -231,11 +231,6 @@ def _get_osqp_algebra() -> str:
     import osqp
 
     return str(osqp.default_algebra())
-
-
-# OSQP replaces the handler of Ctrl-C while it solves and then puts the previous one back. Two solves at the same time
-# would leave OSQP's own handler, with which Ctrl-C no longer raises KeyboardInterrupt.
-_OSQP_LOCK = threading.Lock()
 
 
 def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
@@ -258,41 +253,28 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         "adaptive_rho": True,
         "adaptive_rho_interval": 50,  # [iterations] An interval in time would make results irreproducible.
         "verbose": False,
+        "time_limit": limit.time_limit,
     }
-    if limit.time_limit is not None:
-        settings["time_limit"] = limit.time_limit
     known = {k for k in dir(solver.ext.OSQPSettings()) if not k.startswith("_")} | set(settings)
     for key in extra:
         if key not in known:
             raise InputError(f"osqp has no setting {key!r}; known: {', '.join(sorted(known))}")
     p = sp.csc_matrix(sp.triu(qp.P))
     try:
-        solver.setup(p, qp.q, rows, low, high, **{**settings, **extra})
+        solver.setup(p, qp.q, rows, low, high, **_merge(settings, extra))
     except osqp.OSQPException as error:
         # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
         message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
         return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {message}")
     x, zeta, xi = qp.make_start(impulse)
     solver.warm_start(x=x, y=np.concatenate([zeta, xi])[: len(low)])
-    with _OSQP_LOCK:
-        result = solver.solve(raise_error=False)
+    result = solver.solve(raise_error=False)
     info = result.info
-    status = {
-        1: Status.CONVERGED,
-        2: Status.STALLED,
-        3: Status.INFEASIBLE,
-        4: Status.STALLED,
-        5: Status.INFEASIBLE,
-        6: Status.STALLED,
-        7: Status.MAX_ITERATIONS,
-        8: Status.TIME_LIMIT,
-        10: Status.INTERRUPTED,
-    }.get(int(info.status_val), Status.NUMERICAL_ERROR)
     r = len(qp.b)
     y = np.asarray(result.y)
     polished = {1: ", polished", -1: ", polishing failed"}.get(int(info.status_polish), "")
     return Answer(
-        status=status,
+        status=classify_status(info.status),
         message=f"{info.status}{polished}",
         x=np.asarray(result.x),
         zeta=y[:r],
@@ -328,17 +310,10 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     solver.warm_start(x, np.concatenate([zeta, xi])[: len(low)])
     solver.solve()
     name = str(solver.info.status)
-    status = {
-        "solved": Status.CONVERGED,
-        "primal infeasible": Status.INFEASIBLE,
-        "dual infeasible": Status.INFEASIBLE,
-        "maximum iterations reached": Status.MAX_ITERATIONS,
-        "time limit exceeded": Status.TIME_LIMIT,
-    }.get(name, Status.NUMERICAL_ERROR)
     r = len(qp.b)
     y = np.array(solver.solution.y)
     return Answer(
-        status=status,
+        status=classify_status(name),
         message=name,
         x=np.array(solver.solution.x),
         zeta=y[:r],
@@ -351,3 +326,33 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         if "primal inf" in name
         else None,
     )
+
+
+def call_scs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
+    """Call SCS: operator splitting, homogeneous embedding (O'Donoghue 2021); it ignores a start without x, y and s."""
+    import scs
+
+    rows = ConicRows.from_program(qp)
+    settings: dict[str, Any] = {
+        "eps_abs": limit.eps,
+        "eps_rel": 0.0,
+        "eps_infeas": 1e-11,
+        "max_iters": limit.max_iter,
+        "time_limit_secs": limit.time_limit,
+        "verbose": False,
+    }
+    data = {"P": sp.csc_matrix(sp.triu(qp.P)), "A": rows.A, "b": rows.b, "c": qp.q}
+    try:
+        solver = scs.SCS(data, {"z": qp.n_zero, "l": rows.n_nonneg}, **_merge(settings, extra))
+    except TypeError as error:
+        raise InputError(f"scs rejected the settings {', '.join(extra)}: {error}") from None
+    x, zeta, xi = qp.make_start(impulse)
+    slack = rows.b - rows.A @ x
+    slack[: qp.n_zero] = 0.0
+    result = solver.solve(x=x, y=rows.join_multipliers(zeta, xi), s=np.maximum(slack, 0.0))
+    info, x = result["info"], np.asarray(result["x"])
+    zeta, xi = rows.split_multipliers(np.asarray(result["y"]))
+    return Answer(
+        status=classify_status(info["status"]), message=info["status"], x=x, zeta=zeta, xi=xi,
+        work={"iterations": info["iter"]}, direction=x, contradiction=zeta,
+    )  # fmt: skip

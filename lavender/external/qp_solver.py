@@ -12,13 +12,7 @@ from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.external.as_qp import (
-    QP,
-    build_impulse_form,
-    build_program_form,
-    build_velocity_form,
-    choose_program_form,
-)
+from lavender.external.as_qp import QP, build_program, choose_program_form, shift_to_definite
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import call_backend_until_accepted
@@ -31,7 +25,7 @@ from lavender.solvers.registry import Cost, Solver
 MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
 OPTION_HELP = {
     "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default True",
-    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default: by size, mass ratio and backend); not for programs",
+    "form": "'program' (P, q and rows of from_qp), 'impulse', 'velocity' (bodies, J and M) or 'auto' (default)",
     "unit_diagonal": "in the impulse form, scale A to a unit diagonal; default True",
     "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
@@ -65,32 +59,20 @@ class QPSolver(Solver):
 
     def _build_program(self, problem: Problem, fix_far_rows: bool) -> QP:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
-        b = self.backend
-        qp: QP | None = None
-        if problem.has_singular_program:
-            qp = build_program_form(problem, fix_far_rows=fix_far_rows)
-        elif choose_program_form(problem, self.form, b.definite) == "velocity":
-            qp = build_velocity_form(problem, fix_far_rows=fix_far_rows)
-        if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
-            qp = None
-        if qp is None:
-            qp = build_impulse_form(
-                problem,
-                unit_diagonal=self.unit_diagonal,
-                equality=b.linear == "equality" and problem.cones.is_free,
-                fix_far_rows=fix_far_rows,
-            )
-        if len(qp.unknown_rows) and qp.is_bounds_only and not b.linear:
-            raise CapabilityError(
-                f"solver {b.name!r} does not accept problems without inequalities, because qpsolvers "
-                "passes them to LSQR; use direct or another backend"
+        b, qp = self.backend, None
+        form = choose_program_form(problem, self.form, b.definite)
+        if form != "impulse":
+            qp = build_program(problem, form, fix_far_rows=fix_far_rows)
+        if qp is None or (b.definite and self.form == "auto" and not qp.is_definite):
+            qp = build_program(
+                problem, "impulse", fix_far_rows=fix_far_rows, unit_diagonal=self.unit_diagonal
             )
         if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > MAX_DENSE_SIZE:
             raise CapabilityError(
                 f"solver {b.name!r} accepts dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
                 f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
-        return qp
+        return shift_to_definite(qp) if b.definite else qp
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def run(

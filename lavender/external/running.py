@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import os
 import sys
 import threading
@@ -31,6 +32,7 @@ MIN_GAP = 1e-18  # Smallest absolute gap of objectives passed to a backend.
 MAX_RELATIVE_GAP = 1e-13
 MIN_RELATIVE_GAP = 1e-16  # Gap relative to the objective in the last, strictest call.
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
+MAX_LOOSE_RATIO = 100.0  # A claim at the tolerances tol is not called false up to this multiple of tol.
 MAX_GAP_RESIDUAL = 1e-8  # Relative residual that a gap of MIN_RELATIVE_GAP can cause: its square root.
 
 
@@ -48,8 +50,8 @@ class Limits:
         Difference of the objectives relative to the objective. A backend may stop if either gap is reached.
     max_iter : int
     time_limit : float or None, s
-    repeated : bool
-        Whether the judge rejected the answer of an earlier call.
+    attempt : int
+        Number of earlier calls with answers that the judge did not accept.
     """
 
     eps: float
@@ -57,7 +59,7 @@ class Limits:
     gap_relative: float
     max_iter: int
     time_limit: float | None
-    repeated: bool = False
+    attempt: int = 0
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,23 @@ class Answer:
     work: Mapping[str, int] = field(default_factory=dict)
     direction: FloatArray | None = None
     contradiction: FloatArray | None = None
+
+
+def classify_status(text: str) -> Status:
+    """Return the status that a backend's text for it means."""
+    text = text.lower().replace("_", " ")
+    if text in ("solved", "optimal"):
+        return Status.CONVERGED
+    for status, words in (
+        (Status.INTERRUPTED, ("interrupted",)),
+        (Status.TIME_LIMIT, ("time",)),
+        (Status.MAX_ITERATIONS, ("iter",)),
+        (Status.STALLED, ("almost", "inaccurate", "insufficient", "unknown")),
+        (Status.INFEASIBLE, ("infeas", "unbounded")),
+    ):
+        if any(word in text for word in words):
+            return status
+    return Status.NUMERICAL_ERROR
 
 
 def clamp_tolerance(tolerance: float, minimum: float) -> float:
@@ -143,9 +162,10 @@ def call_backend_until_accepted(
     """Run the backend until the judge accepts its iterate, and write the best iterate to `impulse`.
 
     The stopping tests of backends differ from the judge's. If a backend claims convergence and the judge's residual is
-    above `tol`, the backend is called again with 100 times smaller tolerances, up to three times in all. The answer
-    with the smallest residual and its claim are returned, unless a later call proves that no solution exists. If no
-    call returns an iterate, `impulse` keeps the start point.
+    above `tol`, the backend is called again with 100 times smaller tolerances, up to three times in all. If it fails,
+    it is called once with the tolerances `tol`, as a user would call it, because tolerances near rounding errors let
+    some backends fail. The answer with the smallest residual and its claim are returned, unless a later call proves
+    that no solution exists. If no call returns an iterate, `impulse` keeps the start point.
 
     An interior-point method leaves an error sqrt(x w) on a row with vanishing impulse x and slack w, so the tolerance
     of the gap decreases towards eps^2.
@@ -168,34 +188,29 @@ def call_backend_until_accepted(
         Whether the backend prints by compiled code.
     """
     problem, deadline = qp.problem, Deadline(time_limit)
-    start, best = impulse.copy(), None
+    start, has_loosened = impulse.copy(), False
+    best: tuple[float, Claim, FloatArray, float] | None = None
     work: dict[str, int] = {"backend_calls": 0}
     w, e = np.empty(problem.m), np.empty(problem.m)
     if tol > 0.0 and compute_stopping_residual(problem, impulse, w, e)[0] == 0.0:
         return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
-    limits = _make_limits(problem, tol, max_iter, time_limit)
-    while limits:
-        last = _call_backend_once(qp, impulse, call, limits.pop(0), settings, noisy)
+    levels = _make_levels(qp, tol)
+    for attempt in itertools.count():
+        remaining = max_iter - work.get("iterations", 0)
+        limit = Limits(*levels.pop(0), remaining, deadline.get_remaining_seconds(), attempt)
+        last = _call_backend_once(qp, impulse, call, limit, settings, noisy)
         work = sum_work_counts((work, last.work))
         relative, above = compute_stopping_residual(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy(), above)
-        remaining = max_iter - work.get("iterations", 0)
-        if (
-            last.status is not Status.CONVERGED
-            or above <= tol
-            or remaining <= 0
-            or deadline.has_passed()
-            # If a row that was assumed at its bound leaves it, the caller solves a program with all rows.
-            or np.any(e[qp.assumed] != 0.0)
-        ):
+        if last.status is not Status.CONVERGED:
+            has_loosened = attempt == 0 and tol > 0.0 and _has_failed(problem, last)
+            levels = [(tol, tol, tol)] if has_loosened else []
+        out_of_budget = work.get("iterations", 0) >= max_iter or deadline.has_passed()
+        # If a row that was assumed at its bound leaves it, the caller solves a program with all rows.
+        if above <= tol or not levels or out_of_budget or np.any(e[qp.assumed] != 0.0):
             break
-        limits = [
-            replace(limit, max_iter=remaining, time_limit=deadline.get_remaining_seconds(), repeated=True)
-            for limit in limits
-        ]
-        if limits:
-            impulse[:] = start
+        impulse[:] = start
     assert best is not None
     # Not in the program form: `check_infeasibility_claim` may run `auto`, which calls this backend again.
     if last is not best[1] and last.status is Status.INFEASIBLE and qp.form != "program":
@@ -204,11 +219,14 @@ def call_backend_until_accepted(
             return replace(infeasible, work=work, iterations=work.get("iterations", 0))
     relative, claim, impulse[:], above = best
     status, message = claim.status, claim.message
+    if status is Status.INFEASIBLE:
+        return replace(claim, work=work, iterations=work.get("iterations", 0))
     if last is not claim and last.status is not Status.CONVERGED and relative > tol:
-        # Return the best answer with its own claim: the failure of a stricter call does not affect it.
-        status = last.status if last.status in OUT_OF_BUDGET else Status.STALLED
-        message = f"{message}; with stricter tolerances: {last.message}"
-    if status is Status.NUMERICAL_ERROR and claim.dual is not None and relative <= tol:
+        # Return the best answer with its own claim: the failure of another call does not affect it.
+        failed = Status.STALLED if status is Status.CONVERGED else status
+        status = last.status if last.status in OUT_OF_BUDGET else failed
+        message = f"{message}; with other tolerances: {last.message}"
+    if status is Status.NUMERICAL_ERROR and claim.dual is not None and above <= tol:
         # The backend reports a failure, but its iterate is a solution.
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
@@ -216,20 +234,31 @@ def call_backend_until_accepted(
     elif status is Status.CONVERGED and relative > tol and not above <= tol:
         # The backend's tests use other norms than the judge, so its claim is not false if no stricter call was
         # possible.
-        if limits:
+        if levels:
             status = Status.TIME_LIMIT if deadline.has_passed() else Status.MAX_ITERATIONS
             message = f"{message}; no iterations or time remained for stricter tolerances"
-        elif relative <= MAX_GAP_RESIDUAL:
+        elif relative <= MAX_GAP_RESIDUAL or (has_loosened and relative <= MAX_LOOSE_RATIO * tol):
             status, message = Status.STALLED, f"{message}; its own tests passed at the strictest tolerances"
+        elif qp.shift_of_p:
+            status = Status.STALLED
+    if qp.shift_of_p:
+        message = f"{message}; {qp.shift_of_p:g} was added to the diagonal of the singular P"
     iterations = work.get("iterations", 0)
     if iterations > max_iter:
         message = f"{message}; {iterations} iterations, more than the limit of {max_iter}"
     return replace(claim, status=status, message=message, work=work, iterations=iterations)
 
 
-def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
-    """Return the limits of the first call and of the stricter ones."""
-    eps = max(0.5 * compute_backend_tolerance(problem, tol), MIN_TOLERANCE)
+def _has_failed(problem: Problem, claim: Claim) -> bool:
+    """Return whether a backend failed at its tolerances, or claims infeasibility without a valid certificate."""
+    if claim.status is Status.INFEASIBLE:
+        return claim.certificate is None or check_certificate(problem, claim.certificate) is not None
+    return claim.status in (Status.STALLED, Status.NUMERICAL_ERROR)
+
+
+def _make_levels(qp: QP, tol: float) -> list[tuple[float, float, float]]:
+    """Return the tolerances `eps`, `gap` and `gap_relative` of the first call and of the stricter ones."""
+    eps = max(0.5 * compute_backend_tolerance(qp, tol), MIN_TOLERANCE)
     # Unknowns are near 1, so objectives are between 1 and m, and rounding of their sums often exceeds a gap of 1e-13:
     # the first call does not require a smaller one.
     levels = [
@@ -237,7 +266,7 @@ def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float 
         (max(1e-2 * eps, MIN_TOLERANCE), max(1e-5 * eps, 1e-13), 1e-2 * MAX_RELATIVE_GAP),
         (max(1e-4 * eps, MIN_TOLERANCE), max(1e-2 * eps * eps, MIN_GAP), MIN_RELATIVE_GAP),
     ]
-    return [Limits(*level, max_iter, time_limit) for level in (levels[-1:] if tol == 0.0 else levels)]
+    return levels[-1:] if tol == 0.0 else levels
 
 
 def _call_backend_once(
@@ -264,12 +293,12 @@ def _call_backend_once(
     unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
     xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
     is_valid = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
-    if qp.form != "impulse":
-        is_valid = is_valid and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
+    if zeta is None or len(zeta) != len(qp.b):
+        zeta = np.full(len(qp.b), np.nan)  # In the impulse form, impulses do not depend on multipliers.
     dual, lam = None, impulse
     if is_valid:
         assert x is not None
-        lam = qp.recover_impulse(x, np.zeros(0) if zeta is None else zeta, xi)
+        lam = qp.recover_impulse(x, zeta, xi)
         is_valid = bool(np.isfinite(lam).all())
     if is_valid and status is not Status.INFEASIBLE:
         assert x is not None

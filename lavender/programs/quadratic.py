@@ -103,6 +103,8 @@ def solve_qp(
     is_auto = isinstance(solver, str) and solver == "auto"
     if is_auto and tol > 0.0 and not options and not qp.is_singular:
         answer = _solve_definite(problem, tol, end, start)
+    elif _needs_saddle_form(qp, solver, tol, options):
+        answer = _solve_by_backend(problem, tol, end, start, solver, options)
     else:
         answer = _solve_to_error(problem, solver, tol, end, start, options)
     if qp.is_singular:
@@ -168,10 +170,8 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
 
     The backend comes first if M is so ill-conditioned that a solve by its factor loses the digits that tol needs.
     """
-    operator = problem.qp.generalized.operator
-    is_lossy = operator.n * 2.0**-53 * operator.condition > MAX_LOSS * tol
     first, second = _solve_over_velocities, _solve_by_backend
-    if is_lossy:
+    if _loses_digits(problem.qp, tol):
         first, second = second, first
     answer = first(problem, tol, end, impulse)
     if answer.error <= tol or _is_proved_infeasible(answer) or answer.solution.status is Status.INTERRUPTED:
@@ -189,11 +189,32 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     return replace(answer, solution=solution)
 
 
+def _loses_digits(qp: QuadraticProgram, tol: float) -> bool:
+    """Return whether P is definite, and a solve by its factor loses the digits that `tol` needs."""
+    if qp.generalized is None:
+        return False
+    operator = qp.generalized.operator
+    return bool(operator.n * 2.0**-53 * operator.condition > MAX_LOSS * tol)
+
+
+def _needs_saddle_form(qp: QuadraticProgram, solver: str, tol: float, options: dict[str, Any]) -> bool:
+    """Return whether to solve the form (5) of a program with a definite P, because the inverse of P loses digits."""
+    is_default = options.get("form", "auto") in ("auto", "program")
+    return tol > 0.0 and is_default and _loses_digits(qp, tol) and get(solver).singular_programs
+
+
 def _solve_over_velocities(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
     return _solve_to_error(problem, "auto", tol, end, impulse, {})
 
 
-def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
+def _solve_by_backend(
+    problem: Problem,
+    tol: float,
+    end: float,
+    impulse: Any,
+    solver: str = "auto",
+    options: dict[str, Any] | None = None,
+) -> QPSolution:
     """Solve the program in the form (5) by a backend, which works on P instead of its inverse."""
     qp: QuadraticProgram = problem.qp.convert_to_saddle_form()
     program = Problem(**qp.problem_fields(), qp=qp, copy=False)
@@ -202,19 +223,20 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
         given = problem.impulse_array(impulse)
         start = np.concatenate([problem.qp.recover_variables(given), given])
         start = start if np.isfinite(start).all() else None
-    answer = _solve_to_error(program, "auto", tol, end, start, {})
+    answer = _solve_to_error(program, solver, tol, end, start, options or {})
     solution: Solution = answer.solution
     certificate = solution.certificate if _is_proved_infeasible(answer) else None
     claim = Claim(
         solution.status if certificate is not None else Status.STALLED,
         solution.iterations,
         solution.work,
-        describe_stages(solution.stages),
+        describe_stages(solution.stages) or solution.message,
         certificate=None if certificate is None else qp.select_row_multipliers(certificate),
+        form=solution.solver.form,
         stages=solution.stages,
     )
     impulse = qp.select_row_multipliers(answer.impulse).copy()
-    judged = finish(problem, get("auto"), {}, impulse, claim, tol, solution.setup_time, 0.0, None)
+    judged = finish(problem, get(solver), options or {}, impulse, claim, tol, solution.setup_time, 0.0, None)
     return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
 
 

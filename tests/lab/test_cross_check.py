@@ -204,8 +204,9 @@ def test_unknown_names():
 
 # -- the suite and the example ------------------------------------------------------------------------------
 
-# Backends whose claims have been seen to fail on these problems: the judge marks them, nobody believes them.
-KNOWN_LIARS = {"highs", "proxqp"}
+# Backends with false claims on programs that they receive as written: ProxQP 0.8 reports SOLVED with an objective that
+# is 7 % off.
+KNOWN_LIARS = {"proxqp"}
 # Sweeps within their default budgets, by what they are short for; everything else solves every case.
 SWEEPS = {"block_gauss_seidel", "gauss_seidel", "jacobi", "nncg", "pgs", "sequential_impulses", "sor"}
 UNSOLVED = {

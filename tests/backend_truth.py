@@ -1,0 +1,206 @@
+"""Random quadratic programs and LCPs, their KKT errors in 50 digits, and calls of backends without this package.
+
+    python tests/backend_truth.py --programs 400 --lcps 200 --seconds 600
+
+compares each backend's answer by this package with the answer of the backend called alone through qpsolvers.
+"""
+
+import argparse
+import time
+import warnings
+
+import mpmath
+import numpy as np
+
+import lavender as lv
+
+DIGITS = 50
+TOL = 1e-6
+MAX_RATIO = 10.0  # An answer may be this many times as far from the KKT conditions as the backend's own.
+# Settings of a backend called alone: the ones that its adapter passes, at the same tolerance.
+INTERIOR = {"feastol": TOL, "abstol": TOL, "reltol": TOL}
+PROXIMAL = {"eps_abs": TOL, "eps_rel": 0.0}
+GAPS = {f"eps_duality_gap_{kind}": TOL for kind in ("abs", "rel")}
+ALONE = {
+    "osqp": {"eps_abs": TOL, "eps_rel": 0.0, "max_iter": 100_000, "polishing": True},
+    "clarabel": {"tol_feas": TOL, "tol_gap_abs": TOL, "tol_gap_rel": TOL},
+    "piqp": PROXIMAL | GAPS,
+    "proxqp": PROXIMAL | GAPS | {"check_duality_gap": True},
+    "qpalm": PROXIMAL,
+    "daqp": {"primal_tol": TOL, "dual_tol": TOL},
+    "highs": {f"{kind}_feasibility_tolerance": TOL for kind in ("primal", "dual")},
+    "scs": PROXIMAL | {"max_iters": 100_000},
+    "cvxopt": INTERIOR,
+    "kvxopt": INTERIOR,
+    "ecos": INTERIOR,
+}
+
+
+def draw_program(seed):
+    """Draw a feasible convex program with 2 to 20 variables and up to 3 rows per variable, as arguments of `from_qp`.
+
+    P is definite for even seeds, else singular. One program in three has repeated rows.
+    """
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 21))
+    rank = n if seed % 2 == 0 else int(rng.integers(0, n))
+    root = rng.normal(size=(rank, n))
+    P = root.T @ root + (0.1 * np.eye(n) if rank == n else 0.0)
+    x, q = rng.normal(size=n), rng.normal(size=n)
+    n_g, n_a = int(rng.integers(0, 3 * n + 1)), int(rng.integers(0, max(1, n // 2)))
+    G, A = rng.normal(size=(n_g, n)), rng.normal(size=(n_a, n))
+    if seed % 3 == 0:
+        G = np.vstack([G, *(G[:1] * [[1.0], [2.0]] if n_g else [])])
+        A = np.vstack([A, A[:1]])
+    h = G @ x + np.where(rng.random(len(G)) < 0.3, 0.0, rng.random(len(G)))
+    program = {"P": (P + P.T) / 2.0, "q": q}
+    program |= {"G": G, "h": h} if len(G) else {}
+    program |= {"A": A, "b": A @ x} if len(A) else {}
+    if rank < n or rng.random() < 0.5:
+        program |= {"lb": x - 2.0 * rng.random(n), "ub": x + 2.0 * rng.random(n)}
+        if rank == n:
+            program["lb"][rng.random(n) < 0.5] = -np.inf
+            program["ub"][rng.random(n) < 0.5] = np.inf
+    return program
+
+
+def draw_lcp(seed):
+    """Draw a solvable LCP with a symmetric semidefinite A, as the program min 1/2 x.A x - b.x with x >= 0."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 21))
+    root = rng.normal(size=(n, int(rng.integers(1, n + 1))))
+    A = root @ root.T
+    A = (A + A.T) / 2.0
+    x, active = rng.random(n), rng.random(n) < 0.5
+    return {"P": A, "q": -(A @ (x * active) - rng.random(n) * ~active), "lb": np.zeros(n)}
+
+
+def compute_kkt_error(program, x, y=None, z=None, z_box=None):
+    """Compute the largest violation of the KKT conditions in 50 digits; infinite without an answer.
+
+    Rows are relative to their largest term, stationarity to its largest term, and complementarity to the largest
+    product of a term and a multiplier, all to at least 1. Numbers of the drawn programs are near 1.
+    """
+    n = len(program["q"])
+    parts = [np.zeros(0) if v is None else np.asarray(v, float).ravel() for v in (x, y, z, z_box)]
+    if len(parts[0]) != n or not all(np.isfinite(v).all() for v in parts):
+        return np.inf
+    with mpmath.workdps(DIGITS):
+        x, y, z, box = ([mpmath.mpf(float(v)) for v in part] for part in parts)
+        box = box or [mpmath.mpf(0)] * n
+
+        def rows(matrix, v):
+            return [mpmath.fdot(map(float, row), v) for row in matrix]
+
+        def largest(*vectors):
+            return max([mpmath.mpf(1), *(abs(v) for vector in vectors for v in vector if mpmath.isfinite(v))])
+
+        A, G = (program.get(name, np.zeros((0, n))) for name in "AG")
+        if len(y) < len(A) or len(z) < len(G):
+            return np.inf
+        y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero if there are no rows.
+        b, h, low, high = (
+            [mpmath.mpf(float(v)) for v in program.get(name, missing)]
+            for name, missing in (
+                ("b", ()),
+                ("h", ()),
+                ("lb", np.full(n, -np.inf)),
+                ("ub", np.full(n, np.inf)),
+            )
+        )
+        terms = rows(program["P"], x), map(float, program["q"]), rows(A.T, y), rows(G.T, z), box
+        terms = [list(map(mpmath.mpf, term)) for term in terms]
+        force = largest(*terms)
+        errors = [abs(mpmath.fsum(line)) / force for line in zip(*terms, strict=True)]
+        ax, gx = rows(A, x), rows(G, x)
+        size = largest(ax, b, gx, h, x)
+        errors += [abs(r - c) / size for r, c in zip(ax, b, strict=True)]
+        sides = [(r - c, w) for r, c, w in zip(gx, h, z, strict=True)]
+        sides += [(c - v, max(-w, 0)) for c, v, w in zip(low, x, box, strict=True)]
+        sides += [(v - c, max(w, 0)) for c, v, w in zip(high, x, box, strict=True)]
+        for gap, w in sides:
+            errors += [max(gap, 0) / size, max(-w, 0) / force]
+            errors.append(abs(gap * w) / (size * force) if mpmath.isfinite(gap) else abs(w) / force)
+        return float(max(errors))
+
+
+def call_alone(program, name, tol=TOL):
+    """Return the KKT error of the backend called through qpsolvers; infinite if it returns no answer."""
+    import qpsolvers
+
+    settings = {k: tol if v == TOL else v for k, v in ALONE.get(name, {}).items()}
+    arrays = {k: program.get(k) for k in ("P", "q", "G", "h", "A", "b", "lb", "ub")}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = qpsolvers.solve_problem(qpsolvers.Problem(**arrays), name, **settings)
+    except Exception:  # Backends raise their own exceptions for programs that they do not accept.
+        return np.inf
+    if not found.found:
+        return np.inf
+    return compute_kkt_error(program, found.x, found.y, found.z, found.z_box)
+
+
+def call_here(program, name, is_lcp, tol=TOL):
+    """Return the answer's KKT error and the `Solution`, of the backend called by this package."""
+    if is_lcp:
+        A, b = program["P"], -program["q"]
+        solution = lv.solve(lv.Problem.lcp(A, b), name, tol=tol)
+        x = solution.impulse
+        return compute_kkt_error(program, x, z_box=-np.maximum(A @ x - b, 0.0)), solution
+    answer = lv.solve_qp(lv.Problem.from_qp(**program), name, tol=tol)
+    return compute_kkt_error(program, answer.x, answer.y, answer.z, answer.z_box), answer.solution
+
+
+def compare_backends(draws, names, seconds=np.inf, tol=TOL):
+    """Yield (draw, name, error here, error alone, solution) until `seconds` have passed."""
+    end = time.monotonic() + seconds
+    for kind, seed in draws:
+        program = draw_program(seed) if kind == "program" else draw_lcp(seed)
+        for name in names:
+            if time.monotonic() > end:
+                return
+            alone = call_alone(program, name, tol)
+            try:
+                here, solution = call_here(program, name, kind == "lcp", tol)
+            except lv.CapabilityError:
+                continue
+            yield (kind, seed), name, here, alone, solution
+
+
+def main():
+    """Print each answer that is farther from the KKT conditions than allowed, and the counts of each backend."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--programs", type=int, default=400)
+    parser.add_argument("--lcps", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--backends", default="")
+    parser.add_argument("--tol", type=float, default=TOL)
+    args = parser.parse_args()
+    import qpsolvers
+
+    names = args.backends.split(",") if args.backends else qpsolvers.available_solvers
+    n = max(args.programs, args.lcps)
+    draws = [(k, s) for s in range(n) for k, m in (("program", args.programs), ("lcp", args.lcps)) if s < m]
+    columns = "runs", "worse", "alone fails", "not solved", "contradicted", "right but contradicted"
+    counts = {name: dict.fromkeys(columns, 0) for name in names}
+    last = None
+    for draw, name, here, alone, solution in compare_backends(draws, names, args.seconds, args.tol):
+        count, last = counts[name], draw
+        count["runs"] += 1
+        count["alone fails"] += not alone <= 1e3 * args.tol
+        count["not solved"] += not here <= args.tol
+        count["contradicted"] += solution.is_contradicted
+        count["right but contradicted"] += solution.is_contradicted and here <= args.tol
+        if here > max(MAX_RATIO * alone, args.tol):
+            count["worse"] += 1
+            print(
+                f"{draw} {name}: {here:.1e} here, {alone:.1e} alone, {solution.status.name}: {solution.message}"
+            )
+    print(f"last draw {last}")
+    for name, count in counts.items():
+        print(name, ", ".join(f"{k} {v}" for k, v in count.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Answers of backends by this package against the KKT conditions and against the backend called alone."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from backend_truth import MAX_RATIO, TOL, call_alone, call_here, draw_lcp, draw_program
+from calls import BACKENDS, installed
+from random_problems import spd
+from worked import python
+
+import lavender as lv
+from lavender.external import backends
+from lavender.external.as_qp import build_program, choose_program_form
+from lavender.external.running import Limits
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("draw", [draw_program, draw_lcp])
+def test_backend_answer_is_at_most_ten_times_worse_than_the_backend_alone(name, draw):
+    for seed in range(8):
+        program, is_lcp = draw(seed), draw is draw_lcp
+        try:
+            here, solution = call_here(program, name, is_lcp)
+        except lv.CapabilityError:
+            continue
+        assert here <= max(MAX_RATIO * call_alone(program, name), TOL), f"{seed}: {solution}"
+        assert not (solution.is_contradicted and here <= TOL), f"{seed}: {solution}"
+
+
+@pytest.mark.parametrize("name", installed("osqp", "qpalm", "scs", "daqp", "proxqp"))
+@pytest.mark.parametrize("kind", ["lcp", "program"])
+def test_backend_started_from_an_interior_point_answer_needs_fewer_iterations(name, kind):
+    """Impulses of an interior-point answer are near their bounds, but not at them."""
+    program = draw_lcp(0) if kind == "lcp" else draw_program(0)
+    problem = lv.Problem.lcp(program["P"], -program["q"]) if kind == "lcp" else lv.Problem.from_qp(**program)
+    start = lv.solve(problem, "clarabel", tol=1e-5).impulse
+    assert not (start == 0.0).any()
+    cold, warm = lv.solve(problem, name), lv.solve(problem, name, impulse=start)
+    assert warm.success and warm.work.get("iterations", 0) <= cold.work["iterations"] / 2
+
+
+# -- the program form ----------------------------------------------------------------------------------
+
+
+def test_program_form_near_unit_scale_has_the_users_own_numbers():
+    program = draw_program(4)
+    qp = build_program(lv.Problem.from_qp(**program), "program")
+    assert qp.sigma == 1.0 and qp.n_nonneg == len(program["G"])
+    assert np.array_equal(qp.P.toarray(), program["P"]) and np.array_equal(qp.q, program["q"])
+    assert np.array_equal(qp.A.toarray()[qp.n_zero :], program["G"])
+    assert np.array_equal(qp.b[qp.n_zero :], program["h"])
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_program_form_returns_the_solution_at_any_scale(scale):
+    program = draw_program(10)
+    problem = lv.Problem.from_qp(
+        **{k: v * scale if k in ("P", "q", "A", "b") else v for k, v in program.items()}
+    )
+    solution = lv.solve(problem, "clarabel")
+    qp = build_program(problem, "program")
+    x, zeta, xi = qp.make_start(solution.impulse)
+    np.testing.assert_allclose(qp.recover_impulse(x, zeta, xi), solution.impulse, atol=1e-12 * scale)
+    z = qp.recover_bound_multiplier(x, xi)
+    size = np.abs(problem.b).max()
+    np.testing.assert_allclose(z, -problem.slack(solution.impulse), atol=1e-9 * size)  # of the factor of P
+
+
+def test_form_by_name_or_by_the_problem_is_used():
+    program = draw_program(0)
+    definite, singular = lv.Problem.from_qp(**program), lv.Problem.from_qp(**draw_program(1))
+    assert choose_program_form(definite, "auto") == choose_program_form(singular, "auto") == "program"
+    for form in ("impulse", "velocity", "program"):
+        solution = lv.solve(definite, "clarabel", form=form)
+        assert solution.success and solution.solver.form == form
+    for form in ("impulse", "velocity"):
+        with pytest.raises(lv.CapabilityError, match="P of this program is singular"):
+            lv.solve(singular, "clarabel", form=form)
+    with pytest.raises(lv.CapabilityError, match="needs a quadratic program"):
+        lv.solve(lv.Problem.lcp(*spd(3)), "clarabel", form="program")
+    jac = np.eye(2, 3)
+    regular, repeated = (
+        lv.Problem.from_jacobian(
+            rows, np.eye(3), np.ones(3), cones=lv.Cones.bounded(np.zeros(len(rows)), np.inf)
+        )
+        for rows in (jac, np.vstack([jac, jac[:1]]))
+    )
+    assert choose_program_form(regular, "auto") == "impulse"
+    assert choose_program_form(repeated, "auto") == "velocity"
+
+
+@pytest.mark.parametrize("name", installed("clarabel", "highs", "quadprog", "osqp"))
+def test_program_with_a_row_of_1e5_is_solved(name):
+    answer = lv.solve_qp(
+        lv.Problem.from_qp(np.eye(2), [-1.0, -1.0], G=[[1e5, 2e5], [1.0, -1.0]], h=[1e5, 3.0]), name, tol=1e-6
+    )
+    np.testing.assert_allclose(answer.x, [0.6, 0.2], rtol=1e-5)
+    assert answer.found, str(answer)
+
+
+@pytest.mark.parametrize("name", installed("osqp", "daqp", "clarabel", "highs"))
+def test_solve_qp_of_an_ill_conditioned_program_is_solved_by_named_backends(name):
+    program = draw_program(47)  # P has rank 17 of 18, and rounding makes it definite with a condition of 1e13
+    assert not lv.Problem.from_qp(**program).has_singular_program
+    here, solution = call_here(program, name, False)
+    assert here <= TOL and solution.success
+
+
+def test_matrix_p_of_all_forms_is_symmetric_in_every_bit():
+    problem = lv.Problem.lcp(*spd(9, seed=1))
+    for qp in (
+        build_program(problem, "impulse"),
+        build_program(lv.Problem.from_qp(**draw_program(6)), "program"),
+    ):
+        assert (qp.P != qp.P.T).nnz == 0
+
+
+# -- single backends -----------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")
+@pytest.mark.parametrize("threads", [0, 2])
+def test_highs_solves_after_and_before_other_uses_of_highs_in_the_process(threads):
+    script = f"""if True:
+        import highspy, lavender as lv
+
+        def use():
+            user = highspy.Highs()
+            user.setOptionValue("output_flag", False)
+            user.setOptionValue("threads", {threads})
+            user.addVar(0.0, 1.0)
+            user.changeColCost(0, -1.0)
+            return user.run() == highspy.HighsStatus.kOk
+
+        problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0])
+        print([lv.solve(problem, "highs").success, use(), lv.solve(problem, "highs").success])
+        """
+    first = "use()\n        problem" if threads else "problem"
+    said = python("-c", script.replace("problem =", f"{first} =", 1) if threads else script)
+    assert said.stdout.splitlines()[-1] == "[True, True, True]"
+
+
+@pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")
+def test_highs_does_not_round_small_numbers_to_zero():
+    for b in ([1.0, 5e-5], [1.0, 1e-8]):
+        assert lv.solve(lv.Problem.linear(np.eye(2), b), "highs", tol=1e-9).success
+        assert lv.solve(lv.Problem.lcp(np.eye(2), b), "highs", tol=1e-9).success
+
+
+@pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")
+def test_highs_repeats_a_call_with_another_regularisation(monkeypatch):
+    from lavender.external import native
+
+    monkeypatch.setattr(native, "HIGHS_REGULARIZATION", (1e-2, 1e-12, 1e-8))
+    solution = lv.solve(lv.Problem.lcp(*spd(6)), "highs")
+    assert solution.success and solution.work["backend_calls"] == 2
+
+
+def stub_qpsolvers(monkeypatch):
+    """Replace qpsolvers by a module that records the settings and returns x = 0."""
+    received = {}
+
+    def solve_problem(problem, solver, initvals, **settings):
+        received.update(settings)
+        zero = np.zeros(2)
+        return types.SimpleNamespace(x=zero, y=None, z=zero, z_box=zero, found=True, extras={})
+
+    module = types.SimpleNamespace(Problem=lambda *arrays: arrays, solve_problem=solve_problem)
+    monkeypatch.setitem(sys.modules, "qpsolvers", module)
+    return received
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("jaxopt_osqp", {"tol": 1e-7, "maxiter": 50}),
+        ("sip", {"eps_abs": 1e-7, "eps_rel": 0.0, "max_iterations": 50}),
+        ("qpax", {"solver_tol": 1e-7}),
+    ],
+)
+def test_tolerance_reaches_the_backend_and_32_bits_of_jax_are_reported(name, settings, monkeypatch):
+    received = stub_qpsolvers(monkeypatch)
+    backend = next(b for b in backends.BACKENDS if b.name == name)
+    qp = build_program(lv.Problem.lcp(np.eye(2), np.ones(2)), "impulse")
+    for is_64_bit in (False, True):
+        config = types.SimpleNamespace(jax_enable_x64=is_64_bit)
+        monkeypatch.setitem(sys.modules, "jax", types.SimpleNamespace(config=config))
+        answer = backend.run(qp, np.zeros(2), Limits(1e-7, 1e-9, 1e-9, 50, None), {})
+        assert received == settings
+        assert ("jax_enable_x64" in answer.message) is (name != "sip" and not is_64_bit)
