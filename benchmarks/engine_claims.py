@@ -30,9 +30,8 @@ from lavender.lab.engine_scenes import NewtonScene, start_scene
 from lavender.lab.report.text import format_size
 
 HALF_EDGE, FRICTION, PILE_SEED = 0.1, 0.7, 1
-WEIGHT_RATIO = (
-    2.0  # Both errors differ by at most this factor: the judge weights the rows of a contact's block.
-)
+# Both errors differ by at most this factor: the judge weights the rows of a contact's block.
+WEIGHT_RATIO = 2.0
 
 
 def build_boxes(masses: list[float], restitution: float = 0.0, pile: bool = False) -> Any:

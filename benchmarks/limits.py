@@ -27,11 +27,12 @@ from lavender.solvers.registry import get
 CASES = ("stack(n=64)", "chain(n=33)", "pyramidF(k=6)", "stack(n=5000)", "granular(n=12)", "granularF(n=12)",
          "dense 300 x 100", "dense 3000 x 300", "matrix 300", "matrix 2400")  # fmt: skip
 LIMITS = (1e-3, 1e-2)  # s
+# the first one that accepts the problem's form is used
 SWEEPS = (
     "sequential_impulses",
     "block_gauss_seidel",
     "pgs",
-)  # the first one that accepts the problem's form is used
+)
 
 
 def problem_of(name: str) -> Callable[[], Problem]:

@@ -19,10 +19,11 @@ from random_problems import (
 
 import lavender as lv
 
+# The largest number that a problem may have; the smallest mass or coefficient.
 LARGEST, SMALLEST = (
     1e60,
     1e-60,
-)  # The largest number that a problem may have; the smallest mass or coefficient.
+)
 SPECIAL = (
     0.0,
     5e-324,

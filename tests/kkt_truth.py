@@ -65,9 +65,8 @@ class Exact:
     """Fractions in object arrays."""
 
     equal, close = Fraction(1, 2**200), Fraction(1, 2**200)
-    steps = (
-        5  # of Newton, from 1e-16: one where equations are linear, four double the figures up to EXACT_BITS
-    )
+    # of Newton, from 1e-16: one where equations are linear, four double the figures up to EXACT_BITS
+    steps = 5
 
     @staticmethod
     def number(x):

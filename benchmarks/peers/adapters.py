@@ -194,10 +194,11 @@ def _pinocchio(lanczos: int | None) -> Contestant:
 
         m, c = problem.m, problem.n_blocks
         order = (np.arange(c)[:, None] * 3 + np.array([1, 2, 0])).ravel()
+        # 1/kg, m/s
         unit, speed = (
             float(np.mean(problem.d)),
             max(get_zero_impulse_reference(problem)[1], 1e-300),
-        )  # 1/kg, m/s
+        )
         a = sp.csc_matrix(problem.csr[order][:, order] / unit)
         g = -problem.b[order] / speed
         model = pin.Model()

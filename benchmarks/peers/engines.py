@@ -48,9 +48,8 @@ class Step:
     scene: str
     engine: str
     accurate: bool  # True: iterates to its own tolerance, False: a fixed number of sweeps
-    time: float = (
-        NAN  # s, CPU time of one step in the fastest batch; nan: left out, with the reason in `note`
-    )
+    # s, CPU time of one step in the fastest batch; nan: left out, with the reason in `note`
+    time: float = NAN
     contacts: int = 0
     depth: float = NAN  # m, deepest penetration, or largest joint error of a chain; nan: not known
     speed: float = NAN  # m/s, largest speed of a body

@@ -18,6 +18,7 @@ from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
+# Names of states by the case numbers of the kernels.
 NAMES = (
     "open",
     "closed",
@@ -26,7 +27,7 @@ NAMES = (
     "free",
     "at a bound",
     "at a bound",
-)  # Names of states by the case numbers of the kernels.
+)
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 

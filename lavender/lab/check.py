@@ -33,10 +33,11 @@ from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_budget, check_time_limit
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
+# Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
 CONE_REFERENCES = (
     "clarabel_cone",
     "block_gauss_seidel",
-)  # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
+)
 # A reference must reach this relative residual, or 10 times the round-off floor.
 REFERENCE_MAX_RESIDUAL = 1e-9
 

@@ -532,9 +532,8 @@ class WarpWorlds:
         """Use the options of `model`, which otherwise equals the model of these worlds."""
         self.device_model = self.mjw.put_model(model)
         if hasattr(self.device_model.opt, "warn_overflow"):
-            self.device_model.opt.warn_overflow = (
-                0  # Do not print a line for each solve that uses up its iterations.
-            )
+            # Do not print a line for each solve that uses up its iterations.
+            self.device_model.opt.warn_overflow = 0
 
     def start(self, start_arrays: dict[str, Any]) -> None:
         """Set the state of all worlds to `start_arrays`, arrays (worlds, ...) by the names of MjData."""

@@ -44,11 +44,12 @@ MAX_KEYED_BODIES = 2**22 - 1  # More bodies do not fit into the 22 bits of a key
 MAX_FEATURE = 2**16 - 1  # Larger features do not fit into the 16 bits of a key.
 # [-] A normal is rejected if its length differs from 1 by more; float32 causes 1e-7.
 NORMAL_LENGTH_TOLERANCE = 1e-5
+# Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
 PLANAR_VELOCITIES = (
     0,
     1,
     5,
-)  # Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
+)
 
 
 Arguments = ParamSpec("Arguments")

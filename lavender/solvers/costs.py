@@ -69,9 +69,8 @@ SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factoris
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
 ANALYSIS_BANDWIDTH = 1500.0
 PRODUCTS_PER_BODY_ROW = 32  # Number of multiply-adds of one pass of the judge per row between two bodies.
-PANELS_GROWTH_ROWS = (
-    8000.0  # A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
-)
+# A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
+PANELS_GROWTH_ROWS = 8000.0
 # [ns, ns per entry of a full A] If a time limit exceeds LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY m^2, it is about a hundred
 # times the cost of set-up and judge. No costs are then estimated before the solve, because an estimate takes longer
 # than a small problem.

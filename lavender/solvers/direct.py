@@ -49,9 +49,8 @@ from lavender_ext.judge import measure
 from lavender_ext.pivot.direct import CYCLING, PASS_ENDED, PASSES_USED
 from lavender_ext.pivot.principal import INDEFINITE, SMALL_PIVOT, SOLVED, STUCK
 
-REFINEMENT_RESIDUAL = (
-    1e-13  # Refinement ends at this relative residual, or at the round-off floor if that is larger.
-)
+# Refinement ends at this relative residual, or at the round-off floor if that is larger.
+REFINEMENT_RESIDUAL = 1e-13
 ROUNDS_PER_CHECK = 32  # Number of rounds of exchanges between two checks of the clock and the residual.
 
 

@@ -41,10 +41,8 @@ MAX_PANELS_FRACTION = 0.25  # Supernodal LU is considered for a linear system up
 MAX_DENSE_ROWS = 6000
 # Whether to use vectors of four numbers if the processor has them. The results have the same bits.
 USE_WIDE_LANES = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")
-MAX_DENSE_RANK_ROWS = (
-    # Up to this many rows, the rank of a singular asymmetric matrix is computed with a dense decomposition.
-    2000
-)
+# Up to this many rows, the rank of a singular asymmetric matrix is computed with a dense decomposition.
+MAX_DENSE_RANK_ROWS = 2000
 
 
 def choose_factorisation(problem: Problem) -> tuple[str, int, IntArray | None]:

@@ -41,9 +41,8 @@ class TimedFactor:
 
     def __init__(self, inner: Factor, seconds: float) -> None:
         self.inner = inner
-        self.seconds = (
-            seconds  # Time [s] of the next factor: an estimate at first, then the time of the last factor.
-        )
+        # Time [s] of the next factor: an estimate at first, then the time of the last factor.
+        self.seconds = seconds
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:

@@ -54,13 +54,13 @@ class SolveLog:
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
         self.remark = ""  # Message of the solve of some islands.
-        self.timed_out = (
-            False  # The solve ended before the deadline, because the remaining time was too short.
-        )
+        # The solve ended before the deadline, because the remaining time was too short.
+        self.timed_out = False
+        # Smallest relative residual, and the impulse (m,) [N s] with this residual.
         self.best, self.impulse = (
             np.inf,
             problem._start,
-        )  # Smallest relative residual, and the impulse (m,) [N s] with this residual.
+        )
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
         # Start (m,) [N s] of sweeps, if it is not `impulse`: a given start that is worse than the zero impulse, or the

@@ -18,9 +18,8 @@ from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
 
-MAX_VELOCITY_TOLERANCE = (
-    1.0  # [-] Relative residual of the zero impulse: it is accepted if its own error is small enough.
-)
+# [-] Relative residual of the zero impulse: it is accepted if its own error is small enough.
+MAX_VELOCITY_TOLERANCE = 1.0
 UNFINISHED = (Status.MAX_ITERATIONS, Status.STALLED, Status.TIME_LIMIT)
 
 

@@ -154,11 +154,12 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
 
 
 MAGIC = b"LAVVEC3\0"
+# Counters of `work` that the library counts as iterations.
 ITERATION_COUNTS = (
     "sweeps",
     "factorisations",
     "solves",
-)  # Counters of `work` that the library counts as iterations.
+)
 
 
 @dataclass(frozen=True)

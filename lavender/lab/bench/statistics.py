@@ -19,6 +19,7 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, MATRIX_PASS_COUNTER
 from lavender.lab.bench.record import Record, describe_target
 from lavender.lab.bench.store import Records
 
+# Order in which tables list structures.
 STRUCTURE_ORDER = (
     "separate",
     "chain",
@@ -26,7 +27,7 @@ STRUCTURE_ORDER = (
     "stack",
     "pile",
     "dense",
-)  # Order in which tables list structures.
+)
 DEATH_STATUSES = ("ERROR", "KILLED", "CRASHED")
 EASY_RESIDUAL = 1e-3  # Relative residual to which sweeps are counted as a measure of difficulty.
 # Times within this factor count as equal: a busy machine changes the minimum of repeats by this much.

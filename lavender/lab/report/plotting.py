@@ -31,11 +31,12 @@ from lavender.lab.report.text import TIME_UNITS
 from lavender.solvers import registry
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
+# Plug-ins; no solver of lavender has one of these colours.
 PLUG_IN_COLORS = (
     "#000000",
     "#6A0DAD",
     "#8B0000",
-)  # Plug-ins; no solver of lavender has one of these colours.
+)
 DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
 LEGEND_COLUMNS = 3  # Number of columns of a legend above the axes.

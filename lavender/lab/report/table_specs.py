@@ -40,10 +40,11 @@ DIFFICULTY = (
     "sweeps of pgs to a thousandth of the error of the zero impulse; condition of A scaled to a unit diagonal; "
     "solvers with bit-identical results and no iteration, whose times are times of one shortcut"
 )
+# Marks of times: of recommended calls, which were repeated alternately, and of single runs.
 INTERLEAVED, ALONE = (
     "interleaved",
     "alone",
-)  # Marks of times: of recommended calls, which were repeated alternately, and of single runs.
+)
 ENGINES_OWN = "engine's own"  # Head of the column for the solver of the engine that recorded the cases.
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 

@@ -26,6 +26,7 @@ PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
 ANIMATION_DPI = 160  # Dots per inch of an animation: 480 pixels at the default width.
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+# Corners of the faces -x, +x, -y, +y, -z, +z.
 FACES = (
     (0, 1, 3, 2),
     (4, 6, 7, 5),
@@ -33,7 +34,7 @@ FACES = (
     (2, 3, 7, 6),
     (0, 2, 6, 4),
     (1, 5, 7, 3),
-)  # Corners of the faces -x, +x, -y, +y, -z, +z.
+)
 LIGHT = np.array([-0.45, -0.62, 0.64])
 COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a7fb0")
 

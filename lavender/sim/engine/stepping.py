@@ -127,9 +127,8 @@ class Stepping:
         self._recorded: Path | None = None  # Folder to which `record` wrote last.
         # True if the state comes from a snapshot, so that its list of pairs is not valid.
         self._restored = False
-        self._state_before_step: State | None = (
-            None  # Copy of the state, if a step can be stopped between substeps.
-        )
+        # Copy of the state, if a step can be stopped between substeps.
+        self._state_before_step: State | None = None
         self._last: Solution | _PendingClaim | None = None
 
     # -- running --------------------------------------------------------------------------------

@@ -40,10 +40,11 @@ from lavender.sim.scene.parts import (
 )
 from lavender.solvers.registry import SolverSpec, get
 
+# "alternating" reverses the order of contacts in every substep.
 SCENE_ORDERS = (
     *ENGINE_ORDERS,
     "alternating",
-)  # "alternating" reverses the order of contacts in every substep.
+)
 ON_FAILURE = ("use", "keep", "damp", "raise")
 #: Ranges of the numeric parameters.
 PARAMETER_RANGES: dict[str, dict[str, float]] = {

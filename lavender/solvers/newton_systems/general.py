@@ -30,10 +30,8 @@ SPARSE_FLOP_TIME = 1e-9 * RATES["sparse velocities"]  # Time [s] per multiply-ad
 # If the judge does not confirm the kernel's result, the kernel runs again with a smaller tolerance, down to this
 # fraction of tol.
 MIN_TOLERANCE_RATIO = 1e-2
-MAX_MATRIX_ENTRIES = (
-    # Largest number of values of an island's N. 3,000 velocities with a dense N take 144 MB with the factor.
-    9e6
-)
+# Largest number of values of an island's N. 3,000 velocities with a dense N take 144 MB with the factor.
+MAX_MATRIX_ENTRIES = 9e6
 _STATUS = {
     OUTCOMES["reached"]: Status.CONVERGED,
     OUTCOMES["more"]: Status.MAX_ITERATIONS,
