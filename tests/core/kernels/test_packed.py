@@ -97,28 +97,6 @@ def test_a_new_problem_takes_over_the_room():
     assert lam.tobytes() == sweep_in_parts(problem, [20], start=start, packs=False)[0].tobytes()
 
 
-def test_contacts_of_one_body_are_not_packed():
-    problem = tangled(1, 40, 0, bodies=3)
-    ground = np.stack([np.full(40, -1), np.zeros(40)], axis=1).astype(np.int32)
-    alone = lv.Problem.from_rows(replace(problem.rows, contact_body=ground), mu=0.5)
-    assert sweep_packed(alone, [20]) == (0, 0)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("sequential_impulses", {"order": "symmetric"}),
-        ("sequential_impulses", {"order": "random"}),
-        ("nncg", {"order": "random"}),
-        ("nncg", {"sweep": "blocks"}),
-    ],
-)
-def test_orders_that_change_and_exact_blocks_are_not_packed(name, options):
-    prepared = prepare_sweeps(lattice_pile(300), name, **options)
-    prepared.solve(tol=0.0, max_iter=40)
-    assert prepared.state.sweeps.records[0] == 0
-
-
 @pytest.mark.parametrize("name", ["sequential_impulses", "nncg"])
 def test_hostile_numbers_do_no_harm(name):
     prepared = prepare_sweeps(lattice_pile(300), name)

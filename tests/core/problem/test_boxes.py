@@ -36,10 +36,6 @@ def test_one_shape_becomes_the_other_and_back():
     two = lv.Cones.contacts([(0.1, 0.2), (0.3, 0.3)], shape="box")
     assert two.shaped("disk").kind.tolist() == [lv.CONTACT_ELLIPSE, lv.CONTACT]
     assert two.shaped("disk").shaped("box") == two
-    with pytest.raises(lv.InputError, match="two numbers above 0"):
-        lv.Cones.contacts([(0.0, 0.2)], shape="box").shaped("disk")
-    with pytest.raises(lv.InputError, match="a box cannot bound spin"):
-        lv.Cones.contacts(0.5, patch_radius=0.1).shaped("box")
 
 
 # -- findex ------------------------------------------------------------------------------------------------------------
@@ -81,41 +77,9 @@ def test_findex_comes_back_in_any_order(seed):
         assert again == problem
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "findex", "words"),
-    [
-        ([0, -1, -1], [np.inf, 1, 1], [-1, 1, 0], "its own row"),
-        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 1], "its own findex is 0"),
-        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 3], "a row below 3"),
-        ([0, -1, -1], [np.inf, np.inf, 1], [-1, 0, 0], "upper is mu"),
-        ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "upper is mu"),
-        ([0, 1, -1], [np.inf, -1, 1], [-1, 0, 0], "upper is mu"),
-        ([0, 2, -1], [np.inf, 1, 1], [-1, -1, 0], "lower <= upper"),
-        ([0, -1, -1], [5, 1, 1], [-1, 0, 0], r"a normal needs \[0, inf\]"),
-        ([-1, -1, -1], [np.inf, 1, 1], [-1, 0, 0], r"a normal needs \[0, inf\]"),
-        ([0, -1], [np.inf, 1], [-1, 0, 0], "shape"),
-    ],
-)
-def test_a_findex_that_is_none_is_told(lower, upper, findex, words):
-    with pytest.raises(lv.InputError, match=words):
-        lv.Problem.from_findex(np.eye(3), np.ones(3), lower, upper, findex)
-
-
 def test_fixed_normals_make_constant_bounds():
     boxed = free(1, contacts=1, mu=[(0.25, 0.5)]).boxed(2.0)
     assert boxed.cones.upper.tolist() == [np.inf, 0.5, 1.0]
-
-
-def test_what_findex_cannot_hold_is_told():
-    with pytest.raises(lv.InputError, match="3 rows have findex 0"):
-        lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [np.inf, 1, 1, 1], [-1, 0, 0, 0])
-    disk = lv.Problem.contact(np.eye(3), np.ones(3), 0.5)
-    with pytest.raises(lv.InputError, match=r"shaped\('box'\)"):
-        disk.to_findex()
-    with pytest.raises(lv.InputError, match=r"relaxed\('coulomb'\)"):
-        free(1, friction="cone").to_findex()
-    with pytest.raises(lv.InputError, match="which bounds the norm of its tangents"):
-        dragged(0, 3).to_findex()
 
 
 # -- solutions ---------------------------------------------------------------------------------------------------------

@@ -71,15 +71,6 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         assert f"stopped before convergence, {off.excess:.2g} times its floor" in str(off)
 
 
-@pytest.mark.parametrize("word", ["float16", "single", 32, np.zeros(2)], ids=repr)
-def test_another_precision_is_told(word):
-    p = random_lcp(1)
-    with pytest.raises(lv.InputError, match=r"precision is .*'float64' or 'float32'"):
-        lv.residual(p, p.start(), precision=word)
-    with pytest.raises(lv.InputError, match=r"precision is .*'float64' or 'float32'"):
-        lv.Problem.lcp(np.eye(1), [1.0], precision=word)
-
-
 # -- data in float32 ----------------------------------------------------------------------------------
 
 

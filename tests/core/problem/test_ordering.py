@@ -91,23 +91,3 @@ def test_ranks_are_a_permutation_that_brings_neighbours_near():
     rank = number_bodies_by_adjacency(lv.Problem.from_rows(rows))
     assert np.array_equal(np.sort(rank), np.arange(n))
     assert np.abs(np.diff(rank[body], axis=1)).max() == 1
-
-
-INVALID_PROBLEM = {
-    "no such order": ({"order": "bottomup"}, lv.UnknownName, "bottom_up"),
-    "a block twice": ({"order": [0, 0, 2]}, lv.InputError, "once"),
-    "too few": ({"order": [0, 1]}, lv.InputError, "shape"),
-    "negative seed": ({"order": "random", "seed": -1}, lv.InputError, "seed"),
-    "a seed that nothing draws": ({"order": "reverse", "seed": 3}, lv.InputError, "random"),
-    "ground that nothing uses": ({"order": "reverse", "ground": [0]}, lv.InputError, "ground"),
-    "ground of an array": ({"order": [2, 1, 0], "ground": [0]}, lv.InputError, "ground"),
-    "ground out of range": ({"order": "bottom_up", "ground": [3]}, lv.InputError, "3 blocks"),
-}
-
-
-@pytest.mark.parametrize("name", INVALID_PROBLEM)
-def test_what_makes_no_order_is_refused_with_its_reason(name):
-    options, error, sign = INVALID_PROBLEM[name]
-    problem = lv.Problem.lcp(np.eye(3), np.ones(3))
-    with pytest.raises(error, match=sign):
-        compute_block_order(problem, **options)

@@ -1,7 +1,6 @@
 """`RowBuilder`: closed-form solutions, two dimensions as a plane of three, keys, and agreement of all solvers."""
 
 import re
-from functools import partial
 
 import numpy as np
 import pytest
@@ -319,59 +318,3 @@ def test_a_tangent_can_be_chosen():
     builder.contact(-1, 0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), mu=1.0, tangent=(3.0, 3.0, 1.0))
     expected = [np.sqrt(0.5), np.sqrt(0.5), 0.0]
     np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda b: b.ball(0, 7, (0, 0)), "b is 7; the number of one of the 1 bodies"),
-        (lambda b: b.ball(None, -1, (0, 0)), "a and b are both the static world"),
-        (lambda b: b.ball(0, 0, (0, 0)), "a and b are both body 0"),
-        (lambda b: b.ball(-1, 0, (0, 0, 0)), r"anchor \[m\] has shape \(3,\); \(2,\) is needed"),
-        (lambda b: b.ball(-1, 0, 1.0), "anchor is 1.0; a vector"),
-        (
-            lambda b: b.hinge(-1, 0, (0, 0), (0, 0, 1)),
-            "axis is .*; in two dimensions all rotation is about z",
-        ),
-        (lambda b: b.slider(-1, 0, (0, 0), (0, 0)), "axis has length 0"),
-        (lambda b: b.contact(-1, 0, (0, 0), (0, 2)), "normal has length 2; a unit vector"),
-        (lambda b: b.contact(-1, 0, (0, 0), (0, 1), tangent=(1, 0)), "tangent is .*; in two dimensions"),
-        (
-            lambda b: b.spring(-1, 0, (0, 0), (1, 0), 1.0, stiffness=0.0),
-            "stiffness is 0 N/m and damping is 0",
-        ),
-        (lambda b: b.motor(-1, 0, speed=1.0), "of max_torque and max_force neither is given"),
-        (lambda b: b.motor(-1, 0, speed=1.0, max_torque=1.0, max_force=1.0), "both are given"),
-        (lambda b: b.motor(-1, 0, (1, 0), speed=1.0, max_force=1.0), "anchor is None"),
-        (lambda b: b.motor(-1, 0, speed=1.0, max_force=1.0, anchor=(0, 0)), "axis is None"),
-        (
-            lambda b: b.motor(-1, 0, speed=1.0, max_torque=1.0, anchor=(0, 0)),
-            "anchor is given with max_torque",
-        ),
-        (lambda b: b.limit(-1, 0, value=0.0), "lower is -inf and upper is inf; at least one must be finite"),
-        (lambda b: b.limit(-1, 0, value=0.0, lower=1.0, upper=0.0), "lower must not exceed upper"),
-        (lambda b: b.gear(-1, 0, ratio=0.0), "ratio is 0"),
-        (lambda b: [b.ball(-1, 0, (0, 0), feature=3) for _ in "ab"], "feature is 3, which another ball"),
-        (lambda b: b.rows_of(5), "key is 5; a key that a method"),
-        (lambda b: b.velocity_after(None, [0.0]), "problem is None; the result of RowBuilder.problem"),
-        (lambda b: b.ball(-1, 0, (0, 0), name=3), "name is 3; a text is needed"),
-    ],
-)
-def test_errors_name_the_argument(call, message):
-    with pytest.raises(lv.InputError, match=message):
-        call(planar())
-
-
-def test_errors_of_the_builder_and_of_three_dimensions():
-    with pytest.raises(lv.InputError, match=r"position \[m\] has shape \(1, 4\); \(n, 2\) is needed"):
-        planar(position=np.zeros(4))
-    with pytest.raises(lv.InputError, match=r"velocity .* has shape \(1, 2\); \(1, 3\) is needed"):
-        planar(velocity=(1.0, 2.0))
-    for name in ("inv_mass", "inv_inertia"):
-        with pytest.raises(lv.InputError, match=rf"{name} .* of body 0 is inf.*; it is 0 for a body that"):
-            planar(**{name: np.inf})
-    builder = partial(spatial, np.zeros((1, 6)), np.zeros((1, 3)))
-    with pytest.raises(lv.InputError, match=r"axis is None; a vector \(3,\)"):
-        builder().hinge(-1, 0, np.zeros(3))
-    with pytest.raises(lv.InputError, match="parallel to the normal"):
-        builder().contact(-1, 0, np.zeros(3), (0.0, 0.0, 1.0), tangent=(0.0, 0.0, 1.0))

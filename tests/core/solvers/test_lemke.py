@@ -6,9 +6,6 @@ import scipy.sparse as sp
 from random_problems import good, random_lcp
 
 import lavender as lv
-from lavender.base.deadline import Deadline
-from lavender.solvers.pivoting import PivotState
-from lavender_ext.pivot.lemke import LATE, Lemke
 
 
 def test_free_rows_that_depend_on_others_stay_zero():
@@ -80,14 +77,3 @@ def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
     assert "takes longer" in solution.message
     assert not solution.work
     assert lv.solve(problem, "lemke", time_limit=60.0).status is lv.Status.CONVERGED
-
-
-def test_a_factor_after_the_deadline_is_not_used_in_a_linear_problem():
-    """The dense factor at the end of a path is not started if no time remains; solving with it raised an error."""
-    half = np.random.default_rng(0).normal(size=(100, 100))
-    state = PivotState(lv.Problem.lcp(half @ half.T + np.eye(100), np.ones(100), -np.inf))
-    assert state.problem.law == "linear" and state.outside is not None
-    state.set_deadline(Deadline(1e-9))
-    paths = Lemke(state.rows)
-    paths.set_start(np.zeros(100))
-    assert paths.run(1000) == LATE

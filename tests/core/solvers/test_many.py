@@ -464,33 +464,6 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"J": np.zeros((3, 12))}, "or with row_ptr"),
-        ({"M": np.zeros((4, 3, 3))}, "M has shape"),
-        ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
-        ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),
-        ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"values of M have shape \(4, 17\)"),
-        ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "do not describe a lower triangle"),
-        ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "do not describe a lower triangle"),
-        ({"cones": lv.Cones.contacts(0.5, count=5)}, "48 are needed, the rows of all worlds"),
-        ({"count": [12, 9, 0, 3]}, "24 are needed, the rows of all worlds without padding rows; .* give a list"),
-        ({"cones": [DISKS] * 3}, "one for each of 4 worlds"),
-        ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
-        ({"friction": "wet"}, "friction is 'wet'"),
-        ({"J": np.zeros((47, 18)), "row_ptr": [0, 12, 24, 36, 48]}, "J has shape"),
-        ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, r"row_ptr is \[1, 12, 24, .*must start with 0"),
-        ({"cones": None}, "one for each of 4 worlds"),
-    ],
-)  # fmt: skip
-def test_a_batch_that_does_not_fit_says_so(change, words):
-    jac, mass, free = worlds(4)
-    given = {"J": jac, "M": mass, "v_free": free, "cones": DISKS} | change
-    with pytest.raises(lv.InputError, match=words):
-        lv.Batch(**given)
-
-
 def test_threads_take_worlds_as_they_come(monkeypatch):
     """The first world lasts until all others are done, by the other thread."""
     jac, mass, free = worlds(40)

@@ -8,7 +8,7 @@ from random_problems import as_matrix, random_contact_problem, sweeps
 
 import lavender as lv
 from benchmarks.core_problems import lattice_pile
-from lavender.problem.ordering import compute_block_colors, compute_block_order, number_bodies_by_adjacency
+from lavender.problem.ordering import compute_block_colors, compute_block_order
 from lavender.solvers import layout, sweeping
 
 NAME = "sequential_impulses"
@@ -65,14 +65,6 @@ def test_an_unfinished_run_gives_its_impulses_in_the_problems_order(order, pile,
     np.testing.assert_array_equal(copied.impulse, plain.impulse)
 
 
-def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
-    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
-    problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
-    blocks = np.arange(problem.n_blocks)[::-1]
-    state = lv.prepare(problem, "sequential_impulses", order=blocks).state
-    assert state.layout is None
-
-
 @pytest.mark.parametrize("name", lv.available(order=True))
 @pytest.mark.parametrize("large", [1, 10**9])
 def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatch):
@@ -91,20 +83,6 @@ def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatc
                 results = [lv.solve(problem, name, order=order, **budget) for order in ("colored", *orders)]
                 assert len({s.impulse.tobytes() for s in results}) == 1
                 assert len({(s.iterations, s.status) for s in results}) == 1
-
-
-def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
-    """A lattice whose bodies and contacts were shuffled: the differences of numbers shrink by more than half."""
-    monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
-    body = pile.rows.contact_body
-    moving = (body >= 0).all(axis=1)
-    rank = number_bodies_by_adjacency(pile)
-    assert sorted(rank.tolist()) == list(range(pile.rows.n_bodies))
-    span = np.abs(np.diff(rank[body[moving]].astype(int))).mean()
-    assert span < 0.5 * np.abs(np.diff(body[moving].astype(int))).mean()
-    blocks = compute_block_order(pile, "local").blocks
-    low = np.where(body < 0, len(rank), rank[body]).min(axis=1)[blocks]
-    assert (np.diff(low) >= 0).all()
 
 
 def test_local_takes_a_matrix_too(pile):

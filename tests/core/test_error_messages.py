@@ -1,0 +1,386 @@
+"""Wrong arguments of the core, each with the words of its error; unknown names and attributes."""
+
+import copy
+import json
+import pickle
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from gradient_problems import drawn, table
+from random_problems import as_matrix, dragged, random_contact_problem, random_generalized_problem
+
+import lavender as lv
+from lavender.problem.ordering import compute_block_order
+from lavender.problem.row_assembly import check_arguments
+
+INF, I2, I3 = np.inf, np.eye(2), np.eye(3)
+A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+LCP = lv.Problem.lcp(A, B)
+TINY = lv.Problem.lcp([[2.0]], [1.0])
+CONTACT = lv.Problem.contact(I3, [10.0, 6.0, 0.0], mu=[0.5])
+GENERAL = random_generalized_problem(9, "cone")
+PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(I3, (2, 1, 1))
+contacts, bounded = lv.Cones.contacts, lv.Cones.bounded
+SWAPPED = "so the two seem to be swapped: the order is inv_mass, inv_inertia, velocity, dt, position"
+
+
+def plane():
+    """Build rows of one planar body."""
+    return lv.RowBuilder([0.5], [3.0], [np.zeros(3)], 1 / 60, [(1.5, -1.0)])
+
+
+def space():
+    """Build rows of one body in space."""
+    return lv.RowBuilder([0.5], [I3], np.zeros((1, 6)), 1 / 60, np.zeros((1, 3)))
+
+
+def two():
+    """Build rows of two planar bodies."""
+    return lv.RowBuilder([1.0, 1.0], [1.0, 1.0], PLANE, 0.01, [(0.0, 0.0), (1.0, 0.0)])
+
+
+def two_rows(jac=(1.0, 1.0), mass=(1.0, 1.0), v_free=(1.0, 1.0), **more):
+    """Build two rows on two velocities that nothing couples."""
+    return lv.Problem.from_jacobian(np.diag(jac), np.diag(mass), v_free, cones=lv.Cones.free(2), **more)
+
+
+def batch(**changes):
+    """Build four worlds of four contacts, some arguments replaced."""
+    given = {"J": np.ones((4, 12, 18)), "M": np.tile(np.eye(18), (4, 1, 1)), "v_free": np.ones((4, 18))}
+    return lv.Batch(**given | {"cones": contacts(0.5, count=4)} | changes)
+
+
+def late_batch(jac):
+    """Build worlds of one row whose A_ii is the square of `jac`."""
+    ones = np.ones((3, 1))
+    return lv.Batch(
+        np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * ones, target=ones, cones=lv.Cones.free(1)
+    )
+
+
+def solved_builder():
+    builder = two()
+    builder.contact(-1, 0, (0.0, 0.0), (0.0, 1.0), mu=0.5)
+    return builder, builder.problem(), lv.solve(builder.problem())
+
+
+def derivative(problem=CONTACT):
+    return lv.derivative(problem, lv.solve(problem, tol=1e-12))
+
+
+def spec(**changes):
+    return replace(lv.get("pgs"), **changes)
+
+
+def box(mu=None, **more):
+    return dragged(1, 4, mu, "box", **more)
+
+
+def findex(low, high, index):
+    return lv.Problem.from_findex(I3, np.ones(3), low, high, index)
+
+
+P = drawn(0, "disk", "cone", "generalized")
+ANSWER = lv.solve(P, tol=1e-14)
+BUILDER, BUILT, FOUND = solved_builder()
+
+ERRORS = {
+    lv.InputError: [
+        # Cones
+        (lambda: lv.Cones([0, 1], [9], [0], [1], [0], [0]), "9"),
+        (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
+        (lambda: lv.Cones([0, 0], [0], [], [], [0], [0]), "increase"),
+        (lambda: bounded(0.0, 1.0), r"lower \[N s\] has shape \(\); \(any,\) is needed"),
+        (lambda: bounded(np.array([1.0]), np.array([0.0])), "lower <= upper"),
+        (lambda: bounded(np.array([INF]), np.array([INF])), "between"),
+        (lambda: contacts(np.array([-0.1])), r"mu must not be negative; entry \[0\]"),
+        (lambda: contacts(np.array([0.5]), patch_radius=np.array([-1.0])), "patch_radius must not be negative"),
+        (lambda: contacts(np.array([0.5]), tangents=6), "tangents"),
+        (lambda: lv.Cones([0, 1], [2], [0], [0], [0.5], [0.1]), "contact"),
+        (lambda: contacts([0.5, 0.6], count=3), r"mu has shape \(2,\)"),
+        (lambda: contacts(0.5, count=-1), "count is -1"),
+        (lambda: lv.Cones([0, 7], [lv.ROUND], np.zeros(7), np.zeros(7), [1.0], [0.0]), "a round cone of 7 rows"),
+        (lambda: contacts(0.5, 3, 0.1), "leave patch_radius out"),
+        (lambda: contacts([(0.5, -0.2)], shape="box"), "mu"),
+        (lambda: contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),
+        (lambda: contacts(0.5, 2, 0.1, shape="box"), "neither spin"),
+        (lambda: contacts(0.5, 3, shape="box"), "up to two tangents"),
+        (lambda: lv.Cones([0, 4], [4], np.zeros(4), np.ones(4), [0.5], [1.0]), "box of 4 rows"),
+        (lambda: contacts(0.5, rolling=-0.1), "rolling.*-0.1"),
+        (lambda: contacts(0.5, 1, rolling=0.1), "tangents=2"),
+        (lambda: contacts(0.5, 5, rolling=0.1), "round cone"),
+        (lambda: contacts([0.5, 0.5], rolling=[0.1]), "rolling"),
+        (lambda: lv.Cones([0, 4], [lv.CONTACT_ROLLING], np.zeros(4), np.ones(4), [0.5], [0.0], [0.1]), "5 or 6"),
+        (lambda: lv.Cones([0, 5], [lv.CONTACT_ROLLING], np.zeros(5), np.ones(5), [0.5], [0.0], [-1.0]), "rolling.*-1"),
+        (lambda: contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
+        (lambda: contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
+        (lambda: contacts([(0.5, 0.1)], 1), "neither spin nor rolling"),
+        (lambda: contacts([(0.5, 0.1)], patch_radius=0.1), "neither spin nor rolling"),
+        (lambda: lv.Problem.contact(I3, np.ones(3), [(0.5, 0.1)], 0.1), "neither spin nor rolling"),
+        (lambda: contacts([(0.5, 0.1)], rolling=0.1), "neither spin nor rolling"),
+        (lambda: lv.Cones([0, 2], [lv.CONTACT_ELLIPSE], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
+        (lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
+        (lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [1e50], [1e12]),
+         "mu_2.* must be at most 1e.60"),
+        (lambda: lv.Cones.free(-1), "-1"),
+        *((partial(lv.Cones.free, n), str(n)) for n in (2**31 - 1, 2**40)),
+        *((partial(contacts, 0.5, count=n), str(n)) for n in (2**31 - 1, 2**40)),
+        (lambda: contacts([(0.0, 0.2)], shape="box").shaped("disk"), "two numbers above 0"),
+        (lambda: contacts(0.5, patch_radius=0.1).shaped("box"), "a box cannot bound spin"),
+        # findex
+        (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 1, 0]), "its own row"),
+        (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 0, 1]), "its own findex is 0"),
+        (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 0, 3]), "a row below 3"),
+        (lambda: findex([0, -1, -1], [INF, INF, 1], [-1, 0, 0]), "upper is mu"),
+        (lambda: findex([0, -1, -1], [INF, np.nan, 1], [-1, 0, 0]), "upper is mu"),
+        (lambda: findex([0, 1, -1], [INF, -1, 1], [-1, 0, 0]), "upper is mu"),
+        (lambda: findex([0, 2, -1], [INF, 1, 1], [-1, -1, 0]), "lower <= upper"),
+        (lambda: findex([0, -1, -1], [5, 1, 1], [-1, 0, 0]), r"a normal needs \[0, inf\]"),
+        (lambda: findex([-1, -1, -1], [INF, 1, 1], [-1, 0, 0]), r"a normal needs \[0, inf\]"),
+        (lambda: findex([0, -1], [INF, 1], [-1, 0, 0]), "shape"),
+        (lambda: lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [INF, 1, 1, 1], [-1, 0, 0, 0]),
+         "3 rows have findex 0"),
+        (lambda: CONTACT.to_findex(), r"shaped\('box'\)"),
+        (lambda: box(friction="cone").to_findex(), r"relaxed\('coulomb'\)"),
+        (lambda: dragged(0, 3).to_findex(), "which bounds the norm of its tangents"),
+        # J and M
+        (lambda: lv.Generalized(np.ones((1, 2)), np.diag([1.0, 0.0]), np.zeros(2), ["hip", "knee"]),
+         r"not positive definite: the pivot of knee"),
+        (lambda: lv.Generalized(np.ones((1, 2)), [[1.0, 2.0], [2.0, 1.0]], np.zeros(2)), "not positive definite"),
+        (lambda: lv.Generalized(np.ones((1, 2)), np.triu(A), np.zeros(2), ["hip", "knee"]),
+         r"not symmetric: at \((hip, knee|knee, hip)\)"),
+        (lambda: lv.Generalized(np.ones((1, 2)), sp.csr_array(np.triu(A)), np.zeros(2)), "not symmetric"),
+        (lambda: lv.Generalized(np.ones((1, 3)), A, np.zeros(2)),
+         r"J has shape \(1, 3\); \(any, 2\) is needed, as M has 2"),
+        (lambda: lv.Generalized(np.ones((1, 2)), np.ones((2, 3)), np.zeros(2)), "a square matrix"),
+        (lambda: lv.Generalized(np.ones((1, 2)), A, np.zeros(2), ["hip"]), "1 entries for 2"),
+        (lambda: lv.Problem.from_jacobian(np.ones((1, 2)), A, np.zeros(2), cones=lv.Cones.free(2)),
+         "J has 1 rows; 2 are needed"),
+        (lambda: lv.Problem(np.zeros(1), lv.Cones.free(1), np.eye(1),
+                            generalized=lv.Generalized(np.ones((1, 2)), A, np.zeros(2))), "exactly one is needed"),
+        (lambda: GENERAL.updated(J=GENERAL.generalized.jac), "give target or b"),
+        (lambda: GENERAL.updated(b=GENERAL.b, target=0.0), "give one of the two"),
+        (lambda: as_matrix(GENERAL).updated(v_free=GENERAL.generalized.v_free, target=0.0), "generalised coordinates"),
+        (lambda: GENERAL.updated(J=GENERAL.generalized.jac[:, 1:], target=0.0), "J has shape"),
+        # RowBuilder
+        (lambda: plane().ball(0, 7, (0, 0)), "b is 7; the number of one of the 1 bodies"),
+        (lambda: plane().ball(None, -1, (0, 0)), "a and b are both the static world"),
+        (lambda: plane().ball(0, 0, (0, 0)), "a and b are both body 0"),
+        (lambda: plane().ball(-1, 0, (0, 0, 0)), r"anchor \[m\] has shape \(3,\); \(2,\) is needed"),
+        (lambda: plane().ball(-1, 0, 1.0), "anchor is 1.0; a vector"),
+        (lambda: plane().hinge(-1, 0, (0, 0), (0, 0, 1)), "axis is .*; in two dimensions all rotation is about z"),
+        (lambda: plane().slider(-1, 0, (0, 0), (0, 0)), "axis has length 0"),
+        (lambda: plane().contact(-1, 0, (0, 0), (0, 2)), "normal has length 2; a unit vector"),
+        (lambda: plane().contact(-1, 0, (0, 0), (0, 1), tangent=(1, 0)), "tangent is .*; in two dimensions"),
+        (lambda: plane().spring(-1, 0, (0, 0), (1, 0), 1.0, stiffness=0.0), "stiffness is 0 N/m and damping is 0"),
+        (lambda: plane().motor(-1, 0, speed=1.0), "of max_torque and max_force neither is given"),
+        (lambda: plane().motor(-1, 0, speed=1.0, max_torque=1.0, max_force=1.0), "both are given"),
+        (lambda: plane().motor(-1, 0, (1, 0), speed=1.0, max_force=1.0), "anchor is None"),
+        (lambda: plane().motor(-1, 0, speed=1.0, max_force=1.0, anchor=(0, 0)), "axis is None"),
+        (lambda: plane().motor(-1, 0, speed=1.0, max_torque=1.0, anchor=(0, 0)), "anchor is given with max_torque"),
+        (lambda: plane().limit(-1, 0, value=0.0), "lower is -inf and upper is inf; at least one must be finite"),
+        (lambda: plane().limit(-1, 0, value=0.0, lower=1.0, upper=0.0), "lower must not exceed upper"),
+        (lambda: plane().gear(-1, 0, ratio=0.0), "ratio is 0"),
+        (lambda: [b.ball(-1, 0, (0, 0), feature=3) for b in [plane()] * 2], "feature is 3, which another ball"),
+        (lambda: plane().rows_of(5), "key is 5; a key that a method"),
+        (lambda: plane().velocity_after(None, [0.0]), "problem is None; the result of RowBuilder.problem"),
+        (lambda: plane().ball(-1, 0, (0, 0), name=3), "name is 3; a text is needed"),
+        (lambda: lv.RowBuilder([0.5], [3.0], [np.zeros(3)], 0.1, [np.zeros(4)]),
+         r"position \[m\] has shape \(1, 4\); \(n, 2\) is needed"),
+        (lambda: lv.RowBuilder([0.5], [3.0], [(1.0, 2.0)], 0.1, [(0.0, 0.0)]),
+         r"velocity .* has shape \(1, 2\); \(1, 3\) is needed"),
+        (lambda: lv.RowBuilder([INF], [3.0], [np.zeros(3)], 0.1, [(0.0, 0.0)]),
+         "inv_mass .* of body 0 is inf.*; it is 0 for a body that"),
+        (lambda: lv.RowBuilder([1.0], [INF], [np.zeros(3)], 0.1, [(0.0, 0.0)]),
+         "inv_inertia .* of body 0 is inf.*; it is 0 for a body that"),
+        (lambda: space().hinge(-1, 0, np.zeros(3)), r"axis is None; a vector \(3,\)"),
+        (lambda: space().contact(-1, 0, np.zeros(3), (0.0, 0.0, 1.0), tangent=(0.0, 0.0, 1.0)),
+         "parallel to the normal"),
+        (lambda: two().hinge(-1, 0, nonsense=1), "no argument nonsense=; it takes a=, b=, anchor=, axis="),
+        (lambda: lv.RowBuilder(mass=[1.0], velocity=np.zeros((1, 3)), dt=0.01, position=np.zeros((1, 2))),
+         r"^RowBuilder has no argument mass=; it takes inv_mass=, "),
+        (lambda: lv.RowBuilder([1.0], [1.0], np.zeros((1, 3))), r"^RowBuilder lacks dt=, position=$"),
+        (lambda: two().contact(-1, 0, (0.0, 0.0)), r"contact lacks normal=$"),
+        (lambda: two().contact(-1, 0, (0.0, 0.0), (0.0, 1.0), 0.0, 0.5),
+         r"contact takes 4 positional .* a, b, point, normal; 6 were given; .* by name: gap=, mu="),
+        (lambda: two().hinge(-1, 0, (0.0, 0.0), anchor=(0.0, 0.0)), "hinge has anchor twice, by position and by name"),
+        (lambda: BUILDER.velocity_after(FOUND),
+         r"velocity_after lacks impulse=: builder\.velocity_after\(problem, solution\.impulse\)"),
+        (lambda: BUILDER.velocity_after(BUILT, FOUND), r"give its \.impulse"),
+        (lambda: BUILDER.problem("pyramid"), "a separate bound for each tangent is a shape"),
+        (lambda: lv.solve(BUILDER), r"is a RowBuilder; .* give the result of its \.problem\(\)"),
+        *((partial(lv.RowBuilder, [1.0, 1.0], inertia, velocity, 0.01, position), rf"^position \[m\] has shape {words}")
+          for inertia, velocity, position, words in (
+              ([1.0, 1.0], PLANE, PLANE, r"\(2, 3\).*three dimensions, but velocity .* position \(2, 2\) is needed"),
+              ([1.0, 1.0], np.zeros((2, 2)), PLANE, rf"\(2, 3\).*{SWAPPED}"),
+              (TENSORS, PLANE, SPACE, rf"\(2, 6\).*{SWAPPED}"))),
+        # Names, and arguments in the place of others
+        (lambda: lv.Problem.lcp(A, B, lo=0.0), r"Problem\.lcp has no argument lo=; it takes lower=, upper=, .*guess="),
+        *((partial(lv.solve, A, B, *bounds), r"problem is a ndarray; .* Problem\.lcp\(A, b, lower, upper\)")
+          for bounds in ((), (0.0, 1.0))),
+        (lambda: lv.solve(LCP, "pgs", B), r"solve has 3 positional arguments; .* all others by name"),
+        *((partial(build, matrix, B[:1]), r"^b \[m/s\] has shape \(1,\); \(2,\) is needed, as A has 2 rows")
+          for build in (lv.Problem.lcp, lv.Problem.linear, lambda a, b: lv.Problem.contact(a, b, 0.0))
+          for matrix in (A, A.tolist())),
+        (lambda: lv.solve(LCP, B), r"solver is a ndarray; .*solve\(problem, impulse=\.\.\.\)"),
+        (lambda: lv.solve(LCP, FOUND), r"solver is a Solution; .*solve\(problem, impulse=problem\.carry\(solution\)\)"),
+        (lambda: lv.solve(LCP, 1e-9), r"solver is 1e-09; .*solve\(problem, tol=\.\.\.\)"),
+        (lambda: lv.solve(LCP, 10), r"solver is 10; .*solve\(problem, max_iter=\.\.\.\)"),
+        (lambda: lv.solve(LCP, impulse=np.ones(3)),
+         r"impulse \[N s\] has shape \(3,\); \(2,\) is needed.*problem\.carry"),
+        (lambda: LCP.carry(None), r"previous is None; .* the first step .* without impulse="),
+        (lambda: lv.solve(BUILT, impulse=FOUND), r"impulse is a Solution; .* \.impulse, or problem\.carry\(solution\)"),
+        # solve and solve_many
+        (lambda: lv.solve(I2, "pgs"), "Problem"),
+        (lambda: lv.solve(LCP, "pgs", tol=-1.0), "tol"),
+        (lambda: lv.solve(LCP, "pgs", tol=10**400), "tol is inf; a finite number is needed"),
+        (lambda: lv.solve(LCP, "pgs", time_limit=-1.0), "time_limit"),
+        *((partial(lv.solve, LCP, velocity_tol=x), "velocity_tol") for x in (0.0, -1.0, np.nan, INF, "small")),
+        *((partial(lv.solve_many, [LCP], velocity_tol=x), "velocity_tol") for x in (0.0, -1.0, np.nan, INF, "small")),
+        (lambda: lv.solve_many([LCP], impulse=[0.0, 0.0]), "impulses="),
+        (lambda: lv.solve_many([LCP] * 2, impulses=[None]), "1 entries for 2"),
+        (lambda: lv.solve_many(LCP), "one Problem; a list"),
+        (lambda: lv.solve_many([3]), "Problem"),
+        (lambda: lv.solve_many([LCP], threads=0), "threads is 0"),
+        *((partial(lv.solve, LCP, name, **{option: x}), option) for name, option, values in (
+            ("jacobi", "omega", (0.0, -1.0, INF)), ("anderson", "memory", (0, 17)), ("admm", "memory", (-1, 17, 0.5)),
+            ("admm", "relaxation", (0.0, 2.0)), ("nncg", "convex", (-1,)), ("pgs", "callback", (3,))) for x in values),
+        (lambda: lv.solve(random_contact_problem(1, friction="cone"), "nncg", sweep="pgs"), "cone law"),
+        *((partial(lv.residual, LCP, [0.0, 0.0], precision=word), r"precision is .*'float64' or 'float32'")
+          for word in ("float16", "single", 32, np.zeros(2))),
+        *((partial(lv.Problem.lcp, np.eye(1), [1.0], precision=word), r"precision is .*'float64' or 'float32'")
+          for word in ("float16", "single", 32, np.zeros(2))),
+        # Orders
+        *((partial(compute_block_order, lv.Problem.lcp(I3, np.ones(3)), **options), words) for options, words in (
+            ({"order": [0, 0, 2]}, "once"), ({"order": [0, 1]}, "shape"), ({"order": "random", "seed": -1}, "seed"),
+            ({"order": "reverse", "seed": 3}, "random"), ({"order": "reverse", "ground": [0]}, "ground"),
+            ({"order": [2, 1, 0], "ground": [0]}, "ground"), ({"order": "bottom_up", "ground": [3]}, "3 blocks"))),
+        # Batches
+        *((partial(batch, **change), words) for change, words in (
+            ({"J": np.zeros((3, 12))}, "or with row_ptr"),
+            ({"M": np.zeros((4, 3, 3))}, "M has shape"),
+            ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
+            ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),
+            ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"values of M have shape \(4, 17\)"),
+            ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "do not describe a lower triangle"),
+            ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "do not describe a lower triangle"),
+            ({"cones": contacts(0.5, count=5)}, "48 are needed, the rows of all worlds"),
+            ({"count": [12, 9, 0, 3]}, "24 are needed, the rows of all worlds without padding rows; .* give a list"),
+            ({"cones": [contacts(0.5, count=4)] * 3}, "one for each of 4 worlds"),
+            ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
+            ({"friction": "wet"}, "friction is 'wet'"),
+            ({"J": np.zeros((47, 18)), "row_ptr": [0, 12, 24, 36, 48]}, "J has shape"),
+            ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, r"row_ptr is \[1, 12, 24, .*must start with 0"),
+            ({"cones": None}, "one for each of 4 worlds"))),
+        # Specs of solvers
+        *((partial(spec, **{name: x}), f"{name}.*needed") for name, values in {
+            "name": ("", 3), "laws": (frozenset(), frozenset({"lcp", "lpc"}), "lcp", None, [["lcp"], 3]),
+            "operators": (frozenset({"rows", "tensor"}), frozenset()), "box_friction_laws": ("cone",),
+            "summary": (None,), "requires": ("numpy",), "options": (["omega"],), "max_iter": (-1, "7"),
+            "resumable": ("no",), "seed": (2,),
+        }.items() for x in values),
+        # Numbers out of range
+        *((call, rf"(?s)\b{name}.*e[+-]60") for call, name in (
+            (lambda: lv.Problem.lcp(I2, [1.0, 1e61]), "b"), (lambda: lv.Problem.lcp(I2, [1e-61, -1e-70]), "b"),
+            (lambda: lv.Problem.lcp(np.diag([1.0, 1e61]), [1.0, 1.0]), "A"),
+            (lambda: lv.Problem.lcp(I2, [1.0, 1.0], 0.0, [1.0, 1e300]), "upper"),
+            (lambda: contacts([0.5, 1e-61]), "mu"), (lambda: contacts(0.5, patch_radius=[1e61]), "patch_radius"),
+            (lambda: contacts([1e-40], patch_radius=[1e-40]), "mu patch_radius"),
+            (lambda: contacts(0.5, rolling=[1e-200]), "rolling"),
+            (lambda: two_rows(compliance=[1.0, 1e-70]), "compliance"), (lambda: two_rows(mass=(1.0, 1e-61)), "M"),
+            (lambda: two_rows(jac=(1.0, 1e61)), "J"), (lambda: two_rows(v_free=(0.0, -1e61)), "v_free"),
+            (lambda: lv.solve(two_rows(jac=(1.0, 1e40), target=[1.0, 1.0])), "A_ii"),
+            (lambda: late_batch(1e40)[1].d, "A_ii"), (lambda: LCP.updated(b=[1.0, 1e61]), "b"))),
+        # Derivatives
+        (lambda: lv.derivative(CONTACT, 0.99 * lv.solve(CONTACT, tol=1e-12).impulse),
+         r"relative residual is 1\.\d\de-02.*needs at most 1e-08, or the round-off floor.*solve with tol"),
+        (lambda: lv.derivative(CONTACT.updated(b=[9.0, 6.0, 0.0]), lv.solve(CONTACT, tol=1e-12)),
+         "the impulse is not a solution"),
+        (lambda: lv.derivative(LCP, lv.solve(CONTACT)), r"impulse \[N s\] has shape \(3,\); \(2,\)"),
+        (lambda: derivative().jvp(b=[np.nan, 0.0, 0.0]), "b must be finite"),
+        (lambda: derivative().vjp(impulse=[np.nan, 0.0, 0.0]), "impulse must be finite"),
+        (lambda: derivative().vjp(), "give velocity="),
+        (lambda: derivative().jvp(), "give at least one of b, lower"),
+        (lambda: derivative().jvp(J=I3), "'J' is not among the data of this problem"),
+        (lambda: derivative(table()).jvp(M=np.triu(np.ones((3, 3)))), "the change of M must be symmetric"),
+        (lambda: lv.derivatives([P, P], [ANSWER]), "1 entries for 2 problems"),
+        (lambda: lv.derivatives([P, P], [ANSWER, 1.1 * ANSWER.impulse]), "problem 1: the impulse is not a solution"),
+        (lambda: lv.derivatives([P], [ANSWER]).vjp(velocity=[1, 2]), "velocity has 2 cotangents for 1 problems"),
+        (lambda: lv.derivatives(P, ANSWER), "a list of problems is needed"),
+        (lambda: lv.derivatives([P], [ANSWER]).vjp(impulse=[np.ones(P.m)])[0].full("mu"),
+         "full needs one of A, J, M; 'mu' is not a matrix"),
+    ],
+    lv.UnknownName: [
+        *((partial(call, LCP, "pgs", maxiter=3), r"unknown option 'maxiter' .*did you mean 'max_iter'")
+          for call in (lv.solve, lv.prepare)),
+        (lambda: lv.solve(LCP, sovler="pgs"), "did you mean 'solver'"),
+        *((partial(lv.solve, LCP, name), f"^unknown solver '{name}'; did you mean '{near}'[?]$")
+          for name, near in (("PGS", "pgs"), ("Newton", "newton"), ("newtn", "newton"))),
+        (lambda: lv.solve(LCP, "jacobi", omgea=1.0), "omega"),
+        (lambda: lv.solve(LCP, "pgs", order="colored", threads=2), "threads"),
+        (lambda: lv.solve_many([LCP], "pgss"), "pgs"),
+        (lambda: contacts(0.5, shape="square"), "unknown shape 'square'"),
+        (lambda: compute_block_order(LCP, "bottomup"), "bottom_up"),
+    ],
+    lv.CapabilityError: [
+        (lambda: lv.solve(LCP, "direct", history=True), r"lavender\.available\(problem, history=True\)"),
+        (lambda: derivative().vjp(velocity=np.ones(3)), "given as a matrix"),
+        (lambda: derivative().vjp(impulse=np.ones(3)).J, "J exists only for problems given as rows or generalized"),
+    ],
+    AttributeError: [
+        (lambda: setattr(GENERAL.generalized, "v_free", np.ones(2)), "immutable"),
+        (lambda: derivative().vjp(impulse=np.ones(3)).weight, "a gradient has no 'weight'"),
+        (lambda: lv.derivatives([P], [ANSWER]).vjp(impulse=[np.ones(P.m)]).M,
+         r"gradients of all problems have no attribute 'M'; gradients\[i\]"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("call", "words", "error"),
+    [pytest.param(call, words, error, id=words) for error, cases in ERRORS.items() for call, words in cases],
+)
+def test_a_wrong_argument_raises_an_error_with_these_words(call, words, error):
+    with pytest.raises(error, match=words) as raised:
+        call()
+    assert type(raised.value) is not lv.InputError or isinstance(raised.value, ValueError)
+
+
+@pytest.mark.parametrize("owner", [LCP.cones, lv.residual(LCP, np.zeros(2)), FOUND, lv], ids=type)
+def test_unknown_attributes_raise_attribute_error_with_the_name(owner):
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'") as raised:
+        owner.nonsense  # noqa: B018
+    assert raised.value.name == "nonsense"  # Python suggests the nearest name in the traceback.
+
+
+def test_the_module_of_solvers_names_the_lists_of_solvers():
+    import lavender.solvers
+
+    with pytest.raises(TypeError, match=r"lavender\.available\(problem\) lists .* lavender\.known\(\)"):
+        lavender.solvers()
+    assert all(lv.solve(LCP, name, history=True).history for name in lv.available(LCP, history=True))
+
+
+def test_a_type_error_within_a_call_of_a_row_builder_stays_as_it_is():
+    @check_arguments
+    def add(self, number):
+        return number + ""
+
+    with pytest.raises(TypeError, match="unsupported operand"):
+        add(None, 1)
+    with pytest.raises(lv.InputError, match=r"^RowBuilder\.add lacks number=$"):
+        add(None)
+
+
+def test_a_status_is_equal_to_its_name_everywhere():
+    solution = lv.solve(TINY)
+    assert solution.status == "CONVERGED" and solution.status != "STALLED"
+    assert (lv.solve_many([TINY] * 2).status == "CONVERGED").all()
+    for status in lv.Status:
+        assert status == status.name == str(status) == f"{status}" and len(status.description) > 10
+        assert lv.Status(status.name) is lv.Status[status.name] is status
+        assert pickle.loads(pickle.dumps(status)) is copy.deepcopy(status) is status
+        assert json.loads(json.dumps(status)) == status.name and {status.name: 1}[status] == 1
