@@ -55,17 +55,6 @@ def test_the_next_reference_is_taken_and_named(plug_in):
     assert table["pgs"].verdict == "agrees"
 
 
-def test_no_reference_leaves_distances_out(monkeypatch):
-    monkeypatch.setattr(check, "REFERENCES", ())
-    problem = bounded_problem(1)
-    table = cross_check(problem, ["pgs"], reference="gauss_seidel")
-    assert table.reference is None
-    assert "gauss_seidel takes laws linear" in table.reference_note
-    assert table["pgs"].distance is None
-    assert table["pgs"].verdict == check.AGREES_UNCOMPARED
-    assert "no reference" in str(table)
-
-
 def test_coulomb_and_asymmetric_have_no_reference():
     coulomb = random_contact_problem(2, tangents=2, spin=False)
     table = cross_check(coulomb, ["pgs"], max_iter=20_000)
@@ -330,17 +319,3 @@ def test_known_tells_of_everybody_and_available_of_those_that_can():
     assert set(known) == set(registry.specs())
     assert [name for name, reason in known.items() if reason is None] == lv.available(TINY)
     assert all(reason for reason in known.values() if reason is not None)
-
-
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lv.solve, lv.available, lv.known, lv.cross_check, lv.explain, lv.diagnose, lv.redundancy,
-        lambda p: lv.motion_error(p, [0.0, 0.0]), lambda p: lv.residual(p, [0.0, 0.0]),
-    ],
-)  # fmt: skip
-def test_what_is_no_problem_is_refused_by_all(ask):
-    for wrong in (np.eye(2), None, "p"):
-        if ask not in (lv.available, lv.known) or wrong is not None:  # which ask of no problem then
-            with pytest.raises(lv.InputError, match="Problem"):
-                ask(wrong)

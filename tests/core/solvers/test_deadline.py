@@ -16,10 +16,7 @@ from benchmarks.core_problems import fresh
 from lavender import registry
 from lavender.problem.derived import computed_once
 from lavender.problem.operators import Operators
-from lavender.solvers.costs import (
-    estimate_disk_cost,
-    estimate_judge_setup_cost,
-)
+from lavender.solvers.costs import estimate_disk_cost, estimate_judge_setup_cost
 
 
 def test_set_up_is_inside(clock, monkeypatch):

@@ -457,8 +457,7 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     with pytest.raises(lv.InputError, match="friction is 'wet'"):
         lv.Batch.of_bodies(ball, friction="wet")
     with pytest.raises(
-        lv.InputError,
-        match=r"world 1: this world has 1 rows, the first world 3; .* give tangents=",
+        lv.InputError, match=r"world 1: this world has 1 rows, the first world 3; .* give tangents="
     ):
         lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()

@@ -99,11 +99,7 @@ def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
         io.save(stack(4), tmp_path / f"step_{i}.npz")
     assert [
         item.source[-len("step_10.npz") :].lstrip("/") for item in bench.list_steps_in_folder(tmp_path)
-    ] == [
-        "step_1.npz",
-        "step_9.npz",
-        "step_10.npz",
-    ]
+    ] == ["step_1.npz", "step_9.npz", "step_10.npz"]
     # Files that name no blocks may be anything: steps only where that is said.
     assert [(i.name, i.sequence) for i in bench.resolve_sources([tmp_path])] == [
         ("step_1", ""), ("step_9", ""), ("step_10", ""),

@@ -68,22 +68,8 @@ def example(folder):
     crashed = {"status": "CRASHED (SIGSEGV)", "claims": False}
     for i, case in enumerate(("pile", EVIL)):
         size = 1e-3 * (1 + i)
-        interleaved(
-            made,
-            case,
-            "auto",
-            size,
-            1e-9,
-            solution_hash="a",
-        )
-        interleaved(
-            made,
-            case,
-            "direct",
-            2.0 * size,
-            1e-13,
-            solution_hash="b",
-        )
+        interleaved(made, case, "auto", size, 1e-9, solution_hash="a")
+        interleaved(made, case, "direct", 2.0 * size, 1e-13, solution_hash="b")
         interleaved(made, case, "nncg", 9.0 * size, 1e-7)
         made.append(record(case, "osqp", 3.0 * size, 1e-8, backend_time_min=0.5 * size))
         made.append(record(case, "pgs", size, 9e-4, tol=1e-3, iterations=40))

@@ -40,12 +40,7 @@ class Page(html.parser.HTMLParser):
         # Folded parts, marked rows and cells, and the place of a drawing are part of what a page shows.
         bad = " bad" if values.get("class") == "bad" else ""
         folded = " open" if tag == "details" and "open" in values else ""
-        mark = {
-            "tr": f"\n|{bad}",
-            "td": " | ",
-            "th": " | ",
-            "details": f"\n<details{folded}>",
-        }
+        mark = {"tr": f"\n|{bad}", "td": " | ", "th": " | ", "details": f"\n<details{folded}>"}
         if tag == "svg":
             self.text.append(f"\n[drawing of {values['aria-label']}:")
         elif "data-l" in values:
