@@ -187,6 +187,13 @@ def newton_without(*phases):
         yield
 
 
+def keep_values(monkeypatch, module, name, values, solvers):
+    """Let a table of settings try only some values, beside some solvers or none."""
+    lines = [f for f in getattr(module, name) if f.beside.get("solver", "") in solvers]
+    kept = [f._replace(values=tuple(x for x in f.values if x in values)) for f in lines]
+    monkeypatch.setattr(module, name, tuple(f for f in kept if f.values))
+
+
 #: QP backends of other packages that are here, and those of all that need a definite A.
 BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
 DEFINITE = {"quadprog", "ecos", "pyqpmad"}

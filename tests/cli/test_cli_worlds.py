@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from calls import EARLY_BOXES as EARLY
+from calls import keep_values
 
 from lavender.lab.tune import mujoco_settings as tuning
 
@@ -45,8 +46,7 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
 
 
 def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning, "TOLERANCES", (1e-6, 1e-12))
-    monkeypatch.setattr(tuning, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
+    keep_values(monkeypatch, tuning, "MUJOCO", {1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
     code, out, _ = lavender(
         "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--repeats", 1, "--out", tmp_path / "out"
     )
@@ -61,8 +61,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
 
 
 def test_tuning_to_a_limit_of_the_error(lavender, boxes, tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning, "TOLERANCES", (1e-12,))
-    monkeypatch.setattr(tuning, "ITERATIONS", {"CG": (3,)})
+    keep_values(monkeypatch, tuning, "MUJOCO", {1e-12, 3}, {"CG"})
     words = ("tune", boxes(EARLY), "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")
     for limit, sentence in (
         ("1e-3", "error at most 0.001 m/s, fastest"),
@@ -84,8 +83,7 @@ def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):
 
 
 def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning, "TOLERANCES", (1e-6,))
-    monkeypatch.setattr(tuning, "ITERATIONS", {"Newton": (2,)})
+    keep_values(monkeypatch, tuning, "MUJOCO", {1e-6, 2}, {"Newton"})
     high = boxes(EARLY)
     high.write_text(high.read_text().replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
     words = ("tune", high, "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")

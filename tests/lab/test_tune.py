@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calls import BOXES
+from calls import BOXES, keep_values
 from calls import EARLY_BOXES as EARLY
 
 import lavender as lv
@@ -17,13 +17,6 @@ from lavender.lab.tune.mujoco_settings import MujocoStage as Stage
 from lavender.lab.tune.mujoco_settings import list_first_settings
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
-
-
-def keep_values(monkeypatch, module, name, values, solvers):
-    """Let a table of settings try only some values, beside some solvers or none."""
-    lines = [f for f in getattr(module, name) if f.beside.get("solver", "") in solvers]
-    kept = [f._replace(values=tuple(x for x in f.values if x in values)) for f in lines]
-    monkeypatch.setattr(module, name, tuple(f for f in kept if f.values))
 
 
 def fewer(monkeypatch):
