@@ -23,26 +23,32 @@ for variable in ("COLUMNS", "LINES"):
     os.environ.pop(variable, None)
     os.unsetenv(variable)
 
-# Timings say nothing on a shared machine, so no deadline, of an example or of drawing it; the same examples every run,
-# so a failure repeats: no more of them than meet every branch. HYPOTHESIS_PROFILE=search draws new ones, and many.
-timeless = hypothesis.settings(deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
-hypothesis.settings.register_profile("repeat", timeless, derandomize=True, print_blob=True, max_examples=40)
-hypothesis.settings.register_profile("search", timeless, max_examples=1000)
-hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
+# A shared machine may take any time for an example, and a generator may reject any share of them. The examples of a
+# change are the same in every run; `--nightly` draws new ones, and .ci/fuzz (profile "search") draws many.
+free = hypothesis.settings(deadline=None, suppress_health_check=list(hypothesis.HealthCheck), print_blob=True)
+hypothesis.settings.register_profile("change", free, derandomize=True, max_examples=10)
+hypothesis.settings.register_profile("nightly", free, max_examples=200)
+hypothesis.settings.register_profile("search", free, max_examples=1000)
 
 PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
 def pytest_addoption(parser):
-    parser.addoption("--one-of-each", action="store_true", help="of each test function only its first case")
+    parser.addoption(
+        "--nightly", action="store_true", help="also run the tests marked `nightly`, and 200 new examples"
+    )
+
+
+def pytest_configure(config):
+    profile = "nightly" if config.getoption("nightly") else "change"
+    hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", profile))
 
 
 def pytest_collection_modifyitems(config, items):
-    """The longest test begins first: at the end all cores but one would wait for it."""
-    if config.getoption("one_of_each"):
-        first = {(item.path, getattr(item, "originalname", item.name)): item for item in reversed(items)}
-        config.hook.pytest_deselected(items=[item for item in items if item not in first.values()])
-        items[:] = reversed(first.values())
+    """Deselect the tests marked `nightly` without --nightly. The longest test begins first."""
+    if not config.getoption("nightly"):
+        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("nightly")])
+        items[:] = [item for item in items if not item.get_closest_marker("nightly")]
     items.sort(key=lambda item: "parity" not in item.path.parts)
 
 

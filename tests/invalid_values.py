@@ -5,7 +5,6 @@ time.
 """
 
 import inspect
-import os
 import re
 import types
 from collections.abc import Callable
@@ -14,18 +13,8 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from hypothesis import HealthCheck, settings
 
 import lavender as lv
-
-#: How many times as many examples `.ci/fuzz` draws.
-MORE = 5 if os.environ.get("HYPOTHESIS_PROFILE") == "search" else 1
-
-
-def draw_examples(count):
-    """Return the settings of a test with so many drawn examples, of which any share may be rejected."""
-    return settings(max_examples=MORE * count, suppress_health_check=list(HealthCheck))
-
 
 LAYERS = ("io", "sim", "lab")  # Modules outside of these packages belong to the core.
 

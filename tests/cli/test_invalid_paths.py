@@ -18,8 +18,7 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from invalid_values import MORE
+from hypothesis import given
 from mujoco_scene import scene
 from stacks import stack
 from worked import python
@@ -504,7 +503,6 @@ def check_command(code, text, statuses=(0, 1, 2, 3)):
 
 
 @pytest.mark.fuzz
-@settings(max_examples=12 * MORE, suppress_health_check=list(HealthCheck))
 @given(words=st.sampled_from(WORDS), value=st.sampled_from(VALUES))
 def test_any_number_on_the_command_line_gives_a_documented_status(lavender, words, value):
     code, out, err = lavender(*(word.format(value) for word in words))
@@ -643,8 +641,7 @@ def test_a_folder_of_anything_gives_a_documented_status_and_escaped_text(lavende
 
 
 @pytest.mark.fuzz
-@pytest.mark.skipif(MORE == 1, reason="a second each; the folders above have one of each kind")
-@settings(max_examples=60, suppress_health_check=list(HealthCheck))
+@pytest.mark.nightly
 @given(
     entries=st.lists(st.tuples(st.sampled_from(NAMES), st.sampled_from(CONTENTS)), min_size=1, max_size=5),
     command=st.sampled_from(("report", "check", "files")),

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clib import COUNTS, STRUCTS, SWEEPS, Options, Problem, Result, Verdict, functions
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from invalid_values import draw_examples
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 from vectors import ARRAYS, METHODS
@@ -285,7 +284,6 @@ REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_
 
 @pytest.mark.slow
 @pytest.mark.fuzz
-@draw_examples(150)
 @given(st.data())
 def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, data):
     problem, keep = Problem(), []
@@ -326,7 +324,6 @@ def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, da
     assert solver.is_intact()
 
 
-@settings(max_examples=40)
 @given(
     seed=seeds,
     method=st.sampled_from(sorted(METHODS)),

@@ -19,7 +19,6 @@ from invalid_values import (
     check_float32,
     check_malformed_arguments,
     check_memory_layouts,
-    draw_examples,
     public_calls,
 )
 from random_problems import random_contact_problem
@@ -494,7 +493,6 @@ def damaged_files(draw, folder):
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(150)
 @given(data=st.data())
 def test_a_damaged_file_is_rejected_by_its_path_or_holds_a_valid_problem(data, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()
@@ -568,7 +566,6 @@ def edits_of(names, values):
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(30)
 @given(
     cone=st.sampled_from(("elliptic", "pyramidal")),
     condim=st.sampled_from((1, 3, 4, 6)),

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import as_matrix, dragged, random_contact_problem, seeds, side_by_side, touching
 
@@ -78,7 +78,6 @@ def test_a_local_file_keeps_everything_to_the_bit(tmp_path, spacedim, suffix):
 
 
 @given(seeds, st.sampled_from([2, 3, 5]))
-@settings(max_examples=10)
 def test_a_global_file_keeps_the_matrices_to_the_bit_and_condenses_to_A(tmp_path_factory, seed, spacedim):
     problem = soft(global_problem(seed, min(spacedim - 1, 2), rolling=spacedim == 5))
     impulse = np.linspace(0.0, 1.0, problem.m)

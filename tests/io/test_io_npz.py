@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import (
     CONTACTS,
     FORMS,
@@ -86,7 +86,6 @@ def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
 
 
 @given(seeds)
-@settings(max_examples=2)
 def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("npz") / "p.npz"
     bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]

@@ -10,7 +10,6 @@ from invalid_values import (
     check_every_public_call,
     check_malformed_arguments,
     check_memory_layouts,
-    draw_examples,
     public_calls,
 )
 from random_families import wild
@@ -107,7 +106,6 @@ MEASURES = ("kinetic", "energy", "speed", "spin", "rows")
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(40)
 @given(data=problem_data(), exponent=st.integers(-1070, 1020))
 def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent):
     """A motion error is finite, or its `note` says why there is none."""
@@ -155,7 +153,6 @@ def slow_problems(draw):
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(40)
 @given(
     problem=slow_problems(),
     solver=st.sampled_from(lv.available(external=False, resumable=True)),

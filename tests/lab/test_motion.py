@@ -8,7 +8,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import (
     as_matrix,
     random_contact_problem,
@@ -26,7 +26,6 @@ def cone_problem(seed):
 
 @pytest.mark.parametrize("form", ["rows", "J and M"])
 @given(seed=seeds)
-@settings(max_examples=30)
 def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_difference(form, seed):
     p = random_contact_problem(seed, friction="cone") if form == "rows" else random_generalized_problem(seed)
     x = np.random.default_rng(seed).normal(size=p.m)

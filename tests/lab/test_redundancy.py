@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from kkt_truth import eliminate
 from random_problems import as_matrix, random_contact_problem, seeds, touching
 
@@ -94,7 +94,6 @@ def test_the_rank_of_a_matrix_is_that_of_exact_numbers_whatever_the_units_of_its
 
 
 @given(seed=seeds)
-@settings(max_examples=30)
 def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
     rng = np.random.default_rng(seed)
     m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
@@ -112,7 +111,6 @@ def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
 
 
 @given(seed=seeds)
-@settings(max_examples=30)
 def test_without_the_redundant_rows_the_rank_is_the_same(seed):
     problem = as_matrix(random_contact_problem(seed, tangents=0, spin=False, bodies=2, contacts=12))
     a = problem.dense()

@@ -17,7 +17,6 @@ from invalid_values import (
     check_every_public_call,
     check_malformed_arguments,
     check_memory_layouts,
-    draw_examples,
     public_calls,
 )
 from worked import after, python
@@ -311,7 +310,6 @@ def play(data, path, inspect=True):
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(60)
 @given(data=scenes())
 def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "drawn.state"
@@ -408,7 +406,6 @@ def changed_snapshot(data, edits, header_edits, damage):
 
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
-@draw_examples(60)
 @given(
     name=st.sampled_from(sorted(GALLERY)),
     how=HOW_SOLVED,

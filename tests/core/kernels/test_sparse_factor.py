@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lavender.base.lu import splu
@@ -74,7 +74,6 @@ def test_a_full_factor_solves_and_counts_what_is_lost(n):
     pairs=st.lists(st.tuples(st.integers(0, 59), st.integers(0, 59)), max_size=250),
     heavy=st.integers(1, 9),
 )
-@settings(max_examples=100)
 def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
     """`heavy`: rows of one pattern, which are one vertex of panels."""
     met = np.eye(n)
@@ -139,7 +138,6 @@ def test_columns_of_one_pattern_stand_beside_each_other():
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 150), block=st.integers(1, 6), lu=st.booleans())
-@settings(max_examples=80)
 def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
     rng = np.random.default_rng(seed)
     a = mirrored(rng, n, block, rng.choice([0.005, 0.03, 0.2]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import robot
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, tree_mass
 
 import lavender as lv
@@ -24,7 +24,6 @@ def dense_parts(p):
 
 
 @pytest.mark.parametrize("form", ["rows", "matrix", "generalized"])
-@settings(max_examples=10, deadline=None)
 @given(seed=seeds)
 def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
     p = (
@@ -54,7 +53,6 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
         np.testing.assert_allclose(got, UNIT_ROUNDOFF_FLOAT32**2 * want, rtol=1e-9, atol=1e-30)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_not(seed):
     p = random_lcp(seed)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import (
     ancestors,
@@ -44,7 +44,6 @@ def row_by_row(mass, x):
 
 
 @given(seeds)
-@settings(max_examples=100, deadline=None)
 def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 48 if seed % 5 else 160))
@@ -117,7 +116,6 @@ def test_no_velocities_no_rows_and_rows_on_nothing():
 # -- newton over velocities -------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(seed=seeds)
 @pytest.mark.parametrize("soft", [True, False])
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -207,7 +205,6 @@ def test_nothing_of_the_judge_forms_a(monkeypatch):
 
 @given(seed=seeds)
 @pytest.mark.parametrize("friction", ["coulomb", "cone", "lcp"])
-@settings(max_examples=15)
 def test_branches_are_factored_in_their_own_pattern(friction, seed):
     """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
@@ -234,7 +231,6 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
     ids=["bounded", "contacts", "spinning"],
 )
 @given(seed=seeds, compliance=st.sampled_from([0.0, 0.1]))
-@settings(max_examples=15)
 def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, compliance):
     """From any start: the judge's end, and the velocities of another solver."""
     rng = np.random.default_rng(seed)
@@ -298,7 +294,6 @@ def test_room_for_a_pattern_grows():
 
 @pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "nncg", "anderson"])
 @given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), spin=st.booleans(), few=st.booleans())
-@settings(max_examples=8)
 def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
     problem = random_generalized_problem(

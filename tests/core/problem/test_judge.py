@@ -5,7 +5,7 @@ import dataclasses
 import judge_twin
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from judge_twin import spec_of
 from kkt_truth import parts
@@ -62,7 +62,6 @@ def equals_the_twin(problem, lam):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", CONTACTS)
-@settings(max_examples=5)
 @given(seed=seeds)
 def test_the_judge_equals_its_twin_in_every_form(kind, friction, seed):
     base = CONTACTS[kind](seed, friction)
@@ -71,7 +70,6 @@ def test_the_judge_equals_its_twin_in_every_form(kind, friction, seed):
         equals_the_twin(given_by(base), lam)
 
 
-@settings(max_examples=20)
 @given(seed=seeds, tangents=st.integers(1, 5), soft=st.booleans())
 def test_the_judge_equals_its_twin_on_round_cones(seed, tangents, soft):
     problem = random_generalized_problem(seed, "cone", tangents=tangents, compliance=soft)
@@ -102,7 +100,6 @@ def test_the_floor_counts_what_long_rows_of_a_matrix_round(m, sign):
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
-@settings(max_examples=10)
 @given(seed=seeds)
 def test_the_floor_counts_what_bodies_round(friction, seed):
     problem = random_contact_problem(seed, friction, bodies=8, joints=4, contacts=20)
@@ -223,7 +220,6 @@ def test_natural_map_is_the_plain_formula(seed):
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", ["bounded rows", "normals", *CONTACTS])
 @given(seed=seeds)
-@settings(max_examples=15)
 def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
     """A y = 0, or not; y a tenth off the border of its cone to either side, or along normals alone."""
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
 
 import lavender as lv
@@ -15,7 +15,6 @@ from lavender.problem.ordering import (
 )
 
 
-@settings(max_examples=10)
 @given(seed=seeds)
 @pytest.mark.parametrize("order", SWEEP_ORDERS)
 def test_named_orders_are_permutations_with_joints_first(order, seed):

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from kkt_truth import OF_PROGRAM as NAMES
 from kkt_truth import of_program as kkt
@@ -127,7 +127,6 @@ def test_a_budget_is_that_of_one_solve_where_p_is_definite():
     "ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access"
 )
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
-@settings(max_examples=30)
 @given(seed=seeds)
 def test_x_and_multipliers_are_those_of_qpsolvers(backend, seed):
     qpsolvers = pytest.importorskip("qpsolvers")
@@ -437,7 +436,6 @@ BACKENDS = [name for name in lv.available(SINGULAR) if name != "auto"]
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-@settings(max_examples=40)
 @given(seed=seeds)
 def test_every_backend_solves_programs_with_a_singular_hessian(name, seed):
     qp = drawn(seed, singular=True)

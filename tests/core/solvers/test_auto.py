@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import FORMS, as_matrix, random_contact_problem, seeds, side_by_side
 
 import lavender as lv
@@ -11,7 +11,6 @@ from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_
 
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-@settings(max_examples=25)
 def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
     rolls = bool(seed % 2)
     problem = FORMS[form](

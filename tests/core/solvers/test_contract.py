@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from enumeration import enumerate_lcp, random_bounds
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import (
     make_problems_of_every_kind,
@@ -132,7 +132,6 @@ def test_unusual_problems_have_a_finite_result_or_are_refused(name):
 
 @pytest.mark.parametrize("name", OURS)
 @given(seed=seeds, m=st.integers(1, 6))
-@settings(max_examples=20)
 def test_claims_about_small_matrices_are_true(name, seed, m):
     rng = np.random.default_rng(seed)
     a = np.rint(2.0 * rng.normal(size=(m, m)))
@@ -163,7 +162,6 @@ def test_normal_without_inverse_mass_bears_friction_of_the_relaxed_law(name):
 @pytest.mark.parametrize("name", ["auto", "direct", "lemke", "newton"])
 @pytest.mark.parametrize("kind", ["definite", "semidefinite", "asymmetric"])
 @given(seed=seeds, m=st.integers(1, 7), whole=st.booleans())
-@settings(max_examples=20)
 def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m, whole):
     """`whole`: small whole numbers, so that w = 0 and lambda = 0 at once. A semidefinite A leaves w alone unique."""
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from calls import block_diagonal, dense_h, system_in
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import random_contact_problem, seeds
 
 from lavender.solvers.newton_systems.systems import make_system
@@ -20,7 +20,6 @@ def problem_of(seed, compliant, friction="coulomb"):
 
 
 @given(seed=seeds)
-@settings(max_examples=30)
 def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     system = make_system(problem_of(seed, True), "velocity")
     sc = solve = system.solve
@@ -51,7 +50,6 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 @pytest.mark.parametrize("compliant", [True, False])
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
 @given(seed=seeds)
-@settings(max_examples=8)
 def test_the_system_of_a_step_is_solved(form, compliant, seed):
     problem = problem_of(seed, compliant)
     system = system_in(problem, "velocity" if form == "augmented" else form)

@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
@@ -157,7 +157,6 @@ def test_singular_linear_systems_say_their_rank(m):
     ("kind", "solver"), [("symmetric", "direct"), ("symmetric", "newton"), ("asymmetric", "direct")]
 )
 @given(seed=seeds, m=st.integers(2, 12))
-@settings(max_examples=15)
 def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, solver, seed, m):
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, m - 1))
@@ -172,7 +171,6 @@ def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, sol
 
 @pytest.mark.parametrize("solver", ["direct", "lemke", "newton", "auto"])
 @given(seed=seeds, m=st.integers(2, 14))
-@settings(max_examples=15)
 def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
     problem = without_solution(seed, m)
     left = np.abs(np.linalg.svd(problem.dense())[0][:, -1])

@@ -2,7 +2,7 @@
 
 import pytest
 from calls import REACHED, driven
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, seeds
 
@@ -16,7 +16,6 @@ def forms(problem):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @given(seed=seeds, rolling=st.booleans())
-@settings(max_examples=20)
 def test_contacts_are_solved_as_newton_solves_them(friction, seed, rolling):
     base = random_contact_problem(seed, friction, rolling=rolling, bodies=5, contacts=6, joints=2)
     for problem in forms(base):

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from ball_pile import Pile
 from calls import block_diagonal, dense_h, system_in
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
 from worked import python
@@ -46,7 +46,6 @@ def test_rows_that_outnumber_velocities_take_an_interior_point_no_longer(seed, f
 @pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
 @pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(
         seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10
@@ -110,7 +109,6 @@ def test_a_path_begins_where_a_tower_carries_more_than_its_right_hand_side_says(
 
 @pytest.mark.parametrize("spins", [False, True])
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
     """J and M of bodies, as engines give them: H of the system over bodies is D^-1/2 A D^-1/2."""
     p = random_contact_problem(seed, bodies=8, joints=3, contacts=25, tangents=2, spin=spins)
@@ -130,7 +128,6 @@ def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
 
 
 @given(seed=seeds)
-@settings(max_examples=10)
 def test_no_bodies_are_told_where_three_meet(seed):
     rng = np.random.default_rng(seed)
     jac = np.zeros((3, 18))
@@ -151,7 +148,6 @@ def test_a_compliance_costs_interior_points_no_more_steps(compliance):
 
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
 @given(seed=seeds)
-@settings(max_examples=20)
 def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_judges_errors(form, seed):
     problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
     system = system_in(problem, form)
@@ -306,7 +302,6 @@ def sparse_rows(seed, m=500, even=True, near=3):
 
 @pytest.mark.parametrize("even", [True, False])
 @given(seed=seeds)
-@settings(max_examples=5)
 def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     problem = sparse_rows(seed, 200, even)
     system = system_in(problem, "sparse")
@@ -352,7 +347,6 @@ def test_ctrl_c_within_the_fallback_is_reported_and_no_other_error(monkeypatch):
 
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-@settings(max_examples=4)
 def test_where_nothing_rubs_the_law_has_no_slip_and_no_rounds(form, seed):
     """mu = 0, rows that depend on each other: under either law the same convex problem."""
     p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
@@ -393,7 +387,6 @@ def test_cones_without_a_solution_are_proven_to_have_none(form, kind):
 
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-@settings(max_examples=4)
 def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
     """b = A lambda - w with lambda in the cone and w in its dual: for w.y >= 0 = lambda.A y no y proves anything."""
     p, rng = pinched(seed, "rows", tangents=2, spin=False), np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import SHORT, check
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import (
     as_matrix,
@@ -80,7 +80,6 @@ KINDS = (
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6, 1e-9, 1e-13, 0.9]))
-@settings(max_examples=8)
 def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
     problem = draw(kind, seed)
     for solver in SHORT:

@@ -3,7 +3,7 @@
 import judge_twin
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds, sweeps
 
 import lavender as lv
@@ -12,7 +12,6 @@ from lavender_ext.sweep import serial
 
 
 @pytest.mark.parametrize("kind", CONTACTS)
-@settings(max_examples=8)
 @given(seed=seeds)
 def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
     problem = CONTACTS[kind](seed)
@@ -29,7 +28,6 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
 
 
 @pytest.mark.parametrize("order", SWEEP_ORDERS)
-@settings(max_examples=8)
 @given(seed=seeds)
 def test_sequential_impulses_equal_pgs_on_every_order(order, seed):
     """Twenty sweeps: where strong friction makes the sweeps chaotic, roundings grow tenfold in five."""

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from calls import dense_h, system_in
-from hypothesis import given, settings
+from hypothesis import given
 from random_families import wild
 from random_problems import as_matrix, good, seeds
 
@@ -64,7 +64,6 @@ def test_a_looser_tolerance_costs_no_more():
 
 
 @given(seed=seeds)
-@settings(max_examples=20)
 def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
     problem = suite.stack(n=9, mass_ratio=5.0).problem
     z = np.random.default_rng(seed).normal(size=problem.m)

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from worked import after
 
@@ -50,7 +50,6 @@ def separation(a, b):
 box_numbers = st.tuples(*[st.floats(-1, 1)] * 10, *[st.floats(0.2, 1.5)] * 6)
 
 
-@settings(max_examples=100)
 @given(numbers=box_numbers)
 def test_box_box_agrees_with_the_slow_twin(numbers):
     x = np.array(numbers)
@@ -174,7 +173,6 @@ def overlapping(sim):
     return out
 
 
-@settings(max_examples=12)
 @given(
     seed=st.integers(0, 10_000),
     n=st.sampled_from([5, 40, 120]),
