@@ -54,8 +54,9 @@ def check(
     each answer from it is printed. A solution stored in a file is judged, too: it is at the floor of its precision,
     close enough (--threshold), or its solver stopped early.
 
-    Exit code 1: a claim is contradicted; none of the solvers accepts a problem; a file in a folder cannot be read; or,
-    with --precision or --threshold, a stored solution is neither at its floor nor close enough.
+    Exit code 1: a claim is contradicted; a solver named by --solvers, or without this option every solver, does not
+    solve a problem; none of the solvers accepts a problem; a file in a folder cannot be read; or, with --precision or
+    --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
     from lavender.base.arrays import check_float
@@ -70,7 +71,7 @@ def check(
             raise InputError(
                 f"{name} holds records; only problems can be checked. `lavender report {name}` shows them again"
             )
-    contradicted = unaccepted = solutions = above = unmet = 0
+    contradicted = unsolved = unaccepted = solutions = above = unmet = 0
     errors = ErrorReporter(partial(print_escaped, style="yellow"))
     judges_stored = precision is not None or is_option_set(context, "threshold")
     bench.select_solver_names([*(solvers or ()), reference])
@@ -94,8 +95,12 @@ def check(
                 print_escaped(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
+            if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):
+                unsolved += len(comparison.unsolved)
     if contradicted:
         print_escaped(f"{contradicted} claims are contradicted", style="bold red")
+    if unsolved:
+        print_escaped(f"{unsolved} of the solves did not solve their problem", style="bold red")
     if unaccepted:
         print_escaped(f"{unaccepted} problems are not accepted by any of these solvers", style="bold red")
     if judges_stored and not solutions:
@@ -106,7 +111,7 @@ def check(
     if solutions:
         shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
         print_escaped(f"stored solutions: {shares}")
-    errors.exit(contradicted or unaccepted or (judges_stored and unmet))
+    errors.exit(contradicted or unsolved or unaccepted or (judges_stored and unmet))
 
 
 def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:

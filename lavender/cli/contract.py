@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from lavender.cli.exits import EXIT_UNMET
 from lavender.cli.options import limit_to_one_thread, print_escaped
 
 
@@ -44,4 +45,4 @@ def contract(context: click.Context, name: str, list_only: bool) -> None:
     if skipped:
         print_escaped(f"not required, because the spec does not list the capability: {', '.join(skipped)}")
     if unmet:
-        context.exit(1)
+        context.exit(EXIT_UNMET)

@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import click
 
+from lavender.cli.exits import EXIT_UNMET
 from lavender.cli.options import ErrorReporter, print_escaped
 
 
@@ -43,7 +44,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
         for name, result in wrong.items():
             click.echo(f"{'':<14}{name}: {result}")
     if not results["same_bits"]:
-        raise click.exceptions.Exit(1)
+        raise click.exceptions.Exit(EXIT_UNMET)
 
 
 def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:

@@ -17,12 +17,8 @@ import click
 
 from lavender._version import __version__
 from lavender.base.errors import InputError, LavenderError, UnknownName
-from lavender.cli.options import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERRUPTED,
-    discard_output,
-    print_escaped,
-)
+from lavender.cli.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
+from lavender.cli.options import discard_output, print_escaped
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
@@ -129,7 +125,7 @@ def main(args: Sequence[str] | None = None) -> None:
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
     if code == EXIT_INTERRUPTED and signal.SIGTERM in received:
-        code = 128 + signal.SIGTERM
+        code = EXIT_TERMINATED
     raise SystemExit(code)
 
 

@@ -1,4 +1,4 @@
-"""Common parts of the commands: option types, options of a plan, console output, exit codes."""
+"""Common parts of the commands: option types, options of a plan, console output."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from lavender.base.errors import InputError, LavenderError
+from lavender.cli.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNMET
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
 else:
     _ParamType = click.ParamType
 
-EXIT_UNMET = 1  # The problem is not solved, a check failed, or a file in a folder cannot be read.
-EXIT_BAD_INPUT = 2  # An argument is invalid, or another process writes to the output folder.
-EXIT_INFEASIBLE = 3  # The problem is infeasible, with a certificate that the judge confirms.
-EXIT_INTERRUPTED = 130
 MIN_TERMINAL_WIDTH = 60  # [columns] Tables are formatted for at least this width.
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)

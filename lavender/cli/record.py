@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from lavender.cli.exits import EXIT_UNMET
 from lavender.cli.options import (
     FILE,
     FOLDER,
@@ -32,8 +33,13 @@ def record(
     """Simulate a MuJoCo model and write its constraint problems.
 
     MODEL.xml is an MJCF file. `lavender report OUT` measures solvers on the problems.
+
+    Exit code 1: a step could not be recorded.
     """
     from lavender.io.recording import record_file
 
     reject_unused_recording_options(context, True)
-    print_escaped(str(record_file(model, out, steps, precision=precision or "float64", **options)))
+    recorded = record_file(model, out, steps, precision=precision or "float64", **options)
+    print_escaped(str(recorded))
+    if recorded.left_out:
+        raise click.exceptions.Exit(EXIT_UNMET)

@@ -13,10 +13,9 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
+from lavender.cli.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.measuring import Measured, is_campaign, measure_files
 from lavender.cli.options import (
-    EXIT_INTERRUPTED,
-    EXIT_UNMET,
     PATH,
     RECORDING_NAMES,
     ListType,

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
+from lavender.cli.exits import EXIT_UNMET
 from lavender.cli.options import (
     PATH,
     continue_after_closed_output,
@@ -87,7 +88,7 @@ def run(
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner, newtons_cradle or
     four_bar.
 
-    Exit code 130: stopped by Ctrl-C; the files contain the completed steps.
+    Exit code 1: the run diverged. Exit code 130: stopped by Ctrl-C; the files contain the completed steps.
     """
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
@@ -161,6 +162,8 @@ def run(
     )
     if result.stopped:
         exit_after_interrupt()
+    if result.lost_body:
+        raise click.exceptions.Exit(EXIT_UNMET)
 
 
 def _collect_parameters(

@@ -8,14 +8,8 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import (
-    EXIT_INFEASIBLE,
-    EXIT_INTERRUPTED,
-    EXIT_UNMET,
-    PATH,
-    limit_to_one_thread,
-    print_escaped,
-)
+from lavender.cli.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
 from lavender.io.stored import check_writable, write_atomically
 
 #: Fields of the residual that --output writes.
@@ -55,12 +49,12 @@ def solve(
     """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
-    at the floor of float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is infeasible, with a
-    certificate that the judge confirms.
+    at the floor of float64; with --tol 0 always). 1: the judge rejects it, or the solver crashed. 3: the problem is
+    infeasible, with a certificate that the judge confirms.
     """
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
-    from lavender.lab.bench.running.worker import Worker, solve_isolated
+    from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 
     limit_to_one_thread()
     if output is not None:
@@ -72,10 +66,14 @@ def solve(
         raise InputError(f"--output {output} would overwrite the problem: give another file")
     given = ("order", order), ("seed", seed), ("velocity_tol", velocity_tol)
     options: dict[str, Any] = {name: value for name, value in given if value is not None}
-    with Worker() as worker:
-        solution = solve_isolated(
-            worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
-        )
+    try:
+        with Worker() as worker:
+            solution = solve_isolated(
+                worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
+            )
+    except TaskFailed as error:  # The solver ended its process, or was ended after its time limit.
+        print_escaped(f"lavender: {error}", err=True)
+        raise click.exceptions.Exit(EXIT_UNMET) from None
     if output is not None:
         import numpy as np
 

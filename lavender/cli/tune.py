@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from lavender.cli.exits import EXIT_UNMET
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output
@@ -41,7 +42,8 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     errors do not exceed E on all worlds, or the one with the smallest error if there is none. No line is printed if
     fewer than 20 % of the steps have contact: then start from states with contact (--states).
 
-    Exit code 130: stopped by Ctrl-C; the page shows the completed part.
+    Exit code 1: too few steps have contact, or no setting is within --max-velocity-error. Exit code 130: stopped by
+    Ctrl-C; the page shows the completed part.
     """
     from lavender.lab.tune import tune as run
 
@@ -50,3 +52,5 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     with show_progress() as watch:
         tuning = run(model, watch=watch, **options)
     show_page(tuning.summary_page, out)
+    if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
+        raise click.exceptions.Exit(EXIT_UNMET)

@@ -154,6 +154,11 @@ class CrossCheck:
         return tuple(row for row in self.rows if row.verdict == AGREES)
 
     @property
+    def unsolved(self) -> tuple[CrossCheckRow, ...]:
+        """Rows of solvers that do not solve the problem, or claim without proof that it has no solution."""
+        return tuple(row for row in self.rows if row.verdict in (NOT_SOLVED, UNPROVED))
+
+    @property
     def refused(self) -> tuple[CrossCheckRow, ...]:
         """Rows of solvers that do not accept the problem; their notes give the reason."""
         return tuple(row for row in self.rows if row.verdict == REFUSED)

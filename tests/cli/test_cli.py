@@ -37,14 +37,14 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
 
 def test_check_ends_each_solver_at_its_time_limit(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "pgs", "newton", "--time-limit", "1e-9")
-    assert code == 0
+    assert code == cli.EXIT_UNMET and "2 of the solves did not solve their problem" in out
     assert out.count("TIME_LIMIT") == 2
 
 
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
     assert code == cli.EXIT_UNMET and "1 problems are not accepted by any of these solvers" in out
-    assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
+    assert lavender("check", "granularF(n=3)", "--solvers", "sor", "newton")[0] == 0
 
 
 def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in):

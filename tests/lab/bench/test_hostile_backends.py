@@ -279,7 +279,10 @@ def test_a_command_survives_what_ends_its_process(hostile, tmp_path, capsys):
     stack(4).save(tmp_path / "stack.npz")
     with pytest.raises(SystemExit) as end:
         cli.main(["solve", str(tmp_path / "stack.npz"), "--solver", "x_leave"])
-    assert end.value.code == cli.EXIT_BAD_INPUT and "CRASHED (exit status 3)" in capsys.readouterr().err
+    assert end.value.code == cli.EXIT_UNMET and "CRASHED (exit status 3)" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        cli.main(["check", str(tmp_path / "stack.npz"), "--solvers", "x_leave,pgs"])
+    assert end.value.code == cli.EXIT_UNMET and "CRASHED (exit status 3)" in capsys.readouterr().out
 
 
 def test_memory_is_limited_without_asking(hostile, watchdog):
