@@ -88,9 +88,14 @@ else:
         COMPILE_ARGS += [*sanitizers, "-fno-omit-frame-pointer"]
 
 
+def is_part_of_cython(path):
+    """Return whether a file belongs to Cython. Such files depend on its version only; pip installs them anew each time."""
+    return Path(path).is_relative_to(Path(Cython.__file__).parent)
+
+
 def changed_at(_, path):
-    """Return the time stamp of a source, 0 for Cython's own files, which depend on its version only."""
-    return 0.0 if Path(path).is_relative_to(Path(Cython.__file__).parent) else os.path.getmtime(path)
+    """Return the time stamp of a source, 0 for Cython's own files."""
+    return 0.0 if is_part_of_cython(path) else os.path.getmtime(path)
 
 
 DependencyTree.timestamp = changed_at
@@ -100,9 +105,17 @@ class BuildKernels(build_ext):
     """Translate .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
 
     def finalize_options(self):
-        """Add the extensions of the kernel benchmarks to builds in place; wheels do not contain them."""
+        """Add the extensions of the kernel benchmarks to builds in place; wheels do not contain them.
+
+        An editable install compiles in the folders of `build_ext --inplace`, not in temporary folders, in which every
+        later `pip install -e` would compile all kernels again.
+        """
         if self.inplace or self.editable_mode:
             self.distribution.ext_modules += map(extension, sorted(Path("benchmarks").rglob("*.pyx")))
+        if self.editable_mode:
+            folders = build(self.distribution)
+            folders.ensure_finalized()
+            self.build_lib, self.build_temp = folders.build_lib, folders.build_temp
         super().finalize_options()
 
     def run(self):
@@ -149,7 +162,7 @@ class BuildKernels(build_ext):
         gc.enable()
         for module, c_module in zip(self.extensions, translated, strict=True):
             module.sources = c_module.sources
-            module.depends = c_module.depends
+            module.depends = [path for path in c_module.depends if not is_part_of_cython(path)]
         # Compile the largest modules first: a long one that starts last would delay the end of the build.
         self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers
