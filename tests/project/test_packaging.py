@@ -316,3 +316,24 @@ def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_modul
     subprocess.run(command, check=True, cwd=ROOT)
     assert (shipped / "lavender.wasm").read_bytes() == module
     assert (shipped / "newton.wasm").read_bytes() == newton_module
+
+
+def test_editable_install_compiles_in_the_folders_of_a_build_in_place(monkeypatch):
+    """pip gives an editable install temporary folders, in which each later install would compile every kernel again."""
+    pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
+    code = """
+import setuptools
+from distutils.core import run_setup
+commands = []
+for mode in ("inplace", "editable_mode"):
+    distribution = run_setup("setup.py", stop_after="init")
+    if mode == "editable_mode":
+        build = distribution.get_command_obj("build")
+        build.build_lib = build.build_platlib = build.build_temp = "temporary"
+    command = distribution.get_command_obj("build_ext")
+    setattr(command, mode, True)
+    command.ensure_finalized()
+    commands.append((command.build_lib, command.build_temp))
+assert commands[0] == commands[1] and "temporary" not in commands[1], commands
+"""
+    python("-c", code)
