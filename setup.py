@@ -89,7 +89,7 @@ else:
 
 
 def is_part_of_cython(path):
-    """Return whether a file belongs to Cython. Such files depend on its version only, and pip often installs them anew."""
+    """Return whether a file belongs to Cython. These depend on its version only; pip installs them anew each time."""
     return Path(path).is_relative_to(Path(Cython.__file__).parent)
 
 
