@@ -5,8 +5,8 @@
 
 On a linear problem this is a truncated GMRES with the sweep as preconditioner. It needs neither a symmetric A nor an
 energy, so it also accelerates friction. A step that doubles |f| is undone, and the memory is cleared. Sweeps under
-Coulomb's law alone do not converge on large piles. From 900 rows on, sweeps 17 to 512 are therefore under the cone law,
-unless a test shows that contacts slip (`lavender_ext/accelerate/accelerated.pyx`, (4) and (5)).
+Coulomb's law alone do not converge on large piles. From 900 rows on, the first 512 sweeps are therefore under the cone
+law, unless a test shows that contacts slip (`lavender_ext/accelerate/accelerated.pyx`, (4) and (5)).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SPEC = SolverSpec(
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,
-        "convex": CONVEX_OPTION + "; default None: sweeps 17 to 512 from 900 rows on, unless contacts slip",
+        "convex": CONVEX_OPTION + "; default None: from 900 rows on up to 512, until contacts slip",
         "memory": "number of sweeps that are combined, from 1 to 16; default 5",
     },
     summary="Anderson acceleration of Gauss-Seidel sweeps",

@@ -3,13 +3,18 @@
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
                      is estimated to cost no more than the first sweeps (`small.py`); attempted once
-    relaxation       under Coulomb's law, above `relaxed_rows` rows: `anderson` on the convex relaxation up to the cost
-                     of Newton's method, or `sweep_fraction` of it if more sweeps are predicted to be needed; then the
-                     interior points of `newton` on it. Each iterate is judged under Coulomb's law, which it meets if
-                     no contact slips. The stage ends early if contacts slip: the residual of the relaxation is below
-                     `slip_ratio` times that of Coulomb's law. Only islands that are not solved continue
-    sweeps           `anderson`, unless the problem is linear: `first_sweeps` sweeps. Sweeping continues up to the cost
-                     of the cheapest factorising solver, unless more sweeps than that are predicted to be needed
+    large problems   under Coulomb's law, from `relaxed_rows` rows on, four stages come first. They solve the convex
+                     relaxation, which has the same solution if no contact slips, and judge each iterate under Coulomb's
+                     law. After each stage, only the islands that it has not solved continue
+                     1. `anderson`, which sweeps under the cone law until contacts slip, while it predicts fewer sweeps
+                        than the lower bound of the cost of Newton's method pays for
+                     2. more sweeps, after an analysis of Newton's matrix: at least `sweep_fraction` of its cost, then
+                        unless more sweeps are predicted than its cost pays for
+                     3. `admm` from zero, up to a quarter of that cost, if this pays for 100 iterations
+                     4. the interior points of `newton` on the relaxation, until their residual of the relaxation is
+                        below `slip_ratio` times that of Coulomb's law: contacts slip
+    sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
+                     the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
                      cheapest first, each up to `budget_ratio` times its estimated cost
     certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
@@ -70,10 +75,10 @@ from lavender.solvers.steps import (
     Iterations,
     Newton,
     RelaxedNewton,
-    RelaxedSweeps,
     Step,
     Sweeps,
     estimate_cost,
+    starts_relaxed,
 )
 from lavender_ext.judge.measure import residuals_by_island
 
@@ -82,7 +87,9 @@ __doc__ += describe_numbers() + "\n"
 
 # Newton's method on the relaxation may use this multiple of its expected number of factorisations.
 RELAXED_BUDGET_RATIO = 2.0
-MAX_RELAXED_STAGES = 3
+# On large problems with friction, `admm` may cost this fraction of Newton's method before that runs, if this pays for
+# at least so many iterations. Without a factor, an iteration costs about as much as three sweeps.
+ADMM_FRACTION, MIN_ADMM_ITERATIONS, SWEEPS_PER_ADMM_ITERATION = 0.25, 100.0, 3.0
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
@@ -107,6 +114,8 @@ class Stage:
         Reason, for `lavender.explain`.
     least : float
         Sweeps stop if they predict that more than this number of sweeps is still needed.
+    position : int
+        Position among the stages after which only islands that are not solved continue; 0 for other stages.
     """
 
     solver: str
@@ -114,6 +123,7 @@ class Stage:
     cost: float
     why: str
     least: float = inf
+    position: int = 0
 
 
 class DecisionTree:
@@ -127,7 +137,7 @@ class DecisionTree:
     compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
     started_from_zero = False  # Whether the compiled call started from the zero impulse.
     sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
-    relaxed_stages = 0  # Number of stages on the relaxation that have run.
+    first_stage = 1  # Position of the first stage; earlier ones have run on a problem with more islands.
     best = nan
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -137,6 +147,11 @@ class DecisionTree:
     def sweep(self) -> float:
         """Cost of one sweep [ns]."""
         return estimate_cost("anderson", self.problem).iteration
+
+    @cached_property
+    def relaxed_sweep(self) -> float:
+        """Cost of one sweep over the convex relaxation [ns]."""
+        return estimate_cost("anderson", get_relaxation(self.problem)).iteration
 
     @cached_property
     def min_newton_cost(self) -> float:
@@ -263,33 +278,26 @@ class DecisionTree:
             return False
         return self.min_newton_cost < first and self.newton < first
 
-    @cached_property
-    def starts_relaxed(self) -> bool:
-        """Whether the convex relaxation is solved first: under Coulomb's law, if the problem is large."""
-        p = self.problem
-        large = self.law == "coulomb" and p.m > DECISIONS.relaxed_rows
-        return large and not p.cones.has_round and p.is_symmetric
-
     def iterate_relaxed_stages(self) -> Iterator[Stage]:
-        """Yield the stages on the convex relaxation, if it is solved first."""
-        if not self.starts_relaxed:
+        """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
+        if self.first_stage <= 1:
+            least = self.min_newton_cost
+            yield Stage(
+                "anderson", inf, least, "before any analysis", least=least / self.relaxed_sweep, position=1
+            )
+        if "newton" not in self.states:
             return
-        sweep, why = (
-            estimate_cost("anderson", get_relaxation(self.problem)).iteration,
-            "exact if no contact slips",
-        )
-        name, least = "anderson on the relaxation", self.min_newton_cost
-        stages = [Stage(name, inf, least, why, least / sweep)]
-        yield from stages[self.relaxed_stages :]  # Before any analysis.
-        state = self.states.get("newton")
-        if state is None:
-            return
-        steps = RELAXED_BUDGET_RATIO * state.steps
-        stages += [
-            Stage(name, inf, state.cost, why, state.cost / sweep),
-            Stage("newton on the relaxation", steps, state.cost, why),
-        ]
-        yield from stages[max(1, self.relaxed_stages) :]
+        state = self.states["newton"]
+        if self.first_stage <= 2:
+            why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
+            yield Stage("anderson", inf, state.cost, why, least=state.cost / self.relaxed_sweep, position=2)
+        cost = ADMM_FRACTION * state.cost
+        n = cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep)
+        if self.first_stage <= 3 and n >= MIN_ADMM_ITERATIONS:
+            yield Stage("admm from zero", n, cost, f"{ADMM_FRACTION:g} times newton's cost", position=3)
+        if self.first_stage <= 4:
+            n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
+            yield Stage("newton on the relaxation", n, state.cost, why, position=4)
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
@@ -297,6 +305,9 @@ class DecisionTree:
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
         first = DECISIONS.first_sweeps * self.sweep
+        relaxed = starts_relaxed(p)
+        if relaxed:
+            yield from self.iterate_relaxed_stages()
         max_cost = self.min_newton_cost if self.law == "linear" else first
         pivots_first = self.factorises_first and self.can_pivot and self.direct < max_cost
         if pivots_first:
@@ -304,7 +315,7 @@ class DecisionTree:
             yield Stage(
                 "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
             )
-        elif not self.factorises_first:
+        elif not (relaxed or self.factorises_first):
             yield self.sweeps(first, "the first sweeps, before any analysis")
         self.analyse_row_form_if_cheaper(ratio * self.newton if self.compiled_call_failed else self.newton)
         if not self.factorises_first and first < self.newton < inf:
@@ -406,14 +417,14 @@ class AutoState:
         Counts of a compiled call that has failed; None if it has not been made.
     loop : Loop or None
         Loop of the solve, if it records a history.
-    relaxed_stages : int
-        Number of stages on the convex relaxation that have run.
+    first_stage : int
+        Position of the first stage that has not run on a problem with more islands (`Stage.position`).
     """
 
     problem: Problem
     failed_call: tuple[int, ...] | None = None
     loop: Loop | None = None
-    relaxed_stages: int = 0
+    first_stage: int = 1
 
 
 @dataclass(frozen=True)
@@ -475,7 +486,7 @@ class Auto(Solver):
             impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = DecisionTree(problem, deadline)
-        tree.relaxed_stages = state.relaxed_stages
+        tree.first_stage = state.first_stage
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
         log = SolveLog(problem, tol, max_iter, deadline)
@@ -550,8 +561,6 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
-    if solve_relaxation(log, tree):
-        return
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         Sweeps("anderson", log).sweep_until_deadline()
@@ -582,6 +591,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                 ):
                     step.sweep_until_deadline()
                     return
+            elif isinstance(step, RelaxedNewton):
+                step.over = step.late = not tree.has_time("newton", stage.cost)
             elif step.name == "direct" or isinstance(step, Newton):
                 step.over = step.late = not tree.has_time(
                     METHODS[stage.solver][0], tree.get_stage_cost(stage)
@@ -589,13 +600,15 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             elif step.state is None:
                 setup = estimate_cost(stage.solver, log.problem).setup
                 step.over = log.deadline.has_passed(1e-9 * setup / DECISIONS.time_share)
-        is_hopeless = isinstance(step, Sweeps) and step.predicted > stage.least
+        is_hopeless = isinstance(step, Sweeps) and step.is_hopeless(stage.least)
         if step.over or is_hopeless:
             tree.remaining_cost += stage.cost
         else:
             step.least = stage.least
             step.run(stage.iterations)
             tree.best = log.best
+        if stage.position and not log.done() and solve_unsolved_islands(log, stage.position + 1):
+            return
     if (
         log.best > log.tol
         and log.certificate is None
@@ -604,35 +617,10 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         certify_infeasibility(log)
 
 
-def solve_relaxation(log: SolveLog, tree: DecisionTree) -> bool:
-    """Run the stages on the convex relaxation until one solves the problem or shows that contacts slip.
-
-    Return whether the solve has ended: the problem is solved, or the islands that a stage has not solved have been
-    solved as a problem of their own.
-    """
-    steps: dict[str, Step] = {}
-    for stage in tree.iterate_relaxed_stages():
-        if stage.solver not in steps:
-            steps[stage.solver] = create_solver_step(stage.solver, log, tree)
-        step = steps[stage.solver]
-        if isinstance(step, RelaxedNewton) and not tree.has_time("newton", stage.cost):
-            break
-        if not step.over:
-            step.least = stage.least
-            step.run(stage.iterations)
-        tree.best = log.best
-        tree.relaxed_stages = MAX_RELAXED_STAGES if step.slips else tree.relaxed_stages + 1
-        if log.done() or solve_unsolved_islands(log, tree.relaxed_stages):
-            return True
-        if step.slips:
-            break
-    return False
-
-
-def solve_unsolved_islands(log: SolveLog, relaxed_stages: int) -> bool:
+def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
     """Solve the islands that are not solved as a problem of their own, and return whether there are other islands.
 
-    `relaxed_stages` is the number of stages on the convex relaxation that have run.
+    `first_stage` is the position of the first stage that has not run.
     """
     problem = log.problem
     island_of_block, table = residuals_by_island(problem.metric, log.result)
@@ -641,7 +629,7 @@ def solve_unsolved_islands(log: SolveLog, relaxed_stages: int) -> bool:
         return False
     blocks = np.flatnonzero(unsolved[island_of_block]).astype(np.int32)
     rows = get_rows_of_blocks(problem, blocks)
-    state = AutoState(restrict_to_blocks(problem, blocks, rows), relaxed_stages=relaxed_stages)
+    state = AutoState(restrict_to_blocks(problem, blocks, rows), first_stage=first_stage)
     impulse, result = log.result[rows], log.result.copy()
     claim = Auto()._run(state, impulse, log.remaining_iterations, log.tol, log.time_left)
     result[rows] = impulse
@@ -664,7 +652,7 @@ def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
     kinds = {
         "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
-        "anderson on the relaxation": RelaxedSweeps, "newton on the relaxation": RelaxedNewton,
+        "newton on the relaxation": RelaxedNewton,
     }  # fmt: skip
     step = kinds.get(name, Iterations)(name, log)
     if isinstance(step, RelaxedNewton):

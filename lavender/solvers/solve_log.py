@@ -63,9 +63,8 @@ class SolveLog:
         )
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
-        # Start (m,) [N s] of sweeps, if it is not `impulse`: a given start that is worse than the zero impulse, or the
-        # last iterate of the convex relaxation.
-        self.sweep_start: FloatArray | None = None
+        # Given start (m,) [N s], if it is worse than the zero impulse.
+        self.bad_start: FloatArray | None = None
         self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
@@ -81,7 +80,7 @@ class SolveLog:
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
         self.judge_and_store_best(start, is_start=True)
         if self.best > 1.0:
-            self.sweep_start = start.copy() if self.best < MAX_START_RESIDUAL else None
+            self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
             self.judge_and_store_best(
                 self.problem._start, is_start=True
             )  # The relative residual of the zero impulse is 1.
@@ -105,22 +104,15 @@ class SolveLog:
             starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
             self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
 
-    def compare_with_relaxation(self, impulse: FloatArray) -> tuple[float, float]:
-        """Compare the residuals of an impulse (m,) [N s] on the convex relaxation and on Coulomb's law.
+    def compare_with_relaxation(self, impulse: FloatArray) -> float:
+        """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.
 
-        Returns
-        -------
-        ratio : float
-            Residual of the relaxation divided by that of Coulomb's law, the largest of all islands that are not
-            solved; 0 if all are solved.
-        unsolved : float
-            Fraction of the blocks that belong to these islands.
+        The ratio is the largest of all islands that are not solved; 0 if all are solved.
         """
-        island_of_block, exact = residuals_by_island(self.problem.metric, impulse)
-        relaxed = residuals_by_island(get_relaxation(self.problem).metric, impulse)[1]
+        problems = self.problem, get_relaxation(self.problem)
+        exact, relaxed = (residuals_by_island(p.metric, impulse)[1] for p in problems)
         unsolved = exact[:, 0] > self.tol
-        ratio = float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
-        return ratio, float(unsolved[island_of_block].mean())
+        return float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
 
     def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""

@@ -20,31 +20,40 @@ from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
 from lavender.solvers.registry import get
 from lavender.solvers.solve_log import SolveLog, get_relaxation
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import all_finite, residuals_by_island
 
-__all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "estimate_cost", "make_solver"]
+__all__ = [
+    "METHODS",
+    "Iterations",
+    "Newton",
+    "RelaxedNewton",
+    "Step",
+    "Sweeps",
+    "estimate_cost",
+    "make_solver",
+    "starts_relaxed",
+]
 
 NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 #: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    "anderson": ("anderson", {"convex": 0}),
+    "anderson": ("anderson", {}),
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
     "nncg": ("nncg", NNCG_OPTIONS),
     "admm": ("admm", {}),
-    "anderson on the relaxation": ("anderson", {"convex": MAX_CALL_ITERATIONS}),
+    # On large piles, `admm` needs fewer iterations from zero than from an iterate of sweeps.
+    "admm from zero": ("admm", {}),
     "newton on the relaxation": ("newton", {}),
 }
 # Predictions of remaining sweeps replace a smaller tol by this relative residual.
 MIN_PREDICTED_RESIDUAL = 1e-16
 # [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
 ITERATION_TIME_PER_COST = 4e-9
-# Sweeps over the relaxation before the first prediction of how many remain.
-FIRST_RELAXED_SWEEPS = 8
-# Sweeps over the relaxation have solved it if its residual is below this multiple of that of Coulomb's law.
-SOLVED_RATIO = 1e-3
+# Sweeps over large problems with friction before the first prediction of how many remain.
+FIRST_SWEEPS_OF_LARGE_PROBLEM = 8
 # Interior points on the relaxation need at least this number of factorisations.
 FIRST_RELAXED_FACTORISATIONS = 6
 # Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
@@ -70,6 +79,12 @@ def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
     """Estimate the costs of the solver of a step."""
     cost: Cost = make_solver(name, problem).cost(problem, state)
     return cost
+
+
+def starts_relaxed(problem: Problem) -> bool:
+    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large."""
+    large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
+    return large and not problem.cones.has_round and problem.is_symmetric
 
 
 class Step:
@@ -183,8 +198,9 @@ class Iterations(Step):
         return claim
 
     def prepare_and_set_start(self) -> None:
-        """Prepare the solver and start from the best impulse of the log."""
-        self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
+        """Prepare the solver and start from the best impulse of the log, or from zero."""
+        start = self.log.problem._start if self.name == "admm from zero" else self.log.impulse
+        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
 
     def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n iterations."""
@@ -198,9 +214,13 @@ class Sweeps(Iterations):
     """
 
     time_fraction = DECISIONS.time_share
-    first_sweeps = DECISIONS.first_sweeps
-    growth = 0.5  # Between two predictions, the number of sweeps grows by this fraction.
     predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
+    n_islands = 0  # Number of islands; 0 if it is not known.
+
+    @property
+    def is_large(self) -> bool:
+        """Whether `auto` solves the convex relaxation of the problem first."""
+        return starts_relaxed(self.log.problem)
 
     def advance(self, n: int) -> Claim:
         """Run at most n sweeps, offer the result to the log, and predict how many remain."""
@@ -219,12 +239,12 @@ class Sweeps(Iterations):
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
         self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
-        start = self.log.sweep_start
-        self.impulse = self.log.impulse.copy() if start is None else start
+        self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 
     def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
-        """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
-        first = int(self.first_sweeps)
+        """Run at most n sweeps; predict how many remain at intervals."""
+        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
+        growth = 1.0 if self.is_large else 0.5
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
         if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
             loop.tol = 0.0
@@ -236,7 +256,7 @@ class Sweeps(Iterations):
         while True:
             step = n - due
             if self.least < np.inf:
-                step = min(step, max(int(self.growth * (done + due)), 1 if done else first))
+                step = min(step, max(int(growth * (done + due)), 1 if done else first))
             due += step
             claim = loop.run_chunks(due)
             if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
@@ -244,44 +264,39 @@ class Sweeps(Iterations):
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
             before, now = now, self.measure_progress()
-            if self.is_over_early():
+            if self.has_solved_half():
                 return claim
             gain = log(before / now) if 0.0 < now < before else 0.0
-            is_hopeless = gain * self.least < step * log(now / tol)
-            if now <= tol or (is_hopeless and done + due >= DECISIONS.sweep_fraction * self.least):
+            self.predicted = step * log(now / tol) / gain if now > tol and gain > 0.0 else np.inf
+            if now <= tol or self.is_hopeless(self.least):
                 return claim
+
+    def is_hopeless(self, max_remaining: float) -> bool:
+        """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
+        done = 0.0 if self.state is None else self.state.watch.total
+        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        return self.predicted > max_remaining and not is_early
 
     def measure_progress(self) -> float:
         """Return the smallest relative residual so far."""
+        if self.is_large:
+            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
         self.store_iterate_in_log()
         return self.log.best
 
-    def is_over_early(self) -> bool:
-        """Return whether the sweeps end for another reason than their prediction."""
-        return False
+    def has_solved_half(self) -> bool:
+        """Return whether at least half of the blocks of a large problem belong to solved islands."""
+        if not self.is_large or self.n_islands == 1:
+            return False
+        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
+        self.n_islands = len(table)
+        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
 
     def sweep_until_deadline(self) -> None:
         """Sweep until the remaining time is used up."""
         self.time_fraction, self.least = 1.0, np.inf
         self.run(np.inf)
         self.log.timed_out = self.late
-
-
-class RelaxedSweeps(Sweeps):
-    """Sweeps over the convex relaxation, judged under Coulomb's law. They stop if they show that contacts slip."""
-
-    first_sweeps, growth = FIRST_RELAXED_SWEEPS, 1.0
-
-    def measure_progress(self) -> float:
-        """Return the smallest relative residual that the stopping test has computed."""
-        return float(self.state.best[0])
-
-    def is_over_early(self) -> bool:
-        """Return whether the relaxation is solved without solving Coulomb's law, or half of the blocks are solved."""
-        self.log.sweep_start = self.impulse
-        ratio, unsolved = self.log.compare_with_relaxation(self.impulse)
-        self.slips = ratio < SOLVED_RATIO
-        return self.slips or unsolved <= 0.5
 
 
 class RelaxedNewton(Step):
@@ -309,8 +324,7 @@ class RelaxedNewton(Step):
                 break
             system.solve.write_interior_impulse(trial)
             log.judge_and_store_best(trial)
-            log.sweep_start = trial
-            self.slips = log.compare_with_relaxation(trial)[0] < DECISIONS.slip_ratio
+            self.slips = log.compare_with_relaxation(trial) < DECISIONS.slip_ratio
             if log.best <= log.tol or self.slips:
                 break
         self.record_iterate(claim)

@@ -128,7 +128,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     get_zero_impulse_reference(problem)
     tree, small = DecisionTree(problem), describe_small_call(problem)
     tree.compiled_call_failed = problem.generalized is not None and bool(small)
-    stages = (*tree.iterate_relaxed_stages(), *islice(tree, MAX_EXPLAINED_STAGES))
+    stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
         sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.iterate_one_round(1.0)),

@@ -14,7 +14,7 @@ order.
 
 (2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
 which has the same solution as Coulomb's law if all contacts stick. If `convex` is AUTOMATIC and there are MIN_CONVEX_ROWS rows,
-anderson sweeps FIRST_LAW_TEST times under Coulomb's law, then under the cone law. At doubling numbers of iterations it compares
+anderson sweeps FIRST_LAW_TEST times under Coulomb's law, unless it starts from zero, then under the cone law. At doubling numbers of iterations it compares
 the steps f of one sweep under each law, and returns to Coulomb's law for good if
 
     |f_cone| < 0.5 |f_coulomb|,  |f_coulomb| > 0.8 |f_coulomb of the test before|     contacts slip at the cone solution  (4)
@@ -35,6 +35,7 @@ from lavender_ext.core.block cimport clip, euclidean_norm
 from lavender_ext.core.order cimport SYMMETRIC
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
+from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.view cimport view_t
 from lavender_ext.sweep.serial cimport (
     Sweeps, compute_sweep_velocities, sweep_over_form, sweep_context_t, sweep_run_t, count_sweep_velocities,
@@ -225,6 +226,9 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
     if c.iterations == 0:
         for i in range(m):
             root[i] = sqrt(p.d[i])
+        if c.next_law_test > 0 and is_zero_impulse(p, lam):
+            c.convex_begin = 0                          # Nothing is lost of a start.
+            c.last_coulomb_step = 1.0 / 0.0
     for s in range(n):
         if c.iterations == c.next_law_test and c.iterations < c.convex:
             test_law(c, &mixing, lam)

@@ -37,13 +37,8 @@ def asymmetric():
 
 
 SWEPT = ["anderson", "anderson"]
-RELAXED = [
-    "anderson on the relaxation",
-    "anderson on the relaxation",
-    "newton on the relaxation",
-    *SWEPT,
-    "newton",
-]
+RELAXED = ["anderson", "anderson", "newton on the relaxation", "anderson", "newton"]
+RELAXED_OVER_A = [*SWEPT, "admm from zero", *RELAXED[2:]]
 # The first stages of `auto` for a problem of each kind.
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
@@ -60,7 +55,7 @@ FIRST = {
         [*SWEPT, "newton"],
     ),
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, [*SWEPT, "newton"]),
-    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), RELAXED),
+    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), RELAXED_OVER_A),
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), RELAXED),
     "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, RELAXED),
     "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), RELAXED),
