@@ -6,13 +6,13 @@ cdef extern from *:
     """
     #ifndef LAVENDER_HAS_WIDE
     #if defined(__GNUC__) && defined(__x86_64__) && !defined(LAVENDER_ONE_LANE)
-    #define LAVENDER_HAS_WIDE() (__builtin_cpu_supports("avx2") ? 1 : 0)
+    #define LAVENDER_HAS_WIDE() (__builtin_cpu_supports("avx512f") ? 2 : __builtin_cpu_supports("avx2") ? 1 : 0)
     #else
     #define LAVENDER_HAS_WIDE() 0
     #endif
     #endif
     """
-    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil       # whether the processor has one instruction for four lanes (`tiles.pxd`)
+    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil       # 1 or 2: the processor has instructions for four or eight lanes (`tiles.pxd`)
 
 
 cdef struct pivots_t:
@@ -40,7 +40,7 @@ cdef struct interrupt_t:        # checks for signals during a factorisation, whi
 cdef struct supernodal_t:
     int32_t n                   # rows
     int32_t supernodes
-    int32_t wide                # use one instruction for four lanes
+    int32_t wide                # 1 or 2: use instructions for four or eight lanes
     # pattern
     const int32_t* order        # (n) row at each position; NULL: rows keep their order
     const int32_t* position     # (n) position of each row, or NULL likewise

@@ -114,7 +114,7 @@ cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil
 cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
                            const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil
 cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil
-cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* index, double* real) noexcept nogil
+cdef void bind_block_factor(block_matrix_t* f, bint lu, int32_t wide, int32_t* index, double* real) noexcept nogil
 cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil
 cdef void solve_linear_system(linear_t* f, double* x) noexcept nogil
 cdef void solve_transposed_linear_system(const linear_t* f, double* x) noexcept nogil

@@ -104,7 +104,7 @@ cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil:
     return values + supernodal_scratch_size(p, lu)
 
 
-cdef void bind_block_factor(block_matrix_t* f, bint lu, bint wide, int32_t* index, double* real) noexcept nogil:
+cdef void bind_block_factor(block_matrix_t* f, bint lu, int32_t wide, int32_t* index, double* real) noexcept nogil:
     """Bind the values of N and of its factor, after `analyse_blocks`; neither array needs initial values."""
     cdef supernodal_t* p = &f.factor
     cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s
@@ -395,7 +395,7 @@ cdef class LinearSystem:
     """
 
     def __init__(self, pattern, bint wide=True, splu=None):
-        self.f.wide, self.splu, self.python = wide and has_wide(), splu, PythonCalls()
+        self.f.wide, self.splu, self.python = has_wide() if wide else 0, splu, PythonCalls()
         if isinstance(pattern, int):
             analyse_dense(&self.f, pattern)
         else:

@@ -9,12 +9,27 @@ A panel is stored column by column; its first `width` rows are those of its own 
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, solve_three_columns
+from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, is_large_product, solve_three_columns
 
 
 cdef enum:
     CHOLESKY_STRIP = 3          # number of columns of (1) that are finished together: the width of a tile of `gemm_subtract_nt`
+    CHOLESKY_BLOCK = 48         # number of columns of (1) from which earlier blocks are subtracted together
     LU_STRIP = 12               # number of columns of (2) that are finished together: the width of four tiles
+
+
+cdef inline void gemm_subtract_lower(int32_t wide, int32_t m, int32_t n, int32_t k, const double* a, int64_t lda, double* c,
+                                     int64_t ldc) noexcept nogil:
+    """Subtract A B^T from C (m, n) on and below its diagonal; B is the first n rows of A (m, k).
+
+    Entries above the diagonal are changed within strips of LU_STRIP columns, or of CHOLESKY_BLOCK columns of a large product.
+    """
+    cdef int32_t j = 0, columns
+    cdef int32_t strip = CHOLESKY_BLOCK if n > LU_STRIP and m >= 4 * n and is_large_product(m, n, k) else LU_STRIP
+    while j < n:
+        columns = strip if j + strip <= n else n - j
+        gemm_subtract_nt(wide, m - j, columns, k, a + j, lda, a + j, lda, c + j + j * ldc, ldc)
+        j += columns
 
 
 cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a,
@@ -24,14 +39,19 @@ cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_
     A pivot must exceed min_pivot (width), or, if that is NULL, 1e-15 of its value before the last strip. The column of L of a
     pivot that is too small is zero.
     """
-    cdef int32_t j, j0 = 0, t, n, lost = 0
+    cdef int32_t j, j0 = 0, t, n, lost = 0, block = 0
     cdef double x
     cdef double diagonal[CHOLESKY_STRIP]
     cdef double* y
     while j0 < width:
         n = CHOLESKY_STRIP if j0 + CHOLESKY_STRIP <= width else width - j0
-        # Subtract the earlier columns.
-        gemm_subtract_nt(wide, rows - j0, n, j0, a + j0, rows, a + j0, rows, a + j0 + <int64_t>j0 * rows, rows)
+        # Subtract the earlier columns: first those of earlier blocks, then those of this block.
+        if j0 == block + CHOLESKY_BLOCK:
+            block = j0
+            gemm_subtract_lower(wide, rows - j0, CHOLESKY_BLOCK if j0 + CHOLESKY_BLOCK <= width else width - j0, j0,
+                                a + j0, rows, a + j0 + <int64_t>j0 * rows, rows)
+        gemm_subtract_nt(wide, rows - j0, n, j0 - block, a + j0 + <int64_t>block * rows, rows, a + j0 + <int64_t>block * rows,
+                         rows, a + j0 + <int64_t>j0 * rows, rows)
         for j in range(n):
             diagonal[j] = a[(j0 + j) + <int64_t>(j0 + j) * rows]
         # Factor the diagonal block.
@@ -60,19 +80,6 @@ cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_
                     y[t + <int64_t>j * rows] *= y[j + <int64_t>j * rows]
         j0 += CHOLESKY_STRIP
     return lost
-
-
-cdef inline void gemm_subtract_lower(int32_t wide, int32_t m, int32_t n, int32_t k, const double* a, int64_t lda, double* c,
-                                     int64_t ldc) noexcept nogil:
-    """Subtract A B^T from C (m, n) on and below its diagonal; B is the first n rows of A (m, k).
-
-    Entries above the diagonal are changed within strips of LU_STRIP columns.
-    """
-    cdef int32_t j = 0, columns
-    while j < n:
-        columns = LU_STRIP if j + LU_STRIP <= n else n - j
-        gemm_subtract_nt(wide, m - j, columns, k, a + j, lda, a + j, lda, c + j + j * ldc, ldc)
-        j += columns
 
 
 cdef inline void gemm_subtract_nonzeros(int32_t wide, int32_t m, int32_t n, int32_t k, const double* a, int64_t lda,

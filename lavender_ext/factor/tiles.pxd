@@ -1,8 +1,10 @@
 """Products of dense columns: C <- C - A B^T in tiles, in which dense and supernodal factorisations spend their time.
 
 Lanes are rows of C. The sum runs over the columns of A and B in their order, and each product is rounded before it is
-subtracted, so that all lane widths give the same bits. `wide` selects four lanes in one instruction (AVX2), which `has_wide` of
-`factors.pxd` reports. With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, the loops have no lanes.
+subtracted, so that all lane widths give the same bits. `wide` selects four or eight lanes in one instruction (AVX2, AVX-512),
+which `has_wide` of `factors.pxd` reports. Large products copy blocks of A and B to contiguous memory, which they read several
+times from the caches (Goto, van de Geijn 2008). With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, the loops
+have no lanes.
 """
 from libc.stdint cimport int32_t
 
@@ -11,9 +13,12 @@ cdef extern from *:
     """
     #ifndef LAVENDER_TILES
     #define LAVENDER_TILES
+    /* Below 16384 entries, A stays in the caches, and copies cost more than they save. */
+    #define LAVENDER_IS_LARGE(m, n, k) ((n) >= 12 && (k) >= 24 && (double)(m) * (k) >= 16384.0)
     #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_RESTRICT __restrict__
     #define LAVENDER_INLINE static inline __attribute__((always_inline))
+    typedef double lavender_oct __attribute__((vector_size(64), aligned(8), may_alias));
     typedef double lavender_quad __attribute__((vector_size(32), aligned(8), may_alias));
     typedef double lavender_two __attribute__((vector_size(16), aligned(8), may_alias));
     #define LAVENDER_TILE(NAME, T)                                                                                \
@@ -102,6 +107,64 @@ cdef extern from *:
         LAVENDER_GEMM(lavender_tile_2, 2)
     }
     #if defined(__GNUC__) && defined(__x86_64__) && !defined(LAVENDER_ONE_LANE)
+    /* A product in blocks: DEPTH columns of A and B, WIDTH rows of B, and 2 LANES rows of A, all contiguous. A tile of
+     * 2 LANES rows and COLUMNS columns of C is in registers; tiles at the edge of C are copied. */
+    #define LAVENDER_BLOCKED_GEMM(NAME, T, COLUMNS, TARGET)                                                       \
+    TARGET static inline __attribute__((always_inline)) void NAME##_tile(int k, const double* a, const double* b, double* c,          \
+                                                                         long long ldc) {                         \
+        enum { LANES = sizeof(T) / sizeof(double), WIDTH = 48 };                                                  \
+        T sum[2 * COLUMNS];                                                                                       \
+        for (int j = 0; j < COLUMNS; j++)                                                                         \
+            for (int i = 0; i < 2; i++) sum[2 * j + i] = *(T*)(c + j * ldc + LANES * i);                          \
+        for (int t = 0; t < k; t++, a += 2 * LANES, b += WIDTH) {                                                 \
+            const T first = *(const T*)a, second = *(const T*)(a + LANES);                                        \
+            for (int j = 0; j < COLUMNS; j++) {                                                                   \
+                sum[2 * j] -= first * b[j];                                                                       \
+                sum[2 * j + 1] -= second * b[j];                                                                  \
+            }                                                                                                     \
+        }                                                                                                         \
+        for (int j = 0; j < COLUMNS; j++)                                                                         \
+            for (int i = 0; i < 2; i++) *(T*)(c + j * ldc + LANES * i) = sum[2 * j + i];                          \
+    }                                                                                                             \
+    TARGET static void NAME(int m, int n, int k, const double* a, long long lda, const double* b, long long ldb,  \
+                            double* c, long long ldc) {                                                           \
+        enum { ROWS = 2 * sizeof(T) / sizeof(double), WIDTH = 48, DEPTH = 128 };                                  \
+        double rows[ROWS * DEPTH], columns[WIDTH * DEPTH], edge[ROWS * COLUMNS];                                  \
+        for (int j0 = 0; j0 < n; j0 += WIDTH)                                                                     \
+            for (int t0 = 0; t0 < k; t0 += DEPTH) {                                                               \
+                const int width = n - j0 < WIDTH ? n - j0 : WIDTH, depth = k - t0 < DEPTH ? k - t0 : DEPTH;       \
+                for (int t = 0; t < depth; t++) {                                                                 \
+                    for (int j = 0; j < width; j++) columns[WIDTH * t + j] = b[(t0 + t) * ldb + j0 + j];          \
+                    for (int j = width; j < WIDTH && j % COLUMNS; j++) columns[WIDTH * t + j] = 0.0;              \
+                }                                                                                                 \
+                for (int i0 = 0; i0 < m; i0 += ROWS) {                                                            \
+                    const int height = m - i0 < ROWS ? m - i0 : ROWS;                                             \
+                    for (int t = 0; t < depth; t++) {                                                             \
+                        const double* source = a + (t0 + t) * lda + i0;                                           \
+                        if (height == ROWS)                                                                       \
+                            for (int i = 0; i < ROWS; i++) rows[ROWS * t + i] = source[i];                        \
+                        else                                                                                      \
+                            for (int i = 0; i < ROWS; i++) rows[ROWS * t + i] = i < height ? source[i] : 0.0;     \
+                    }                                                                                             \
+                    for (int j = 0; j < width; j += COLUMNS) {                                                    \
+                        double* out = c + (j0 + j) * ldc + i0;                                                    \
+                        const int count = width - j < COLUMNS ? width - j : COLUMNS;                              \
+                        if (height == ROWS && count == COLUMNS) {                                                 \
+                            NAME##_tile(depth, rows, columns + j, out, ldc);                                      \
+                            continue;                                                                             \
+                        }                                                                                         \
+                        for (int q = 0; q < COLUMNS; q++)                                                         \
+                            for (int i = 0; i < ROWS; i++)                                                        \
+                                edge[ROWS * q + i] = q < count && i < height ? out[q * ldc + i] : 0.0;            \
+                        NAME##_tile(depth, rows, columns + j, edge, ROWS);                                        \
+                        for (int q = 0; q < count; q++)                                                           \
+                            for (int i = 0; i < height; i++) out[q * ldc + i] = edge[ROWS * q + i];               \
+                    }                                                                                             \
+                }                                                                                                 \
+            }                                                                                                     \
+    }
+    LAVENDER_BLOCKED_GEMM(lavender_blocked_gemm_8, lavender_oct, 8, __attribute__((target("avx512f"))))
+    LAVENDER_BLOCKED_GEMM(lavender_blocked_gemm_4, lavender_quad, 6, __attribute__((target("avx2"))))
     __attribute__((target("avx2"))) static void lavender_gemm_wide(int m, int n, int k, const double* a, long long lda,
                                                                    const double* b, long long ldb, double* c,
                                                                    long long ldc) {
@@ -118,6 +181,13 @@ cdef extern from *:
     static inline void lavender_gemm(int wide, int m, int n, int k, const double* a, long long lda, const double* b,
                                      long long ldb, double* c, long long ldc) {
         if (k == 0) return;
+    #if defined(__GNUC__) && defined(__x86_64__) && !defined(LAVENDER_ONE_LANE)
+        if (wide && LAVENDER_IS_LARGE(m, n, k)) {
+            if (wide == 2) lavender_blocked_gemm_8(m, n, k, a, lda, b, ldb, c, ldc);
+            else lavender_blocked_gemm_4(m, n, k, a, lda, b, ldb, c, ldc);
+            return;
+        }
+    #endif
         if (wide) lavender_gemm_wide(m, n, k, a, lda, b, ldb, c, ldc);
         else lavender_gemm_narrow(m, n, k, a, lda, b, ldb, c, ldc);
     }
@@ -147,6 +217,8 @@ cdef extern from *:
     # Subtract A B^T from C (m, n), with A (m, k) and B (n, k); lda, ldb and ldc are the distances of their columns.
     void gemm_subtract_nt "lavender_gemm"(int wide, int m, int n, int k, const double* a, long long lda, const double* b,
                                           long long ldb, double* c, long long ldc) noexcept nogil
+    # Return whether `gemm_subtract_nt` copies blocks of its matrices.
+    bint is_large_product "LAVENDER_IS_LARGE"(int m, int n, int k) noexcept nogil
     # Write to out (n) the sum over i of x_i times the row that begins at rows + at_i; n is a multiple of 4.
     void combine_rows "lavender_combine_rows"(int wide, int n, int count, const double* rows, const int32_t* at, const double* x,
                                               double* out) noexcept nogil

@@ -174,7 +174,7 @@ cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, 
 
 
 cdef inline void bind_panel_and_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
-                             bint lu, bint wide, int32_t* index, double* y, double* real) noexcept nogil:
+                             bint lu, int32_t wide, int32_t* index, double* y, double* real) noexcept nogil:
     """Bind the panel (rows, 12), with these columns of each body, and the factor after `analyse_blocks`.
 
     index has `block_factor_index_size`, y n size, real `block_factor_size`.
@@ -188,7 +188,7 @@ cdef inline void bind_panel_and_factor(newton_t* s, const pattern_t* a, double* 
     bind_block_factor(&s.linear.blocks, lu, wide, index, real)
 
 
-cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, const view_t* v, bint wide,
+cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, const view_t* v, int32_t wide,
                                      int32_t* index) noexcept nogil:
     """Bind all values of s in real (`body_workspace_size`), and the factor's integers in index (`block_factor_index_size`)."""
     cdef const blocks_t* p = &v.p

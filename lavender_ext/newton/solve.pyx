@@ -119,7 +119,7 @@ cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_
     return is_problem_supported(&v.p)
 
 
-cdef inline void bind_dense_system(newton_t* n, bint wide, const double* h, double* matrix, double* lower) noexcept nogil:
+cdef inline void bind_dense_system(newton_t* n, int32_t wide, const double* h, double* matrix, double* lower) noexcept nogil:
     """Bind H and the matrix (m, m), and L L^T (`dense_workspace_size`)."""
     analyse_dense(&n.linear, n.sc.e.m)
     n.linear.wide, n.linear.matrix, n.linear.lower = wide, matrix, lower
@@ -333,7 +333,7 @@ cdef class Solve(Method):
         cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
         self.held += [h, whole, lower]
         self.n.s.symmetric = symmetric
-        bind_dense_system(self.n, wide and has_wide(), &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
+        bind_dense_system(self.n, has_wide() if wide else 0, &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
 
     def use_sparse_matrix(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
         """Use H in compressed rows. Its linear system `linear` has the pattern of the graph (to, other) of elements.
@@ -387,7 +387,7 @@ cdef class Solve(Method):
         a.group = <int32_t*>get_data_pointer(own) + block_factor_index_size(a.n, layout.s)
         values = np.empty(factored + block_factor_size(f, lu) + 1)
         self.held += [panel, layout, own, values]
-        bind_panel_and_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, wide and has_wide(),
+        bind_panel_and_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, has_wide() if wide else 0,
                     <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
                     <double*>get_data_pointer(values) + factored)
         f.factor.interrupt = &self.python.interrupt

@@ -137,6 +137,25 @@ def test_columns_of_one_pattern_stand_beside_each_other():
     assert (first[parent] <= first[has_parent]).all() and (first >= 0).all()
 
 
+@pytest.mark.parametrize("lu", [False, True])
+def test_wide_supernodes_give_the_bits_of_two_lanes(lu):
+    """Products from 16,384 entries on copy their matrices in blocks; edges of 1 to 11 rows and columns remain."""
+    rng = np.random.default_rng(4)
+    corner = mirrored(rng, 301, 7, 0.02)
+    a = definite(
+        sp.block_array([[corner, None], [None, rng.normal(size=(613, 613))]]) + sp.eye_array(914, k=300)
+    )
+    found = []
+    for wide in (True, False):
+        f = LinearSystem(raw(a), wide)
+        assert f.factor(a.data, a.diagonal(), 0.0, 1e-13, lu) == 0
+        found.append(f.solve(np.ones(914)))
+    assert found[0].tobytes() == found[1].tobytes()
+    # The residual is a sum of up to 914 rounded terms.
+    rounding = 914 * EPS * abs(a).sum(axis=1).max() * np.abs(found[0]).max()
+    np.testing.assert_allclose(a @ found[0], 1.0, rtol=0, atol=rounding)
+
+
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 150), block=st.integers(1, 6), lu=st.booleans())
 def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
     rng = np.random.default_rng(seed)
