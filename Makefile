@@ -3,7 +3,7 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels test quick lint format types coverage docs wasm fingerprint ci release clean
+.PHONY: help setup kernels test quick lint format types coverage docs wasm fingerprint ci nightly release clean
 
 help:  ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -56,8 +56,11 @@ wasm:  ## build the WebAssembly modules, in lavender/sim/web/
 fingerprint:  ## compare the bits of solvers and engine with the stored fingerprint
 	$(PYTHON) .ci/fingerprint --compare .ci/fingerprint.txt
 
-ci:  ## run the complete continuous integration
+ci:  ## run the continuous integration of a change
 	bash .ci/run
+
+nightly:  ## run everything that the continuous integration checks at night
+	bash .ci/run --all
 
 release:  ## build the files of a release, in dist/; stops if a manual step is required
 	PYTHON=$(PYTHON) .ci/release dist
