@@ -59,7 +59,8 @@ CONTENTS = {
     ),
     "LavenderSim": "engine engine-measurements scenes towers web",
     "Background": (
-        "chapter motion newtons-method auto performance peers generated/cases generated/measured method"
+        "chapter chapter-answers chapter-engines motion newtons-method auto performance peers generated/cases "
+        "generated/measured method"
     ),
     "Project": "architecture plugin trust platforms limitations",
 }

@@ -11,7 +11,7 @@ largest velocity is left at the ground. Swept from the top down, the ground is s
 above: max |e_n| is half as large, yet the boxes approach faster and sink deeper. The judge adds the energy of all
 rows and takes the largest velocity, and says so.
 
-Cold run, steps 20 to 60: with few sweeps the residual is larger than in the first solve. Each solve must build up the
+Cold run, steps 21 to 60: with few sweeps the residual is larger than in the first solve. Each solve must build up the
 whole weight from zero, so the boxes sink until b is large enough that n sweeps reach it. With G the error matrix of a
 sweep and l the impulses that hold the stack,
 
@@ -43,9 +43,9 @@ BUDGETS = (4, 8, 16, 32, 64)
 ORDERS = ("alternating", "bottom_up", "top_down", "random", "colored", "symmetric")
 RUNS = ("alternating", "bottom_up", "top_down")
 COMPARED = ("bottom_up", "alternating")
-WINDOW = (20, 60)  # steps of which medians are taken
-TAILS = ((20, 60), (180, 240))  # steps of which the ratio of 4 to 64 sweeps is taken
-STARTS = ((20, 90), (90, 120))  # steps of which the ratio of cold to warm starts is taken
+WINDOW = (21, 60)  # first and last step of which medians are taken
+TAILS = ((21, 60), (181, 240))  # steps of which the ratio of 4 to 64 sweeps is taken
+STARTS = ((21, 90), (91, 120))  # steps of which the ratio of cold to warm starts is taken
 STEPS = 240
 ENDS = (BUDGETS[0], BUDGETS[-1])
 MOVED = 0.05  # m
@@ -93,7 +93,7 @@ def judge(sweeps, order, warm, window=WINDOW):
     """Return the median relative residual of all rows [-] over the steps of a window."""
     sim, _ = make_simulation(sweeps, order, warm)
     relative = []
-    for step in range(window[1]):
+    for step in range(1, window[1] + 1):
         sim.report_residual = step >= window[0]  # costs as much as ten steps
         info = sim.step()[-1]
         if sim.report_residual:
@@ -104,7 +104,7 @@ def judge(sweeps, order, warm, window=WINDOW):
 def summarize(order, warm):
     """Return by budget (5, 3): medians of residual and violation in WINDOW, and the largest depth up to its end."""
     rows = [run(n, order, warm)[: WINDOW[1]] for n in BUDGETS]
-    return np.array([(*np.median(x[WINDOW[0] :, 1:3], axis=0), x[:, 3].max()) for x in rows])
+    return np.array([(*np.median(x[WINDOW[0] - 1 :, 1:3], axis=0), x[:, 3].max()) for x in rows])
 
 
 def compare_orders():
@@ -114,8 +114,8 @@ def compare_orders():
         few, many = (run(n, order, False) for n in ENDS)
         warm = run(ENDS[0], order, True)
         out[order] = {
-            "tails": [np.median(few[a:b, 1]) / np.median(many[a:b, 1]) for a, b in TAILS],
-            "starts": [np.median(few[a:b, 0]) / np.median(warm[a:b, 0]) for a, b in STARTS],
+            "tails": [np.median(few[a - 1 : b, 1]) / np.median(many[a - 1 : b, 1]) for a, b in TAILS],
+            "starts": [np.median(few[a - 1 : b, 0]) / np.median(warm[a - 1 : b, 0]) for a, b in STARTS],
             "moved": many[-1, 4],
             "judged": np.array([[judge(n, order, False, window) for n in BUDGETS] for window in TAILS]),
         }
@@ -187,22 +187,24 @@ def set_budget_axis(axes):
 
 
 def draw_published(axes, found):
-    """Draw residual, violation and penetration of the cold run against the budget."""
+    """Draw residual, violation and penetration of the cold run, each divided by its value with the fewest sweeps."""
     for order, style in (("alternating", "-"), ("bottom_up", "--")):
         for i, (name, marker) in enumerate(
-            (("violation [m/s]", "s"), ("penetration [m]", "^"), ("residual [N s]", "o"))
+            (("approach velocity", "s"), ("penetration", "^"), ("residual", "o"))
         ):
             values = found["cold"][order][:, (1, 2, 0)[i]]
             axes.plot(
                 BUDGETS,
-                values,
+                values / values[0],
                 marker + style,
                 color=f"C{i}",
                 markersize=4,
                 label=f"{name},\n{order.replace('_', ' ')}",
             )
     set_budget_axis(axes)
-    axes.set(title=f"cold, steps {WINDOW[0]} to {WINDOW[1]}", ylabel="units in the legend")
+    axes.set(
+        title=f"cold, steps {WINDOW[0]} to {WINDOW[1]}", ylabel=f"value / value with {BUDGETS[0]} sweeps [-]"
+    )
     put_legend_right(axes)
 
 

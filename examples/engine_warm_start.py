@@ -21,6 +21,7 @@ from panels import Numbers, put_legend_right, show
 import lavender as lv
 
 STEPS = 180
+FIRST = 21  # first step of which medians are taken
 SWITCH = 90  # number of steps after which the third run loses its warm start
 SWITCHES = range(80, 101)  # the same, in runs that differ in nothing else
 SWEEPS = 4
@@ -107,19 +108,25 @@ def print_numbers(found):
     """Print medians before and after the switch, and the two steps around it."""
     print(f"{'run':<20}{'steps':>9}{'matches':>9}{'initial':>12}{'final':>12}{'all rows':>12}")
     for name, solver in found["values"].items():
-        for first, last in ((20, SWITCH), (SWITCH, STEPS)):
+        for first, last in ((FIRST, SWITCH), (SWITCH + 1, STEPS)):
             values = [
-                np.median(get_column(solver, k)[first:last]) for k in ("residual_initial", "residual_final")
+                np.median(get_column(solver, k)[first - 1 : last])
+                for k in ("residual_initial", "residual_final")
             ]
-            matches = int(np.median(get_column(solver, "cache_matches")[first:last]))
+            matches = int(np.median(get_column(solver, "cache_matches")[first - 1 : last]))
             print(
                 f"{name:<20}{f'{first}-{last}':>9}{matches:>9}"
-                + "".join(f"{x:>12.2e}" for x in (*values, np.median(found["judged"][name][first:last])))
+                + "".join(
+                    f"{x:>12.2e}" for x in (*values, np.median(found["judged"][name][first - 1 : last]))
+                )
             )
-    initial = {k: np.median(get_column(v, "residual_initial")[20:SWITCH]) for k, v in found["values"].items()}
+    initial = {
+        k: np.median(get_column(v, "residual_initial")[FIRST - 1 : SWITCH])
+        for k, v in found["values"].items()
+    }
     one_way = initial["cold, one direction"] / initial["warm, one direction"]
     print(
-        f"in steps 20 to {SWITCH} warm starts {initial['cold'] / initial['warm']:.0f} times closer than cold; "
+        f"in steps {FIRST} to {SWITCH} warm starts {initial['cold'] / initial['warm']:.0f} times closer than cold; "
         f"always swept from the bottom up {one_way:.0f} times"
     )
     solver = found["values"]["switched off"]

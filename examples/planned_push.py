@@ -12,6 +12,7 @@ from there if the result is closer to the goal.
 import sys
 
 import numpy as np
+import panels  # noqa: F401 - prints --help
 
 import lavender as lv
 

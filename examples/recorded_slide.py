@@ -14,6 +14,7 @@ Borwein (1988).
 import sys
 
 import numpy as np
+import panels  # noqa: F401 - prints --help
 
 import lavender as lv
 

@@ -13,6 +13,7 @@ is the maximum over rows) in a scene with most of its energy in other, correctly
 import sys
 
 import numpy as np
+import panels  # noqa: F401 - prints --help
 
 import lavender as lv
 from lavender import suite

@@ -35,8 +35,7 @@ STEPS = 1200
 def solve_by_hand():
     """Return the impulse [N s] and the velocities after it (2, 3) [m/s]."""
     n = (POSITION[1] - POSITION[0]) / np.linalg.norm(POSITION[1] - POSITION[0])
-    problem = lv.Problem.linear([[1.0 / MASS[0] + 1.0 / MASS[1]]], [-n @ (VELOCITY[1] - VELOCITY[0])])
-    impulse = lv.solve(problem, "direct").impulse[0]
+    impulse = -n @ (VELOCITY[1] - VELOCITY[0]) / (1.0 / MASS[0] + 1.0 / MASS[1])
     return impulse, VELOCITY + np.outer([-1.0, 1.0] / MASS, impulse * n)
 
 

@@ -12,6 +12,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import panels  # noqa: F401 - prints --help
 
 import lavender as lv
 

@@ -1,7 +1,15 @@
-"""What the chapter's examples share: numbers that are computed when they are read, and figures of several panels."""
+"""What the examples share: --help, numbers that are computed when they are read, and figures of several panels."""
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+
+_script = sys.modules["__main__"]
+_folder = Path(getattr(_script, "__file__", None) or "").resolve().parent
+# Only scripts of the folder examples/ print their help: the documentation build imports this module, too.
+if _folder == Path(__file__).resolve().parents[1] and {"-h", "--help"} & set(sys.argv[1:]):
+    print(_script.__doc__.strip())
+    raise SystemExit
 
 
 class Numbers(Mapping):

@@ -1,11 +1,11 @@
-"""Every number of the chapter's page is what the command beside it prints.
+"""Every number of the chapter's pages is what the command beside it prints.
 
-Comments in the page hold the claims, section by section: a command in the first line, then `numbers | line`, the line
+Comments in the pages hold the claims, section by section: a command in the first line, then `numbers | line`, the line
 as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
 half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise; `<0.1`
 holds where what is printed is less.
 `given:` lists settings and numbers of theory, `measured once:` those of another project's engine; a section has no
-further numbers but those claimed elsewhere on the page. LAVENDER_PRINTED names a folder with what the commands printed
+further numbers but those claimed elsewhere on the pages. LAVENDER_PRINTED names a folder with what the commands printed
 before, in files of their names with `_` for `/`.
 """
 
@@ -24,7 +24,8 @@ from worked import example
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-PAGE = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "docs" / f"chapter{part}.md" for part in ("", "-answers", "-engines")]
+PAGE = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
 COMMENT = re.compile(r"<!-- (.*?) ?-->", re.DOTALL)
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"(?<![\w.])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?(?!\w|\.\d)")
