@@ -11,7 +11,6 @@ from worked import after
 
 import lavender as lv
 from lavender.io.stored import pack_header, unpack_header
-from lavender.sim.engine import stepping
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
 from lavender.sim.scene.scene import SCENE_ORDERS
@@ -233,12 +232,6 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(lv.InputError, match="is not a folder"):
         sim.record(tmp_path / "file", 1)
-
-
-def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
-    monkeypatch.setattr(stepping, "summarise_motion", None)
-    *_, info = lv.Simulation("stack").step()
-    assert "motion" not in info
 
 
 @pytest.mark.parametrize(

@@ -108,108 +108,73 @@ def test_contacts_of_one_scene_may_have_different_rows():
 # -- bad input ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda s: s.add_box(mass=0.0), "mass"),
-        (lambda s: s.add_box(mass=-1.0), "mass"),
-        (lambda s: s.add_box((1, 0, 1)), "positive"),
-        (lambda s: s.add_box((1, -1, 1)), "positive"),
-        (lambda s: s.add_sphere(0.0), "radius"),
-        (lambda s: s.add_plane((0, 0, 0)), "direction"),
-        (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
-        (lambda s: s.add_body(quaternion=(0, 0, 0, 0)), "quaternion"),
-        (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
-        (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
-        (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),
-        (lambda s: s.add_body(shape=Box((1.0, -1.0, 1.0))), "positive edges"),
-        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
-        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
-        (lambda s: s.add_body(inertia=(1, 1, 0)), "positive"),
-        (lambda s: s.add_body(inertia=(1, 1, -1)), "positive"),
-        (lambda s: s.add_body(inertia=(1, 2.1, 1)), "at most the sum of the others"),
-        (lambda s: s.add_body(inertia=(1, 1, 1e-15)), "positive"),
-        (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
-        (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
-        (lambda s: s.add_body(static=True, velocity=(1, 0, 0)), "static"),
-        (lambda s: s.add_body(friction=-0.1), "friction"),
-        (lambda s: s.add_body(restitution=1.1), "restitution"),
-        (lambda s: s.add_joint("ball", 0, 7, anchor=(0, 0, 0)), "body 7"),
-        (lambda s: s.add_joint("ball", 0, -2, anchor=(0, 0, 0)), "body -2"),
-        (lambda s: s.add_joint("ball", 0, 0, anchor=(0, 0, 0)), "two bodies"),
-        (lambda s: s.add_joint("ball", -1, 1, anchor=(0, 0, 0)), "dynamic"),
-        (lambda s: s.add_joint("ball", 0, -1), "anchor"),
-        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1)), "axis"),
-        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0)), "axis"),
-        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 0)), "direction"),
-        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1), motor_speed=1.0), "motor"),
-        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), motor_speed=1.0, motor_torque=1.0), "motor"),
-        (lambda s: s.add_joint("distance", 0, -1), "anchor"),
-        (lambda s: s.add_joint("distance", 0, -1, anchor_a=(0, 0, 0), anchor_b=(0, 0, 0)), "length 0"),
-        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
-        (lambda s: s.add_joint("slider", 0, -1), "joint 'slider'"),
-    ],
-)
-def test_bad_parts_are_refused_and_nothing_is_added(build, message):
+#: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
+REFUSED = [
+    (lambda s: s.add_box(mass=0.0), "mass"),
+    (lambda s: s.add_box(mass=-1.0), "mass"),
+    (lambda s: s.add_box((1, 0, 1)), "positive"),
+    (lambda s: s.add_box((1, -1, 1)), "positive"),
+    (lambda s: s.add_sphere(0.0), "radius"),
+    (lambda s: s.add_plane((0, 0, 0)), "direction"),
+    (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
+    (lambda s: s.add_body(quaternion=(0, 0, 0, 0)), "quaternion"),
+    (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
+    (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
+    (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),
+    (lambda s: s.add_body(shape=Box((1.0, -1.0, 1.0))), "positive edges"),
+    (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
+    (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
+    (lambda s: s.add_body(inertia=(1, 1, 0)), "positive"),
+    (lambda s: s.add_body(inertia=(1, 1, -1)), "positive"),
+    (lambda s: s.add_body(inertia=(1, 2.1, 1)), "at most the sum of the others"),
+    (lambda s: s.add_body(inertia=(1, 1, 1e-15)), "positive"),
+    (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
+    (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
+    (lambda s: s.add_body(static=True, velocity=(1, 0, 0)), "static"),
+    (lambda s: s.add_body(friction=-0.1), "friction"),
+    (lambda s: s.add_body(restitution=1.1), "restitution"),
+    (lambda s: s.add_joint("ball", 0, 7, anchor=(0, 0, 0)), "body 7"),
+    (lambda s: s.add_joint("ball", 0, -2, anchor=(0, 0, 0)), "body -2"),
+    (lambda s: s.add_joint("ball", 0, 0, anchor=(0, 0, 0)), "two bodies"),
+    (lambda s: s.add_joint("ball", -1, 1, anchor=(0, 0, 0)), "dynamic"),
+    (lambda s: s.add_joint("ball", 0, -1), "anchor"),
+    (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1)), "axis"),
+    (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0)), "axis"),
+    (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 0)), "direction"),
+    (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1), motor_speed=1.0), "motor"),
+    (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), motor_speed=1.0, motor_torque=1.0), "motor"),
+    (lambda s: s.add_joint("distance", 0, -1), "anchor"),
+    (lambda s: s.add_joint("distance", 0, -1, anchor_a=(0, 0, 0), anchor_b=(0, 0, 0)), "length 0"),
+    (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
+    (lambda s: s.add_joint("slider", 0, -1), "joint 'slider'"),
+    *((lambda s, more=more: lv.Scene("stack", **more), words) for more, words in (
+        ({"dt": 0.0}, "dt"), ({"dt": -0.01}, "dt"), ({"substeps": 0}, "substeps"), ({"friction": -1.0}, "friction"),
+        ({"restitution": 2.0}, "restitution"), ({"rolling_radius": -0.1}, "rolling_radius"),
+        ({"max_substep": 0.0}, "max_substep"), ({"max_substep": -1.0}, "max_substep"),
+        ({"max_substep": 1e-60}, "substeps"), ({"dt": 50.0}, "substeps"), ({"dt": 1e60}, "substeps"),
+        ({"friction_shape": "square"}, "friction_shape"),
+        ({"solver": "pgz"}, "did you mean 'pgs'"), ({"order": "bottomup"}, "bottom_up"),
+        ({"on_failure": "ignore"}, "on_failure"), ({"solver_options": {"omega": 1}}, "solver_options"),
+        ({"solver": "pgs", "order": "reverse"}, "solver_options"), ({"solver_options": 3, "solver": "pgs"}, "mapping"),
+        ({"gravity": -9.81}, r"downward acceleration.* give 9.81"), ({"frction": 1.0}, "did you mean 'friction'"),
+        ({"n": 0}, "n is 0"))),
+    (lambda s: lv.Scene(["stack"]), r"unknown scene \['stack'\]"), (lambda s: lv.Scene("stac"), "did you mean 'stack'"),
+    (lambda s: lv.Scene("chain", tipmass=1.0), "tip_mass"), (lambda s: lv.Scene("pile", kind="sphere"), "spheres"),
+    (lambda s: lv.Scene(n=3), "unknown"), (lambda s: lv.Simulation(lv.Scene()), "no bodies"),
+    (lambda s: lv.Simulation(3), r"lavender.Scene is needed"),
+    (lambda s: lv.Simulation("stack").step([1, 2]), "has no actions"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "words"), REFUSED)
+def test_bad_parts_and_parameters_are_refused_and_nothing_is_added(call, words):
     scene = lv.Scene()
     scene.add_sphere(name="ball")
     scene.add_plane()
-    with pytest.raises(lv.LavenderError, match=message):
-        build(scene)
+    with pytest.raises(lv.LavenderError, match=words):
+        call(scene)
     assert (scene.n_bodies, scene.n_joints) == (2, 0)
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"dt": 0.0}, "dt"),
-        ({"dt": -0.01}, "dt"),
-        ({"substeps": 0}, "substeps"),
-        ({"friction": -1.0}, "friction"),
-        ({"restitution": 2.0}, "restitution"),
-        ({"rolling_radius": -0.1}, "rolling_radius"),
-        ({"max_substep": 0.0}, "max_substep"),
-        ({"max_substep": -1.0}, "max_substep"),
-        ({"max_substep": 1e-60}, "substeps"),
-        ({"dt": 50.0}, "substeps"),  # 12,000 of 1/240 s are no step that anybody has asked for
-        ({"dt": 1e60}, "substeps"),
-        ({"friction_shape": "square"}, "friction_shape"),
-        ({"solver": "pgz"}, "did you mean 'pgs'"),
-        ({"order": "bottomup"}, "bottom_up"),
-        ({"on_failure": "ignore"}, "on_failure"),
-        ({"solver_options": {"omega": 1}}, "solver_options"),
-        ({"solver": "pgs", "order": "reverse"}, "solver_options"),
-        ({"solver_options": 3, "solver": "pgs"}, "mapping"),
-        ({"gravity": -9.81}, r"downward acceleration.* give 9.81"),
-    ],
-)
-def test_bad_parameters_are_refused(more, message):
-    with pytest.raises(lv.LavenderError, match=message):
-        lv.Scene("stack", **more)
-    assert lv.Scene("stack", dt=1e6, substeps=3).parameters.substeps == 3  # which somebody asks for
-
-
-def test_unknown_scenes_and_parameters_name_the_nearest():
-    with pytest.raises(lv.UnknownName, match=r"unknown scene \['stack'\]"):
-        lv.Scene(["stack"])
-    with pytest.raises(lv.UnknownName, match="did you mean 'stack'"):
-        lv.Scene("stac")
-    with pytest.raises(lv.UnknownName, match="did you mean 'friction'"):
-        lv.Scene("stack", frction=1.0)
-    with pytest.raises(lv.UnknownName, match="tip_mass"):
-        lv.Scene("chain", tipmass=1.0)
-    with pytest.raises(lv.UnknownName, match="spheres"):
-        lv.Scene("pile", kind="sphere")
-    with pytest.raises(lv.UnknownName):
-        lv.Scene(n=3)
-    with pytest.raises(lv.InputError):
-        lv.Scene("stack", n=0)
-    with pytest.raises(lv.InputError, match="no bodies"):
-        lv.Simulation(lv.Scene())
-    with pytest.raises(lv.InputError, match=r"lavender.Scene is needed"):
-        lv.Simulation(3)
-    with pytest.raises(lv.InputError, match="has no actions"):
-        lv.Simulation("stack").step([1, 2])
+    assert lv.Scene("stack", dt=1e6, substeps=3).parameters.substeps == 3  # because it is given
 
 
 # -- extremes ---------------------------------------------------------------------------------------
