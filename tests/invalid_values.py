@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pytest
 import scipy.sparse as sp
 
 import lavender as lv
@@ -239,3 +240,22 @@ def check_every_public_call(public, calls, not_called):
     """Require that each public call is in the table of calls or among the exceptions."""
     called = {name.partition(",")[0].partition(" by ")[0] for name in calls}
     assert public - called - set(not_called) == set()
+
+
+def make_tests_of_calls(layer, calls, not_called, public=None):
+    """Return the tests of a table of calls: it is complete, arguments are checked, memory layouts change nothing."""
+
+    def test_table():
+        check_every_public_call(public or public_calls(layer), calls, not_called)
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("name", calls)
+    def test_arguments(name):
+        check_malformed_arguments(name, calls[name])
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("name", calls)
+    def test_layouts(name):
+        check_memory_layouts(calls[name])
+
+    return test_table, test_arguments, test_layouts

@@ -6,14 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from invalid_values import (
-    Call,
-    check_every_public_call,
-    check_float32,
-    check_malformed_arguments,
-    check_memory_layouts,
-    public_calls,
-)
+from invalid_values import Call, check_float32, make_tests_of_calls
 from random_problems import random_bodies_and_contacts, random_contact_problem
 
 import lavender as lv
@@ -327,20 +320,11 @@ NOT_CALLED = {
 }  # fmt: skip
 
 
-def test_every_public_call_of_the_core_is_in_the_table():
-    check_every_public_call(public_calls("core"), CALLS, NOT_CALLED)
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_malformed_arguments_are_rejected_by_name(name):
-    check_malformed_arguments(name, CALLS[name])
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_arrays_in_any_memory_layout_give_the_same_result(name):
-    check_memory_layouts(CALLS[name])
+(
+    test_every_public_call_of_the_core_is_in_the_table,
+    test_malformed_arguments_are_rejected_by_name,
+    test_arrays_in_any_memory_layout_give_the_same_result,
+) = make_tests_of_calls("core", CALLS, NOT_CALLED)
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from invalid_values import (
-    Call,
-    check_every_public_call,
-    check_float32,
-    check_malformed_arguments,
-    check_memory_layouts,
-    public_calls,
-)
+from invalid_values import Call, check_float32, make_tests_of_calls, public_calls
 from random_problems import random_contact_problem
 from scipy.sparse.csgraph import connected_components
 
@@ -90,20 +83,11 @@ NOT_CALLED = {
 }
 
 
-def test_every_public_call_of_io_is_in_the_table():
-    check_every_public_call(public_calls("io", io, "io.") | public_calls("io"), CALLS, NOT_CALLED)
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_malformed_arguments_are_rejected_by_name(name):
-    check_malformed_arguments(name, CALLS[name])
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_arrays_in_any_memory_layout_give_the_same_result(name):
-    check_memory_layouts(CALLS[name])
+(
+    test_every_public_call_of_io_is_in_the_table,
+    test_malformed_arguments_are_rejected_by_name,
+    test_arrays_in_any_memory_layout_give_the_same_result,
+) = make_tests_of_calls("io", CALLS, NOT_CALLED, public_calls("io", io, "io.") | public_calls("io"))
 
 
 def test_float32_of_either_byte_order_is_single_precision():

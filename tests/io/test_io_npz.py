@@ -322,11 +322,7 @@ def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tm
     with pytest.raises(lv.CapabilityError, match="singular"):
         lv.solve(loaded, "newton")
     meta = {"operator": "csr", "friction": "coulomb", "name": "", "names": None}
-    for n, sign in (
-        (1, "form of a quadratic program of 1 "),
-        (99, "program is 99"),
-        (-1, "program is -1"),
-    ):
+    for n, sign in ((1, "form of a quadratic program of 1 "), (99, "program is 99"), (-1, "program is -1")):
         changed = {"meta": np.frombuffer(json.dumps(meta | {"program": n}).encode(), np.uint8)}
         with pytest.raises(lv.InputError, match=sign):
             lavender.io.load(own(tmp_path, problem, **changed))

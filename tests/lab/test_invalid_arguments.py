@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 from extreme_problems import build_problem, problem_data
 from hypothesis import assume, given, reject
-from invalid_values import (
-    Call,
-    check_every_public_call,
-    check_malformed_arguments,
-    check_memory_layouts,
-    public_calls,
-)
+from invalid_values import Call, make_tests_of_calls
 from random_families import wild
 from random_problems import nearly_singular, random_contact_problem, seeds, warmed
 from worked import after
@@ -70,33 +64,18 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        (
-            "CrossCheck",
-            "MotionError",
-            "SlipExplanation",
-            "Redundancy",
-            "Diagnostic",
-        ),
+        ("CrossCheck", "MotionError", "SlipExplanation", "Redundancy", "Diagnostic"),
         "a result: the package makes it",
     ),
     "CrossCheck.__getitem__": "a mapping by the names of solvers",
 }
 
 
-def test_every_public_call_of_the_lab_is_in_the_table():
-    check_every_public_call(public_calls("lab"), CALLS, NOT_CALLED)
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_malformed_arguments_are_rejected_by_name(name):
-    check_malformed_arguments(name, CALLS[name])
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_arrays_in_any_memory_layout_give_the_same_result(name):
-    check_memory_layouts(CALLS[name])
+(
+    test_every_public_call_of_the_lab_is_in_the_table,
+    test_malformed_arguments_are_rejected_by_name,
+    test_arrays_in_any_memory_layout_give_the_same_result,
+) = make_tests_of_calls("lab", CALLS, NOT_CALLED)
 
 
 # -- extreme numbers ------------------------------------------------------------------------------------------------

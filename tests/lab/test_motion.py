@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import (
-    as_matrix,
-    random_contact_problem,
-    random_generalized_problem,
-    random_lcp,
-    seeds,
-)
+from random_problems import as_matrix, random_contact_problem, random_generalized_problem, random_lcp, seeds
 
 import lavender as lv
 

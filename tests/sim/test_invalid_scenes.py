@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 from extreme_problems import SPECIAL
 from hypothesis import given, reject
-from invalid_values import (
-    Call,
-    check_every_public_call,
-    check_malformed_arguments,
-    check_memory_layouts,
-    public_calls,
-)
+from invalid_values import Call, make_tests_of_calls
 from worked import after, python
 
 import lavender as lv
@@ -121,20 +115,11 @@ NOT_CALLED = {
 }  # fmt: skip
 
 
-def test_every_public_call_of_the_engine_is_in_the_table():
-    check_every_public_call(public_calls("sim"), CALLS, NOT_CALLED)
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_malformed_arguments_are_rejected_by_name(name):
-    check_malformed_arguments(name, CALLS[name])
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", CALLS)
-def test_arrays_in_any_memory_layout_are_accepted(name):
-    check_memory_layouts(CALLS[name])
+(
+    test_every_public_call_of_the_engine_is_in_the_table,
+    test_malformed_arguments_are_rejected_by_name,
+    test_arrays_in_any_memory_layout_give_the_same_result,
+) = make_tests_of_calls("sim", CALLS, NOT_CALLED)
 
 
 @pytest.mark.parametrize(
