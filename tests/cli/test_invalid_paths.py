@@ -34,7 +34,7 @@ from lavender.io.stored import (
     write_text,
 )
 from lavender.lab.bench import machine
-from lavender.lab.bench.record import KINDS, Skip, escape_unprintable, make_file_name, to_json
+from lavender.lab.bench.record import KINDS, Skip, make_file_name, to_json
 from lavender.lab.bench.store import Records, Store
 from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
@@ -365,17 +365,8 @@ def test_a_new_recording_removes_the_description_of_the_old_one(tmp_path):
 # -- commands that write -----------------------------------------------------------------------------------------
 
 QUICK = (
-    "--solvers",
-    "pgs",
-    "--tolerances",
-    "1e-3",
-    "--budgets",
-    "4",
-    "--repeats",
-    "1",
-    "--orders",
-    "reverse",
-)
+    "--solvers", "pgs", "--tolerances", "1e-3", "--budgets", "4", "--repeats", "1", "--orders", "reverse",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -507,11 +498,6 @@ def check_command(code, text, statuses=(0, 1, 2, 3)):
 def test_any_number_on_the_command_line_gives_a_documented_status(lavender, words, value):
     code, out, err = lavender(*(word.format(value) for word in words))
     check_command(code, out + err)
-
-
-def test_characters_that_cannot_be_shown_are_written_as_their_codes():
-    assert escape_unprintable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
-    assert escape_unprintable("a\nb\r", lines=True) == "a\nb\\r"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file names of POSIX")
