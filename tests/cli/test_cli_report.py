@@ -183,7 +183,7 @@ def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_path):
     # A problem that nothing solves in the time: every run to a tolerance takes its limit.
     out = tmp_path / "out"
@@ -283,6 +283,7 @@ if "popen_loky" in " ".join(sys.orig_argv):
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
 def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alone(tmp_path):
     """The terminal sends the signal to all of its processes, where the first worker begins its imports."""

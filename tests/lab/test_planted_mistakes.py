@@ -147,6 +147,7 @@ def kinds(problem, **state):
     return {diagnostic.kind for diagnostic in lv.diagnose(problem, **state)}
 
 
+@pytest.mark.nightly
 def test_the_page_has_the_share_of_each_mistake_that_is_found(scenes):
     """The mistake is found if something is reported that is not reported without it."""
     found = {}

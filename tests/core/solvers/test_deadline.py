@@ -259,7 +259,7 @@ SPEC = lv.SolverSpec("slow_plug_in", "slow_plug_in:Copied", laws={"lcp"}, summar
 """
 
 
-@pytest.mark.parametrize("name", ["osqp", "slow_plug_in"])
+@pytest.mark.parametrize("name", [pytest.param("osqp", marks=pytest.mark.nightly), "slow_plug_in"])
 def test_code_of_others_is_imported_before_the_clock_of_its_first_limit(name, tmp_path):
     """A plug-in's first solve was late; a backend's process was ended in its import, at every call."""
     if name == "osqp":

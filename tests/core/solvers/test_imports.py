@@ -114,6 +114,7 @@ for solver, kind in (words.split(": ") for words in sys.argv[1:]):
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
 def test_the_clock_of_a_limit_holds_no_import_of_scipy():
     """Counted and never done, it made every call of a process within 0.3 s late: a set-up of 1 ms never began."""

@@ -226,7 +226,14 @@ COMMANDS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("given", "workers", "later"), COMMANDS.values(), ids=COMMANDS)
+@pytest.mark.parametrize(
+    ("given", "workers", "later"),
+    [
+        pytest.param(*x, marks=[pytest.mark.nightly] * (x[1:] not in ((1, 1), (1, 2))))
+        for x in COMMANDS.values()
+    ],
+    ids=COMMANDS,
+)
 def test_the_same_command_goes_on_where_it_was_killed(given, workers, later, tmp_path):
     """Cut in the middle of a line; impulses that are carried from step to step come back, too."""
     path, events = tmp_path / "records.jsonl", []

@@ -148,7 +148,7 @@ def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
     assert not (tmp_path / "figures").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     distributed = pytest.importorskip(
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
@@ -178,7 +178,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     assert lines(found) == lines(expected)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_after_a_cluster_that_goes_midway_the_next_run_goes_on(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
     names, path = SEEDED, tmp_path / "records.jsonl"

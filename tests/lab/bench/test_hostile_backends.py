@@ -153,7 +153,7 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 
 @pytest.mark.slow
 @PROC
-@pytest.mark.parametrize("how", ["fork", "escape"])
+@pytest.mark.parametrize("how", ["fork", pytest.param("escape", marks=pytest.mark.nightly)])
 def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
     """Its child ends with it, or has left the group and keeps the pipe."""
     monkeypatch.setattr(bench_worker, "GRACE_TIME", 0.5)
@@ -225,7 +225,7 @@ def children(pid):
     return [c for child in found for c in (child, *children(child))]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(
     not os.path.exists(f"/proc/self/task/{os.getpid()}/children"), reason="children are seen in Linux's /proc"
 )

@@ -43,7 +43,7 @@ def simulate(name, rate, seconds, solver="sequential_impulses", **parameters):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("rate", [60, 120])
+@pytest.mark.parametrize("rate", [60, pytest.param(120, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_of_the_gallery_keeps_its_energy_and_its_place(name, rate):
     result = simulate(name, rate, 5.0, **SMALLER.get(name, {}))
