@@ -563,7 +563,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
-        Sweeps("anderson", log).sweep_until_deadline()
+        sweep_until_deadline(log, tree, steps)
         return
     lines = iter(tree)
     # Check this first, because the tree computes costs before it yields the next stage.
@@ -589,7 +589,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                     steps,
                     min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds()),
                 ):
-                    step.sweep_until_deadline()
+                    sweep_until_deadline(log, tree, steps)
                     return
             elif isinstance(step, RelaxedNewton):
                 step.over = step.late = not tree.has_time("newton", stage.cost)
@@ -599,7 +599,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                 )
             elif step.state is None:
                 setup = estimate_cost(stage.solver, log.problem).setup
-                step.over = log.deadline.has_passed(1e-9 * setup / DECISIONS.time_share)
+                step.over = step.late = log.deadline.has_passed(1e-9 * setup / DECISIONS.time_share)
+            log.timed_out = log.timed_out or step.late
         is_hopeless = isinstance(step, Sweeps) and step.is_hopeless(stage.least)
         if step.over or is_hopeless:
             tree.remaining_cost += stage.cost
@@ -609,6 +610,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             tree.best = log.best
         if stage.position and not log.done() and solve_unsolved_islands(log, stage.position + 1):
             return
+    if log.timed_out and not log.done():
+        sweep_until_deadline(log, tree, steps)
     if (
         log.best > log.tol
         and log.certificate is None
@@ -636,6 +639,20 @@ def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
     log.judge_and_store_best(result)
     log.record_part(claim, rows)
     return True
+
+
+def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Step]) -> None:
+    """Use the remaining time for sweeps, and for `nncg` if they end: no factorising solver would end in time."""
+    log.timed_out = True
+    for name in ("anderson", "nncg"):
+        step = steps.get(name) or create_solver_step(name, log, tree)
+        if not step.over:
+            step.least = inf
+            if isinstance(step, Sweeps):
+                step.time_fraction = 1.0
+            step.run(inf)
+        if log.done():
+            return
 
 
 def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:

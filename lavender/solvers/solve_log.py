@@ -54,7 +54,7 @@ class SolveLog:
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
         self.remark = ""  # Message of the solve of some islands.
-        # The solve ended before the deadline, because the remaining time was too short.
+        # A stage was left out or ended early, because the remaining time was too short.
         self.timed_out = False
         # Smallest relative residual, and the impulse (m,) [N s] with this residual.
         self.best, self.impulse = (
@@ -188,7 +188,7 @@ class SolveLog:
             return Status.CONVERGED
         if self.is_at_floor():
             return Status.ROUNDOFF_LIMIT
-        if self.timed_out or self.deadline.has_passed():
+        if self.deadline.has_passed():
             return Status.TIME_LIMIT
         if self.remaining_iterations <= 0:
             return Status.MAX_ITERATIONS
@@ -197,6 +197,8 @@ class SolveLog:
     def make_claim(self) -> Claim:
         """Return the claim of the complete solve."""
         status = self.status
+        if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
+            status = Status.TIME_LIMIT
         no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
         no_work = NO_WORK_MESSAGES.get(status, no_work)
         message = describe_stages(self.stages) or ("" if self.failure else no_work)

@@ -113,6 +113,7 @@ class Step:
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
         self.late = claim.status is Status.TIME_LIMIT
+        log.timed_out = log.timed_out or self.late
         log.record_stage(self.name, claim, before)
 
     def advance(self, n: int) -> Claim:
@@ -210,7 +211,7 @@ class Iterations(Step):
 class Sweeps(Iterations):
     """Sweeps that stop if more than `least` remaining sweeps are predicted.
 
-    With a time limit, they use a part of the remaining time, or all of it in `sweep_until_deadline`.
+    With a time limit, they use a part of the remaining time, or all of it in `auto.sweep_until_deadline`.
     """
 
     time_fraction = DECISIONS.time_share
@@ -291,12 +292,6 @@ class Sweeps(Iterations):
         island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
         self.n_islands = len(table)
         return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
-
-    def sweep_until_deadline(self) -> None:
-        """Sweep until the remaining time is used up."""
-        self.time_fraction, self.least = 1.0, np.inf
-        self.run(np.inf)
-        self.log.timed_out = self.late
 
 
 class RelaxedNewton(Step):
