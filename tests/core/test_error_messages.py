@@ -3,14 +3,20 @@
 import copy
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from gradient_problems import drawn, table
-from random_problems import as_matrix, dragged, random_contact_problem, random_generalized_problem
+from random_problems import (
+    as_matrix,
+    dragged,
+    random_bodies_and_contacts,
+    random_contact_problem,
+    random_generalized_problem,
+)
 
 import lavender as lv
 from lavender.problem.ordering import compute_block_order
@@ -21,6 +27,7 @@ A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
 LCP = lv.Problem.lcp(A, B)
 TINY = lv.Problem.lcp([[2.0]], [1.0])
 CONTACT = lv.Problem.contact(I3, [10.0, 6.0, 0.0], mu=[0.5])
+ROWS, ONE = random_bodies_and_contacts(np.random.default_rng(0)), sp.coo_array(np.ones(2))
 GENERAL = random_generalized_problem(9, "cone")
 PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(I3, (2, 1, 1))
 contacts, bounded = lv.Cones.contacts, lv.Cones.bounded
@@ -45,6 +52,17 @@ def two():
 def two_rows(jac=(1.0, 1.0), mass=(1.0, 1.0), v_free=(1.0, 1.0), **more):
     """Build two rows on two velocities that nothing couples."""
     return lv.Problem.from_jacobian(np.diag(jac), np.diag(mass), v_free, cones=lv.Cones.free(2), **more)
+
+
+def shortened():
+    """Return a sparse A that has lost a number."""
+    a = sp.csr_array(np.eye(2))
+    a.data = a.data[:1]
+    return a
+
+
+def rows_with(**changes):
+    return lv.Rows(**{f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"} | changes)
 
 
 def batch(**changes):
@@ -165,6 +183,45 @@ ERRORS = {
         (lambda: GENERAL.updated(b=GENERAL.b, target=0.0), "give one of the two"),
         (lambda: as_matrix(GENERAL).updated(v_free=GENERAL.generalized.v_free, target=0.0), "generalised coordinates"),
         (lambda: GENERAL.updated(J=GENERAL.generalized.jac[:, 1:], target=0.0), "J has shape"),
+        # Problems and rows
+        (lambda: lv.Problem.lcp(sp.csr_array([[1.0, 0.0], [2.0, INF]]), [1, 1]), r"entry \[1, 1\] is inf"),
+        (lambda: lv.Problem.lcp(shortened(), [1, 1]), "A is not a valid compressed matrix"),
+        (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
+        (lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]), r"\(2, 2\) is needed"),
+        (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
+        (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows, which is not a multiple"),
+        (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangent rows"),
+        *((partial(lv.Problem.contact, I3, np.ones(3), [1], friction=law), "'coulomb' or 'cone'")
+          for law in ("couloumb", np.array([0.5, 0.5]))),
+        (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 entries for 2 blocks"),
+        (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
+        (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already contains compliance on its diagonal"),
+        (lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=ROWS), "exactly one is needed"),
+        (lambda: lv.Problem(np.ones(4), contacts(0.5, 3), np.eye(4)), "law is not supported for a round cone"),
+        (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "exactly one is needed"),
+        (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
+        (lambda: lv.Generalized(ONE, I2, [0, 0]), r"J has shape \(2,\)"),
+        (lambda: lv.Generalized(I2, ONE, [0, 0]), r"M has shape \(2,\)"),
+        (lambda: lv.Generalized(I2, sp.coo_array(np.ones((2, 2, 2))), [0, 0]), "a square"),
+        (lambda: contacts(ONE), "mu has dtype object"),
+        *((partial(lv.Problem.lcp, I2, [1, 1], names=names), "a sequence of 2 words") for names in (7, np.array("x"))),
+        (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
+        (lambda: lv.Problem.contact(I3, np.ones(3), 10.0).boxed(1e60), r"mu N \[N s\] must be at most 1e\+60"),
+        *((partial(rows_with, **changes), words) for changes, words in (
+            ({"contact_body": np.full((8, 2), [0, 9])}, "body 9; there are 5 bodies"),
+            ({"contact_body": np.full((8, 2), [0, -2])}, "body -2"),
+            ({"contact_body": np.full((8, 2), [3, 3])}, r"is \[3, 3\]; two different"),
+            ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
+            ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+            ({"normal": np.tile([1e60, 1e60, 0], (8, 1)), "tangent": np.tile([1e60, -1e60, 0], (8, 1))},
+             r"off by 1.4e\+60"),
+            ({"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))}, "orthogonal"))),
+        *((partial(lv.Problem.from_jacobian, np.eye(6), np.eye(6), np.ones(6), **bounds), words) for bounds, words in (
+            ({}, "cones and mu are missing"),
+            ({"mu": 0.7, "cones": contacts([0.7] * 2)}, "cones and mu are both given"),
+            ({"cones": contacts([0.7] * 2), "tangents": 2}, "tangents has no effect without mu"),
+            ({"mu": [0.7] * 3}, "J has 6 rows and mu 3 values.*tangents=1"),
+            ({"mu": [0.7] * 4}, "J has 6 rows, which is not a multiple of the 4 values of mu"), ({"mu": -0.7}, "mu"))),
         # RowBuilder
         (lambda: plane().ball(0, 7, (0, 0)), "b is 7; the number of one of the 1 bodies"),
         (lambda: plane().ball(None, -1, (0, 0)), "a and b are both the static world"),

@@ -12,7 +12,6 @@ from random_problems import (
     FORMS,
     arrays_of,
     as_matrix,
-    random_bodies_and_contacts,
     random_contact_problem,
     random_lcp,
     seeds,
@@ -127,121 +126,7 @@ def test_one_mu_for_each_contact_and_a_scalar_for_all():
     assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
 
 
-# -- bad input ---------------------------------------------------------------------------------------------
-
-INF = np.inf
-ONE = sp.coo_array(np.ones(2))
-
-
-def shortened():
-    a = sp.csr_array(np.eye(2))
-    a.data = a.data[:1]
-    return a
-
-
-BAD_PROBLEMS = {
-    "its place in sparse A": (
-        lambda: lv.Problem.lcp(sp.csr_array([[1.0, 0.0], [2.0, INF]]), [1, 1]),
-        r"entry \[1, 1\] is inf",
-    ),
-    "sparse A that has lost a number": (
-        lambda: lv.Problem.lcp(shortened(), [1, 1]),
-        "A is not a valid compressed matrix",
-    ),
-    "not square": (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
-    "sparse, not square": (
-        lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]),
-        r"\(2, 2\) is needed",
-    ),
-    "lower > upper": (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
-    "rows per contact": (
-        lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]),
-        "5 rows, which is not a multiple",
-    ),
-    "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangent rows"),
-    "law": (
-        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
-        "'coulomb' or 'cone'",
-    ),
-    "law of numbers": (
-        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction=np.array([0.5, 0.5])),
-        "'coulomb' or 'cone'",
-    ),
-    "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 entries for 2 blocks"),
-    "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
-    "compliance": (
-        lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]),
-        "already contains compliance on its diagonal",
-    ),
-    "both forms": (
-        lambda: lv.Problem(
-            np.ones(2), lv.Cones.free(2), I2, rows=random_bodies_and_contacts(np.random.default_rng(0))
-        ),
-        "exactly one is needed",
-    ),
-    "round cones under Coulomb's law": (
-        lambda: lv.Problem(np.ones(4), lv.Cones.contacts(0.5, 3), np.eye(4)),
-        "law is not supported for a round cone",
-    ),
-    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "exactly one is needed"),
-    "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
-    "sparse J of one dimension": (lambda: lv.Generalized(ONE, I2, [0, 0]), r"J has shape \(2,\)"),
-    "sparse M of one dimension": (lambda: lv.Generalized(I2, ONE, [0, 0]), r"M has shape \(2,\)"),
-    "sparse M of three dimensions": (
-        lambda: lv.Generalized(I2, sp.coo_array(np.ones((2, 2, 2))), [0, 0]),
-        "a square",
-    ),
-    "sparse mu": (lambda: lv.Cones.contacts(ONE), "mu has dtype object"),
-    "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
-    "names are one word alone": (
-        lambda: lv.Problem.lcp(I2, [1, 1], names=np.array("x")),
-        "a sequence of 2 words",
-    ),
-    "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
-    "friction beyond float64": (
-        lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e60),
-        r"mu N \[N s\] must be at most 1e\+60",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD_PROBLEMS)
-def test_bad_problems_say_what_came_and_what_was_needed(case):
-    make, message = BAD_PROBLEMS[case]
-    with pytest.raises(lv.InputError, match=message) as raised:
-        make()
-    assert isinstance(raised.value, ValueError)
-    assert isinstance(raised.value, lv.LavenderError)
-
-
-def rows_with(**changes):
-    rows = random_bodies_and_contacts(np.random.default_rng(0))
-    values = {f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "copy"}
-    return lv.Rows(**{**values, **changes})
-
-
-BAD_ROWS = {
-    "missing body": ({"contact_body": np.full((8, 2), [0, 9])}, "body 9; there are 5 bodies"),
-    "body -2": ({"contact_body": np.full((8, 2), [0, -2])}, "body -2"),
-    "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "is \\[3, 3\\]; two different"),
-    "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
-    "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
-    "axes whose product is inf - inf": (
-        {"normal": np.tile([1e60, 1e60, 0], (8, 1)), "tangent": np.tile([1e60, -1e60, 0], (8, 1))},
-        "off by 1.4e\\+60",
-    ),
-    "tangent": (
-        {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
-        "orthogonal",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD_ROWS)
-def test_bad_rows_say_what_came_and_what_was_needed(case):
-    changes, message = BAD_ROWS[case]
-    with pytest.raises(lv.InputError, match=message):
-        rows_with(**changes)
+# -- copies and interruptions ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -407,19 +292,3 @@ def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangen
     cones = lv.Cones.contacts(np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0])
     assert problem == lv.Problem.from_jacobian(jac, mass, v, cones=cones)
     assert problem.cones.n_tangents.tolist() == tangents
-
-
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
-        ({}, "cones and mu are missing"),
-        ({"mu": 0.7, "cones": lv.Cones.contacts([0.7] * 2)}, "cones and mu are both given"),
-        ({"cones": lv.Cones.contacts([0.7] * 2), "tangents": 2}, "tangents has no effect without mu"),
-        ({"mu": [0.7] * 3}, "J has 6 rows and mu 3 values.*tangents=1"),
-        ({"mu": [0.7] * 4}, "J has 6 rows, which is not a multiple of the 4 values of mu"),
-        ({"mu": -0.7}, "mu"),
-    ],
-)
-def test_from_jacobian_with_bounds_that_do_not_fit_says_so(bounds, words):
-    with pytest.raises(lv.InputError, match=words):
-        lv.Problem.from_jacobian(np.eye(6), np.eye(6), np.ones(6), **bounds)
