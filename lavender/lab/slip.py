@@ -23,7 +23,7 @@ norms of vector differences, so the parts of one contact can add up to more than
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,6 +57,9 @@ REMEDIES = {
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
+REMEDY_STEPS = (
+    25  # Settings are compared again after this number of further steps, when creep has become steady.
+)
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 
 
@@ -87,6 +90,25 @@ class SlipVariant:
         return np.array([np.linalg.norm(v) for v in self.velocity])
 
 
+@dataclass(frozen=True)
+class Remedy:
+    """Slip of the fastest contact with a setting of MuJoCo.
+
+    Parameters
+    ----------
+    setting : str
+        Text for the model's file; the first remedy of an explanation is the model without a change.
+    slip : float, m/s
+        Mean speed of the contact's points in the explained step, simulated with the setting.
+    later : float, m/s
+        The same after `REMEDY_STEPS` further steps; nan if the geoms no longer touch.
+    """
+
+    setting: str
+    slip: float
+    later: float
+
+
 @dataclass(frozen=True, eq=False)
 class SlipExplanation:
     """Slip of contacts in each variant of one step; `str()` gives the table and the sentence.
@@ -97,10 +119,13 @@ class SlipExplanation:
         Names of the chosen contacts.
     variants : tuple of SlipVariant
         In the order of replacement.
+    remedies : tuple of Remedy
+        Settings that were simulated, if the model is known and this is its state with the fastest contact.
     """
 
     contacts: tuple[str, ...]
     variants: tuple[SlipVariant, ...]
+    remedies: tuple[Remedy, ...] = ()
 
     def __str__(self) -> str:
         rows = [self.table.heads, *self.table.rows]
@@ -140,6 +165,16 @@ class SlipExplanation:
         return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))
 
     @property
+    def remedies_table(self) -> Table:
+        """Slip of the fastest contact with each setting [m/s], in the explained step and later."""
+        heads = ["setting", "slip [m/s]", f"{REMEDY_STEPS} steps later [m/s]"]
+        rows = [
+            [r.setting, *(NONE if np.isnan(x) else format_size(x) for x in (r.slip, r.later))]
+            for r in self.remedies
+        ]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
     def sentence(self) -> str:
         """The contact with the largest slip and its cause in one sentence."""
         if not self.contacts:
@@ -153,6 +188,18 @@ class SlipExplanation:
         return (
             f"{self.contacts[i]} slides fastest, with {format_size(speed)} m/s; the largest part, "
             f"{format_size(part)} m/s, is caused by: {cause}.{notes} Remedy: {REMEDIES[cause]}."
+            f"{self._format_best_remedy()}"
+        )
+
+    def _format_best_remedy(self) -> str:
+        """Return a sentence about the setting with the least slip later, or nothing if none reduces it."""
+        kept = [r for r in self.remedies if not np.isnan(r.later)]
+        best = min(kept, key=lambda r: r.later, default=None)
+        if best is None or best is self.remedies[0]:
+            return ""
+        return (
+            f" Of the settings below, {best.setting} leaves the least slip: {format_size(best.later)} m/s after "
+            f"{REMEDY_STEPS} further steps, in place of {format_size(kept[0].later)} m/s."
         )
 
 
@@ -202,7 +249,6 @@ def explain_slip(
     measured = problem if disk is None else disk
     check_problem(measured)
     blocks = _choose_contacts(measured, contacts)
-    jacobian = measured.jacobian.tocsr()
     free, own_free = (p.velocity(np.zeros(p.m)) for p in (measured, problem))
     if own_free.shape != free.shape:
         raise InputError(
@@ -216,13 +262,8 @@ def explain_slip(
     )
 
     def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
-        velocity = changed.velocity(impulse).ravel()
-        return tuple(jacobian[rows] @ velocity - surface[rows] for rows in rows_of_contacts)
+        return _compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
 
-    cones = measured.cones
-    rows_of_contacts = [
-        np.arange(cones.ptr[k] + 1, cones.ptr[k] + 1 + min(2, int(cones.n_tangents[k]))) for k in blocks
-    ]
     variants = [SlipVariant("engine", slip(problem, answer), residual(problem, answer).relative)]
 
     def solve_and_add_variant(
@@ -258,6 +299,19 @@ def explain_slip(
     start = solve_and_add_variant("coulomb", rigid, start, law_note)
     names = tuple(measured.block_name(k) for k in blocks)
     return SlipExplanation(names, tuple(variants))
+
+
+def _compute_slip(
+    problem: Problem, blocks: Sequence[int], velocity: FloatArray, surface: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Return the tangential velocity of each contact minus the surface's (tangents,) [m/s]."""
+    jacobian, cones = problem.jacobian.tocsr(), problem.cones
+    starts = [int(cones.ptr[k]) + 1 for k in blocks]
+    rows_of_contacts = [
+        slice(start, start + min(2, int(cones.n_tangents[k])))
+        for start, k in zip(starts, blocks, strict=True)
+    ]
+    return tuple(jacobian[rows] @ velocity - surface[rows] for rows in rows_of_contacts)
 
 
 def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
@@ -342,27 +396,37 @@ def explain_slip_of_states(
     states : path of an .npz, "keyframes", or arrays, optional
         As for `lavender.audit`: `states.npz` of an audit or a recording. Default: the model's initial state.
     contacts : names or a part of names, optional
-        Geoms of the contacts to explain; default: all.
+        Geoms of the contacts to explain; default: all. States in which these geoms touch nothing are skipped.
     steps : int, default 1
         Steps that are simulated from each state, with its controls and without sleep; the last one is explained.
 
     Returns
     -------
     list of SlipExplanation
-        One for each state that has a contact with friction.
+        One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings
+        of MuJoCo, each simulated from this state.
+
+    Raises
+    ------
+    InputError
+        No geom has one of the names.
     """
     from lavender.io import mujoco as adapter
     from lavender.io.states import read_states, without_sleep
 
     mj = adapter.import_mujoco()
     model = without_sleep(mj, model)
-    data = mj.MjData(model)
+    entries = [contacts] if isinstance(contacts, str) else list(contacts or ())
+    geoms = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) or str(i) for i in range(model.ngeom)]
+    for entry in entries:
+        if model.nflex == 0 and not any(entry in name for name in geoms):
+            known = ", ".join(geoms[:8])
+            raise InputError(
+                f"contacts names {entry!r}, but no geom's name contains it; the geoms are {known}"
+            )
+    data, before = mj.MjData(model), np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
     vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
-    round_model = None
-    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
-        round_model = copy.deepcopy(model)
-        round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
-    explanations = []
+    explanations, fastest, start = [], -1, before
     for vector in vectors:
         mj.mj_resetData(model, data)
         if vector is not None:
@@ -370,29 +434,108 @@ def explain_slip_of_states(
         for _ in range(steps - 1):
             mj.mj_step(model, data)
         mj.mj_forward(model, data)
-        problem, final = adapter.from_mujoco(model, data), data
-        disk = None
-        if round_model is not None:
-            other = mj.MjData(round_model)
-            state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-            mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-            mj.mj_setState(round_model, other, state, mj.mjtState.mjSTATE_INTEGRATION)
-            mj.mj_forward(round_model, other)
-            disk, final = adapter.from_mujoco(round_model, other), other
-        measured, surface = problem if disk is None else disk, None
-        if getattr(model, "flg_surfacevel", False):  # MuJoCo subtracts the surfaces' velocities from J v.
-            surface = measured.jacobian @ data.qvel - final.efc_vel
-        if measured.cones.n_tangents.any():
+        mj.mj_getState(model, data, before, mj.mjtState.mjSTATE_INTEGRATION)
+        problem, disk, surface = _read_step(mj, model, data)
+        measured = problem if disk is None else disk
+        names = [measured.block_name(k) for k in np.flatnonzero(measured.cones.n_tangents > 0).tolist()]
+        touching = [entry for entry in entries if any(entry in name for name in names)]
+        if touching or (names and not entries):
             explanations.append(
                 explain_slip(
                     problem,
                     adapter.impulse(model, data),
-                    contacts=contacts,
+                    contacts=touching or None,
                     disk=disk,
                     surface_velocity=surface,
                 )
             )
+            if fastest < 0 or _get_largest_speed(explanations[-1]) > _get_largest_speed(
+                explanations[fastest]
+            ):
+                fastest, start = len(explanations) - 1, before.copy()
+    if fastest >= 0 and _get_largest_speed(explanations[fastest]) > MIN_EXPLAINED_SLIP:
+        speeds = explanations[fastest].variants[0].speeds
+        name = _get_geoms(explanations[fastest].contacts[int(np.argmax(speeds))])
+        remedies = tuple(
+            Remedy(text, *(_simulate_slip(mj, changed, start, name, n) for n in (0, REMEDY_STEPS)))
+            for text, changed in _change_settings(mj, model)
+        )
+        explanations[fastest] = replace(explanations[fastest], remedies=remedies)
     return explanations
+
+
+def _get_largest_speed(explanation: SlipExplanation) -> float:
+    """Return the sliding speed of the fastest contact [m/s]."""
+    return float(explanation.variants[0].speeds.max(initial=0.0))
+
+
+def _get_geoms(contact: str) -> str:
+    """Return the names of both geoms of a contact, without the contact's number."""
+    return contact.partition(" (")[2].rstrip(")") or contact
+
+
+def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None, FloatArray | None]:
+    """Return a step's problem, the one with disks if cones are pyramids, and surface velocities if geoms have them."""
+    from lavender.io import mujoco as adapter
+
+    problem, disk, final = adapter.from_mujoco(model, data), None, data
+    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
+        round_model = copy.deepcopy(model)
+        round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
+        final = mj.MjData(round_model)
+        state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_setState(round_model, final, state, mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_forward(round_model, final)
+        disk = adapter.from_mujoco(round_model, final)
+    if not getattr(model, "flg_surfacevel", False):
+        return problem, disk, None
+    measured = problem if disk is None else disk  # MuJoCo subtracts the surfaces' velocities from J v.
+    return problem, disk, measured.jacobian @ data.qvel - final.efc_vel
+
+
+def _change_settings(mj: Any, model: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the text of each setting that can reduce slip, with the changed model; first the model as it is."""
+    yield "as it is", model
+    ratio, iterations = 10.0 * model.opt.impratio, 10 * int(model.opt.iterations)
+    options: dict[str, dict[str, Any]] = {
+        f'iterations="{iterations}" tolerance="1e-12"': {"iterations": iterations, "tolerance": 1e-12},
+        f'impratio="{ratio:g}"': {"impratio": ratio},
+        'noslip_iterations="20"': {"noslip_iterations": 20},
+    }
+    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
+        cone = {"cone": mj.mjtCone.mjCONE_ELLIPTIC}
+        options |= {'cone="elliptic"': cone} | {
+            f'cone="elliptic" {text}': cone | values for text, values in list(options.items())[1:]
+        }
+    for text, values in options.items():
+        changed = copy.deepcopy(model)
+        for name, value in values.items():
+            setattr(changed.opt, name, value)
+        yield f"<option {text}/>", changed
+    shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
+    if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
+        changed = copy.deepcopy(model)
+        for solref in (changed.geom_solref, changed.pair_solref):
+            solref[:, 0] = np.where(solref[:, 0] > shortest, shortest, solref[:, 0])
+        yield f'<geom solref="{shortest:g} 1"/>', changed
+
+
+def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str, steps: int) -> float:
+    """Return the mean sliding speed [m/s] of two geoms in the step after `steps` steps; nan if they do not touch."""
+    data = mj.MjData(model)
+    mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    for _ in range(steps):
+        mj.mj_step(model, data)
+    mj.mj_forward(model, data)
+    problem, disk, surface = _read_step(mj, model, data)
+    measured = problem if disk is None else disk
+    sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
+    blocks = [k for k in sliding if _get_geoms(measured.block_name(k)) == geoms]
+    surface = _find_surface_velocity(measured) if surface is None else surface
+    mj.mj_step(model, data)
+    speeds = [np.linalg.norm(v) for v in _compute_slip(measured, blocks, data.qvel, surface)]
+    return float(np.mean(speeds)) if speeds else np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,9 +572,7 @@ def average_slip(explanations: Iterable[SlipExplanation]) -> list[AverageSlip]:
     parts: dict[str, dict[str, float]] = {}
     for explanation in explanations:
         for i, contact in enumerate(explanation.contacts):
-            key = (
-                contact.partition(" (")[2].rstrip(")") or contact
-            )  # Names of the geoms, without the contact's number.
+            key = _get_geoms(contact)
             speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
             sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
             for cause, sizes in explanation.parts.items():

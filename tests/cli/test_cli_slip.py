@@ -37,3 +37,16 @@ def test_no_contact_is_stated(lavender, tmp_path):
     code, output, _ = lavender("slip", tmp_path / "air.xml")
     assert code == 1 and "no contact with friction" in output
     assert lavender("slip", tmp_path / "air.xml", "--steps", 0)[0] == 2
+
+
+def test_a_geom_that_touches_nothing_is_named(lavender, tmp_path):
+    (tmp_path / "slope.xml").write_text(SLOPE.replace("0 0 .05", "0 0 5"))
+    code, output, _ = lavender("slip", tmp_path / "slope.xml", "--contact", "box")
+    assert code == 1 and "'box' touches nothing with friction in these states." in output
+
+
+def test_settings_are_shown_with_the_slip_that_they_leave(lavender, tmp_path):
+    (tmp_path / "slope.xml").write_text(SLOPE.replace("5.5 0 -8.1", "2 0 -9"))
+    code, output, _ = lavender("slip", tmp_path / "slope.xml", "--steps", 100)
+    assert code == 0 and '<option noslip_iterations="20"/> leaves the least slip' in " ".join(output.split())
+    assert output.count("<option") == 4 and '<geom solref="0.004 1"/>' in output

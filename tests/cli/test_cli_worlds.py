@@ -162,7 +162,7 @@ def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes
         (("slip", "--steps", 0), "lavender: --steps is 0;"),
         (
             ("slip", "--contact", "wheel"),
-            "lavender: --contact names 'wheel', but no contact's name contains it",
+            "lavender: --contact names 'wheel', but no geom's name contains it",
         ),
     ],
 )

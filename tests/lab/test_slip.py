@@ -1,11 +1,20 @@
 """The cause of slip of scenes whose answer is known."""
 
+import copy
+
 import numpy as np
 import pytest
 
 import lavender as lv
 from lavender.lab.report.text import NONE
-from lavender.lab.slip import CAUSES, average_slip, explain_slip, explain_slip_of_states, summarize_slip
+from lavender.lab.slip import (
+    CAUSES,
+    REMEDY_STEPS,
+    average_slip,
+    explain_slip,
+    explain_slip_of_states,
+    summarize_slip,
+)
 from lavender.lab.slip_figure import draw_slip
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -154,7 +163,7 @@ def test_chosen_contacts_and_summary():
     table = summarize_slip(explanations)
     assert [str(row[0]) for row in table.rows] == ["slope, box"]
     assert table.rows[0][-1] == "load above the friction limit"
-    with pytest.raises(lv.InputError, match="but no contact's name contains it"):
+    with pytest.raises(lv.InputError, match="but no geom's name contains it"):
         explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
 
 
@@ -258,3 +267,50 @@ def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
           </mujoco>""")
         explanation = explain_slip_of_states(model, steps=1000)[0]
         assert explanation.causes == ("no slip",) * len(explanation.contacts)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives(cone):
+    """Each <option> is pasted into the model, which then continues from the explained state in MuJoCo alone."""
+    angle, steps, state_kind = 0.3, 100, mujoco.mjtState.mjSTATE_INTEGRATION
+    model = block(angle, option=f'cone="{cone}"')
+    data = mujoco.MjData(model)
+    for _ in range(steps - 1):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    state = np.empty(mujoco.mj_stateSize(model, state_kind))
+    mujoco.mj_getState(model, data, state, state_kind)
+    (explanation,) = explain_slip_of_states(model, steps=steps)
+    settings = {remedy.setting: remedy for remedy in explanation.remedies}
+    assert next(iter(settings)) == "as it is" and '<geom solref="0.004 1"/>' in settings
+    assert ('<option cone="elliptic" noslip_iterations="20"/>' in settings) == (cone == "pyramidal")
+    for text, remedy in settings.items():
+        if not text.startswith("<option"):
+            continue
+        option = text.removeprefix("<option ").removesuffix("/>")
+        typed = block(angle, option=option if "cone=" in option else f'cone="{cone}" {option}')
+        data = mujoco.MjData(typed)
+        mujoco.mj_setState(typed, data, state, state_kind)
+        for expected, further in ((remedy.slip, 0), (remedy.later, REMEDY_STEPS)):
+            for _ in range(further):
+                mujoco.mj_step(typed, data)
+            mujoco.mj_forward(typed, data)
+            jacobians = np.zeros((data.ncon, 3, typed.nv))
+            for jacobian, point in zip(jacobians, data.contact.pos, strict=True):
+                mujoco.mj_jac(typed, data, jacobian, None, point, 1)
+            following = copy.deepcopy(data)
+            mujoco.mj_step(typed, following)
+            speeds = np.linalg.norm((jacobians @ following.qvel)[:, :2], axis=1)  # The normal is z.
+            assert speeds.mean() == pytest.approx(expected, rel=1e-6, abs=1e-12), text
+    best = min(explanation.remedies, key=lambda remedy: remedy.later)
+    assert best.setting in explanation.sentence
+    assert best.later < 0.3 * explanation.remedies[0].later
+
+
+def test_explain_slip_of_states_skips_states_in_which_the_geom_touches_nothing():
+    model = block(0.3, option='cone="elliptic"')
+    touching, flying = model.qpos0.copy(), model.qpos0.copy()
+    flying[2] = 5.0
+    states = {"qpos": np.array([flying, touching]), "qvel": np.zeros((2, model.nv))}
+    assert len(explain_slip_of_states(model, states, contacts="box", steps=20)) == 1
+    assert explain_slip_of_states(model, {k: x[:1] for k, x in states.items()}, contacts="box", steps=2) == []
