@@ -33,7 +33,7 @@ from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
 from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
-from lavender_ext.factor.graph import order_by_minimum_degree
+from lavender_ext.factor.graph import order_for_elimination
 
 # M is rejected if |M_ij - M_ji| exceeds this fraction of sqrt(M_ii M_jj); rounding of sums in float64 causes less.
 MAX_ASYMMETRY = 1e-12
@@ -478,7 +478,7 @@ def _order_by_degree(graph: sp.csr_array) -> IntArray:
     graph.setdiag(0)
     graph.eliminate_zeros()
     graph.sort_indices()
-    order: IntArray = order_by_minimum_degree(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[
+    order: IntArray = order_for_elimination(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[
         ::-1
     ]
     return order

@@ -9,7 +9,7 @@ from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
 
-def order_by_minimum_degree(const int32_t[::1] ptr, const int32_t[::1] near):
+def order_for_elimination(const int32_t[::1] ptr, const int32_t[::1] near):
     """Return the vertices (n,) in an elimination order. near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i itself."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
     cdef double[::1] scratch = np.empty(order_workspace_size(n, all_) // 2 + 1)

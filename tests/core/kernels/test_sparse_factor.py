@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavender.base.lu import splu
-from lavender_ext.factor.graph import order_by_minimum_degree
+from lavender_ext.factor.graph import order_for_elimination
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import extract_free_part, has_symmetric_pattern
 
@@ -80,7 +80,7 @@ def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
     for i, j in pairs:
         if i < n and j < n:
             met[i, j] = met[j, i] = 1.0
-    order = order_by_minimum_degree(*raw(met - np.eye(n)))
+    order = order_for_elimination(*raw(met - np.eye(n)))
     assert np.array_equal(np.sort(order), np.arange(n))
     of = np.repeat(np.arange(n), 1 + np.arange(n) % heavy)
     panels = LinearSystem(raw(met[of][:, of]))
@@ -123,10 +123,29 @@ def factor_of(matrix, order):
     return np.cumsum([0, *map(len, below)]), np.array([i for rows in below for i in sorted(rows)])
 
 
+@pytest.mark.parametrize("piles", [1, 3])
+def test_dissection_halves_the_work_of_minimum_degree_on_a_cube(piles):
+    """Blocks of a grid of 14 x 14 x 14 with 26 neighbours, alone or beside others: each vertex has one place."""
+    line = sp.diags_array([np.ones(13), np.ones(14), np.ones(13)], offsets=[-1, 0, 1])
+    cube = sp.csr_array(sp.kron(sp.kron(line, line), line))
+    graph = sp.csr_array(sp.block_diag([cube] * piles) - sp.eye_array(piles * 2744))
+    graph.eliminate_zeros()
+    graph.sort_indices()
+    order = order_for_elimination(*raw(graph))
+    assert np.array_equal(np.sort(order), np.arange(len(order)))
+    pattern = sp.csr_array(graph + sp.eye_array(graph.shape[0]))
+    work = [
+        (np.diff(factor_of(pattern, x)[0]) ** 2.0).sum()
+        for x in (order, LinearSystem(raw(pattern), True).order)
+    ]
+    # The order of LinearSystem is that of minimum degree. Other software for nested dissection reaches 0.4 as well.
+    assert work[0] < 0.5 * work[1]
+
+
 def test_columns_of_one_pattern_stand_beside_each_other():
     """Places are those of a postorder: what is below a vertex and not below its parent comes right before it."""
     matrix = grid(12)
-    order = order_by_minimum_degree(*raw(matrix))
+    order = order_for_elimination(*raw(matrix))
     lptr, lind = factor_of(matrix, order)
     size = np.ones(len(order), int)  # of the subtree of each
     has_parent = np.flatnonzero(np.diff(lptr))
