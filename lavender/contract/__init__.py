@@ -4,3 +4,4 @@ from lavender.contract.checks import CHECKS, Check, ContractError, list_checks
 from lavender.contract.run import check_solver
 
 __all__ = ["CHECKS", "Check", "ContractError", "check_solver", "list_checks"]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.

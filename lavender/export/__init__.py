@@ -8,3 +8,4 @@ from lavender.export.image import engine_image
 from lavender.export.library import HEADER, source, write
 
 __all__ = ["HEADER", "engine_image", "source", "write"]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.

@@ -59,6 +59,7 @@ __all__ = [
     "record",
     "save",
 ]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:

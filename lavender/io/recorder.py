@@ -133,6 +133,9 @@ class Recorder:
         self._removed: list[str] = []  # Files without a line, to be deleted after the lines are written.
         self._is_closed = False
 
+    def __repr__(self) -> str:
+        return f"<Recorder of {self.folder}: {self.n_steps} steps, {len(self.files)} files>"
+
     def __enter__(self) -> Recorder:
         return self
 

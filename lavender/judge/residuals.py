@@ -60,6 +60,7 @@ from lavender.base.arrays import (
     as_array,
     check_choice,
     check_float,
+    format_html_table,
     mark_read_only,
 )
 from lavender.base.errors import InputError
@@ -134,7 +135,7 @@ class Islands(NamedTuple):
     velocity_at_zero: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Residual:
     """Error of one impulse. `str()` is one line.
 
@@ -260,6 +261,23 @@ class Residual:
         get_zero_impulse_reference(problem)
         label, table = measure.residuals_by_island(problem.metric, self._impulse)
         return Islands(label, *table.T)
+
+    def __repr__(self) -> str:
+        return f"<Residual {self}>"
+
+    def _repr_html_(self) -> str:
+        """Return a small HTML table for notebooks."""
+        return format_html_table(self._facts | {"verdict": self.verdict}, "Residual")
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """Numbers for the tables of notebooks."""
+        return {
+            "relative residual": f"{self.relative:.2e}",
+            "energy": f"{self.energy:.2e} √J",
+            "worst row": f"{self.worst_name}, {self.velocity:.2g} m/s",
+            f"floor of {self.precision}": f"{self.roundoff_floor:.1e}",
+        }
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_choice, format_html_table, mark_read_only
+from lavender.base.arrays import FloatArray, check_choice, check_int, format_html_table, mark_read_only
 from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual, residual
@@ -124,7 +124,7 @@ class Claim:
     judged: Any = field(default=None, repr=False, compare=False)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class History:
     """Residuals at fixed iteration counts (`lavender.solve(..., history=True)`), in arrays of one length k.
 
@@ -158,13 +158,18 @@ class History:
             Horizontal axis.
         """
         check_choice("against", against, ("iterations", "time"))
-        require_packages("History.plot", "matplotlib")
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        figure, (axes,) = _make_figure("History.plot", 1)
+        self._draw(axes, against)
+        return figure
 
-        figure = Figure(figsize=(6.0, 4.0), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
+    def __repr__(self) -> str:
+        if not len(self.iterations):
+            return "<History without records>"
+        ends = f"relative {self.relative[0]:.2e} to {self.relative[-1]:.2e}"
+        return f"<History of {len(self.iterations)} records, {self.iterations[-1]} iterations, {ends}>"
+
+    def _draw(self, axes: Any, against: str = "iterations") -> None:
+        """Draw the relative residual into axes of matplotlib."""
         x = np.asarray(self.iterations if against == "iterations" else self.time)
         shown = self.relative > 0.0
         line = axes.semilogy(x[shown], self.relative[shown], marker="o", markersize=3)[0]
@@ -177,7 +182,17 @@ class History:
         axes.set_xlabel("iterations" if against == "iterations" else "time [s]")
         axes.set_ylabel("relative residual [-]")
         axes.grid(alpha=0.3)
-        return figure
+
+
+def _make_figure(caller: str, n_axes: int) -> tuple[Any, Any]:
+    """Return a figure of matplotlib, which needs no display, and its axes one below the other."""
+    require_packages(caller, "matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 4.0 * n_axes), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(n_axes, squeeze=False).flat
 
 
 @dataclass(frozen=True)
@@ -403,13 +418,29 @@ class Solution:
             return self
         raise SolveFailed(str(self))
 
+    def plot(self, rows: int = 10) -> Any:
+        """Plot the rows with the largest velocity errors, and the history if there is one; return the figure.
+
+        Parameters
+        ----------
+        rows : int, default 10
+            Number of rows that are shown.
+        """
+        figure, axes = _make_figure("Solution.plot", 1 if self.history is None else 2)
+        error = self.residual.velocity_by_row
+        worst = np.argsort(-error, kind="stable")[: check_int("rows", rows, 1)][::-1]
+        axes[0].barh([self.residual._problem.row_name(int(i)) for i in worst], error[worst])
+        axes[0].set(xlabel="velocity error [m/s]", title=f"{self.solver.name}: {self.status.name}")
+        if self.history is not None:
+            self.history._draw(axes[1])
+        return figure
+
     def _repr_html_(self) -> str:
         """Return a small HTML table of the result for notebooks."""
         facts = {
             "status": self.status.name,
-            "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
-            "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
-            "floor of float64": f"{self.residual.roundoff_floor:.1e}",
+            "tolerance": f"{self.tol:.0e}",
+            **self.residual._facts,
             "work": self._work_text,
             "time": self._time_text,
         }

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ class CrossCheckRow:
         return self.verdict in (CLAIM_CONTRADICTED, BREACH)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CrossCheck:
     """Result of `cross_check`; iterates over its rows, and `str()` gives a plain-text table.
 
@@ -173,12 +174,22 @@ class CrossCheck:
         verdicts = {row.verdict for row in self.rows} - {REFUSED}
         return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO}
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
+        return f"<CrossCheck of {len(self)} solvers: {len(self.agreed)} agree, {len(self.unsolved)} did not solve it>"
+
+    def _repr_html_(self) -> str:
+        """Return the table for notebooks."""
+        rows = ("".join(f"<td>{escape(text)}</td>" for text in line) for line in self._cells)
+        return f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+    @property
+    def _cells(self) -> list[Any]:
+        """Texts of the table, beginning with the heads of its columns."""
         head = (
             "solver", "verdict", "status", "relative", "floor", "error [m/s]", "distance [√J]", "allowed [√J]",
             "objective [J]", "time [ms]", "what ran",
         )  # fmt: skip
-        body = [
+        return [head] + [
             (
                 f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
                 _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.velocity),
@@ -187,10 +198,11 @@ class CrossCheck:
             )
             for r in self.rows
         ]  # fmt: skip
-        widths = [max(len(line[i]) for line in (head, *body)) for i in range(len(head))]
+
+    def __str__(self) -> str:
+        widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
         lines = [
-            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip()
-            for line in (head, *body)
+            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in self._cells
         ]
         name = self.problem.name or f"{self.problem.m} rows"
         reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"

@@ -85,7 +85,7 @@ CONTACT_ROWS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cones:
     """Bounds of k blocks with m rows, built by `Cones.free`, `Cones.bounded` and `Cones.contacts`, joined by `+`.
 
@@ -211,6 +211,10 @@ class Cones:
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         rolling = as_array("rolling", self.rolling, (k,), unit="m")
         return ptr, kind, lower, upper, mu, radius, rolling
+
+    def __repr__(self) -> str:
+        contacts = int(np.count_nonzero(self.is_contact))
+        return f"<Cones of {contacts} contacts and {len(self.kind) - contacts} other blocks, {self.ptr[-1]} rows>"
 
     @classmethod
     def bounded(cls, lower: ArrayLike, upper: ArrayLike) -> Cones:

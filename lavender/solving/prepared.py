@@ -155,6 +155,9 @@ class Prepared:
             self._prepare_solver(NEVER)
         self.setup_time = watch.elapsed_seconds
 
+    def __repr__(self) -> str:
+        return f"<Prepared {self.spec.name} for {self._original!r}>"
+
     solver: Any = None  # Created when it is first needed.
     setup_time = 0.0  # [s] Time of the preparation.
     _is_fresh = True  # Whether no solve has used the state yet.

@@ -50,3 +50,4 @@ __all__ = [
     "write_csv",
     "write_json",
 ]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.

@@ -35,3 +35,4 @@ __all__ = [
     "summarize_runs_by_case",
     "write",
 ]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.

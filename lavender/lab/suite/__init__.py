@@ -79,6 +79,7 @@ __all__ = [
     "two_particles",
     "walking",
 ]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 # Models of each package in the set "robots".
 ROBOTS = {

@@ -7,3 +7,4 @@ from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.values import SOLVER_FIELDS
 
 __all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run"]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.

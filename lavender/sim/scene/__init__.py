@@ -16,3 +16,4 @@ __all__ = [
     "Sphere",
     "named_scene",
 ]
+__dir__ = sorted(__all__).copy  # Completion shows public names only.
