@@ -517,7 +517,7 @@ def _change_settings(mj: Any, model: Any) -> Iterator[tuple[str, Any]]:
     if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
         changed = copy.deepcopy(model)
         for solref in (changed.geom_solref, changed.pair_solref):
-            solref[:, 0] = np.where(solref[:, 0] > shortest, shortest, solref[:, 0])
+            solref[solref[:, 0] > shortest] = shortest, 1.0
         yield f'<geom solref="{shortest:g} 1"/>', changed
 
 
