@@ -16,6 +16,7 @@ Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other
 Submodules and the engine are imported at their first use.
 """
 
+import sys
 from typing import TYPE_CHECKING
 
 import lavender.base.check_build  # noqa: F401 - first: explains why kernels cannot be imported
@@ -188,7 +189,8 @@ if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they rep
         elif name in _MODULE_OF_NAME:
             value = getattr(import_module_under_lock(_MODULE_OF_NAME[name]), name)
         else:
-            raise AttributeError(f"module 'lavender' has no attribute {name!r}", name=name)
+            module = sys.modules[__name__]
+            raise AttributeError(f"module 'lavender' has no attribute {name!r}", name=name, obj=module)
         globals()[name] = value
         return value
 
