@@ -364,7 +364,7 @@ class Builders(Operators):
             positive inside), -e v_n is a bounce after an approach v_n < 0. A gap is a negative depth.
         cones : Cones
         mu, tangents : optional
-            Instead of `cones`, if all rows are those of contacts: as for `contact`.
+            Instead of `cones`, if all rows belong to contacts: as for `contact`.
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
         precision : {"float64", "float32"}, optional

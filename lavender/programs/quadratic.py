@@ -1,6 +1,6 @@
 """`solve_qp`: quadratic programs through `solve`, to an error of the program itself.
 
-`solve` stops at a residual relative to that of the zero impulse, while `QPSolution.error` is relative to the terms of
+`solve` stops at a residual relative to the zero impulse's, while `QPSolution.error` is relative to the terms of
 the program. While the error is above tol, the solve is continued from its result with a smaller tol. If `auto` does
 not reach tol in this way for a positive definite P, the backend for a singular P solves the program in the form (5) of
 `problem/program.py`.

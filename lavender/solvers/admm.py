@@ -132,7 +132,7 @@ class AdmmState:
         self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _estimate_first_factor_cost(self) -> float:
-        """Estimate the cost [ns] of the first factor from the structure; later costs are those of the last factor."""
+        """Estimate the cost [ns] of the first factor from the structure; later costs are measured."""
         problem, rates = self.problem, RATES
         if self.is_over_bodies:
             assert problem.rows is not None

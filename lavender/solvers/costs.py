@@ -331,7 +331,7 @@ def estimate_order_cost(problem: Problem, order: object) -> float:
 
 
 def estimate_judge_setup_cost(problem: Problem) -> float:
-    """Estimate the cost to compute the arrays that the judge reads [ns]: A by rows, J L^-1, or those of bodies."""
+    """Estimate the cost to compute the arrays that the judge reads [ns]: A by rows, J L^-1, or the arrays of bodies."""
     return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
 
 

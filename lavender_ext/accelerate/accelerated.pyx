@@ -14,8 +14,8 @@ order.
 
 (2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
 which has the same solution as Coulomb's law if all contacts stick. If `convex` is AUTOMATIC and there are MIN_CONVEX_ROWS rows,
-anderson sweeps FIRST_LAW_TEST times under Coulomb's law, unless it starts from zero, then under the cone law. At doubling numbers of iterations it compares
-the steps f of one sweep under each law, and returns to Coulomb's law for good if
+anderson sweeps FIRST_LAW_TEST times under Coulomb's law, unless it starts from zero, then under the cone law. At doubling
+numbers of iterations it compares the steps f of one sweep under each law, and returns to Coulomb's law for good if
 
     |f_cone| < 0.5 |f_coulomb|,  |f_coulomb| > 0.8 |f_coulomb of the test before|     contacts slip at the cone solution  (4)
     |f_coulomb| < 0.95 |f_cone|   (0.15 |f_cone| at the first test)                   Coulomb's law is no harder          (5)

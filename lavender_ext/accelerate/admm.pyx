@@ -297,7 +297,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
     """
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
-    cdef double rho = c.rho, primal, dual
+    cdef double rho = c.rho
     while n[0] > 0:
         n[0] -= 1
         mixed = c.mixed
@@ -416,7 +416,7 @@ cdef class BodySolve:
 
     @property
     def iterations(self):
-        """Number of iterations of all solves, including those of the predecessors."""
+        """Number of iterations of all solves, including its predecessors."""
         return int(self.f.iterations)
 
 

@@ -102,12 +102,12 @@ cdef inline void multiply_body_system(const body_solve_t* f, const double* x, do
 
 cdef inline double precondition_residual(const body_solve_t* f) noexcept nogil:
     """Write the preconditioned residual to `product`; return its product with the residual."""
-    cdef int32_t body, i, j
+    cdef int32_t _body, i, j
     cdef const double* a = f.inverse
     cdef const double* r = f.residual
     cdef double* y = f.product
     cdef double s, total = 0.0
-    for body in range(f.n // BODY_SIZE):
+    for _body in range(f.n // BODY_SIZE):
         for i in range(BODY_SIZE):
             s = 0.0
             for j in range(BODY_SIZE):

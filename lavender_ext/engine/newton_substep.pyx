@@ -41,7 +41,7 @@ cdef enum:
 
 
 cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:
-    """Return the number of scratch integers in addition to those of Newton's method."""
+    """Return the number of scratch integers in addition to the integers of Newton's method."""
     return SCRATCH_HEADER + v.r.n_bodies + 2 * <int64_t>v.r.n_joints + 1 + island_workspace_integers(v)
 
 

@@ -12,7 +12,7 @@ cdef extern from *:
     #endif
     #endif
     """
-    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil       # 1 or 2: the processor has instructions for four or eight lanes (`tiles.pxd`)
+    int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil  # 1 or 2: instructions for four or eight lanes (`tiles.pxd`)
 
 
 cdef struct pivots_t:

@@ -110,7 +110,7 @@ cdef extern from *:
     /* A product in blocks: DEPTH columns of A and B, WIDTH rows of B, and 2 LANES rows of A, all contiguous. A tile of
      * 2 LANES rows and COLUMNS columns of C is in registers; tiles at the edge of C are copied. */
     #define LAVENDER_BLOCKED_GEMM(NAME, T, COLUMNS, TARGET)                                                       \
-    TARGET static inline __attribute__((always_inline)) void NAME##_tile(int k, const double* a, const double* b, double* c,          \
+    TARGET static inline __attribute__((always_inline)) void NAME##_tile(int k, const double* a, const double* b, double* c, \
                                                                          long long ldc) {                         \
         enum { LANES = sizeof(T) / sizeof(double), WIDTH = 48 };                                                  \
         T sum[2 * COLUMNS];                                                                                       \

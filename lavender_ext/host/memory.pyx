@@ -9,7 +9,7 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.engine.arrays cimport (
-    CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+    CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE, N_JOINT,
     N_SIZES, ROWS_PER_CONTACT, S_OUT, bind_engine_arrays, engine_t,
 )
 
@@ -65,7 +65,6 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
     memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
     memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
-    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # Stiffness of joints; that of contacts is in the cache.
     memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 

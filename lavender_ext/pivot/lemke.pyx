@@ -204,7 +204,7 @@ cdef inline int32_t first_free_pair(const lemke_t* l) noexcept nogil:
 
 
 cdef inline void number_complementary_pairs(lemke_t* l, int32_t* pair_of) noexcept nogil:
-    """Number the pairs: bounded rows, their caps, free rows. Write the pair of each row to `pair_of`; -1 for a fixed row."""
+    """Assign numbers to the pairs: bounded rows, their caps, free rows. Write the pair of each row, or -1, to `pair_of`."""
     cdef const blocks_t* p = l.t.s.p
     cdef int32_t i, k, n = 0
     for i in range(p.n_rows):

@@ -87,7 +87,7 @@ cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
 
 
 cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requirements_t* need) noexcept nogil:
-    """Number the islands in the order of their first panel, and list their panels and columns.
+    """Assign numbers to the islands in the order of their first panel, and list their panels and columns.
 
     up (n) and label (max(n, n_panels)) are scratch. iptr and cptr have places for n_panels + 1. A panel without columns
     is an island of its own.

@@ -33,9 +33,9 @@ LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17":
     [
         ("gcc", "C99", []),
         ("gcc", "C++17", []),
-        ("clang", "C++11", []),
-        ("gcc", "C99", ["-DLAV_SWEEPS_ONLY"]),
-        ("clang", "C++11", ["-DLAV_SWEEPS_ONLY"]),
+        pytest.param("clang", "C++11", [], marks=pytest.mark.nightly),
+        pytest.param("gcc", "C99", ["-DLAV_SWEEPS_ONLY"], marks=pytest.mark.nightly),
+        pytest.param("clang", "C++11", ["-DLAV_SWEEPS_ONLY"], marks=pytest.mark.nightly),
     ],
 )
 def test_no_warning_in_either_language(folder, tmp_path, name, language, small):
@@ -95,7 +95,7 @@ def test_what_is_there_and_is_another_is_not_replaced_unasked(tmp_path, folder):
     assert [p.name for p in tmp_path.iterdir()] == ["lavender.h"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_cmake_builds_installs_and_is_found(folder, tmp_path):
     if shutil.which("cmake") is None:
         pytest.skip("cmake is not installed")
@@ -120,7 +120,7 @@ def test_cmake_builds_installs_and_is_found(folder, tmp_path):
     assert "-llavender" in next((tmp_path / "in").rglob("lavender.pc")).read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name, what", [("gcc", "address,undefined"), ("clang", "memory")])
 def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
     flags = ["-std=c11", "-O0", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]

@@ -1,9 +1,9 @@
 """Redundant rows of a problem, and the quantities that are unique although A is singular.
 
 If A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's velocity, is
-unique for symmetric positive semidefinite A without Coulomb friction. The rank of A = J M^-1 J^T is that of J, whose
-rows, scaled to length 1, are decomposed if J is known, by QR with column pivoting. A diagonal entry of R is the part
-of a row's direction that is new next to the rows before it. A holds the squares of these parts.
+unique for symmetric positive semidefinite A without Coulomb friction. A = J M^-1 J^T has the rank of J. If J is known,
+its rows, scaled to length 1, are decomposed by QR with column pivoting. A diagonal entry of R is the part of a row's
+direction that is new next to the rows before it. A holds the squares of these parts.
 """
 
 from __future__ import annotations

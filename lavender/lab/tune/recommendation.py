@@ -83,7 +83,7 @@ class Tuning:
         return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
 
     def _is_accurate_enough(self, m: Measured) -> bool:
-        """Return whether error and motion of a setting are at most those of the present setting, or the threshold."""
+        """Return whether a setting's error and motion do not exceed the present setting's, or the threshold."""
         now, threshold = self.present_result, self.threshold
         pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
         return all(x <= max(own, threshold) for x, own in pairs)

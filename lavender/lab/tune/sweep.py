@@ -83,7 +83,7 @@ def tune(
     threshold : float, m/s, m
         Errors [m/s] and distances [m] up to this number count as accurate enough.
     max_velocity_error : float, m/s, optional
-        Also recommend the fastest setting whose error does not exceed this number in any step of all worlds.
+        Also recommend the fastest setting with an error of at most this number in every step of all worlds.
     watch : callable, optional
         Called with the progress.
 

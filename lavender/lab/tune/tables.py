@@ -1,7 +1,7 @@
 """Tables of the settings that are tried: field, values and meaning for each engine.
 
-A line tries each of its values alone, together with the fields in `beside`. Lines with `near` are tried beside the
-settings near the Pareto front of time and error, the others beside the present setting.
+A line tries each of its values together with the fields in `fixed`. These fields replace fields of the present setting;
+lines with `near` replace fields of the settings near the Pareto front of time and error.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ class Field(NamedTuple):
     name: str
     values: tuple[Any, ...]
     meaning: str
-    beside: Mapping[str, Any] = NOTHING
+    fixed: Mapping[str, Any] = NOTHING
     near: bool = False
 
 
 def list_options(table: tuple[Field, ...], near: bool = False) -> list[dict[str, Any]]:
-    """Return the options that a table tries beside a setting near the front, or beside the present setting."""
-    return [{**f.beside, f.name: x} for f in table if f.near == near for x in f.values]
+    """Return the options that a table tries: variants of settings near the front, or of the present setting."""
+    return [{**f.fixed, f.name: x} for f in table if f.near == near for x in f.values]
 
 
 NEWTON, CG, PGS = ({"solver": name} for name in ("Newton", "CG", "PGS"))

@@ -1,6 +1,6 @@
 """Names and indices of the entries of the engine's arrays `size`, `head`, `setting` and `joint`.
 
-They are those of `lavender_ext/engine/arrays.pxd`.
+They are defined in `lavender_ext/engine/arrays.pxd`.
 """
 
 from lavender_ext.engine import arrays

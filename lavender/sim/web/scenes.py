@@ -96,7 +96,7 @@ class Number(NamedTuple):
     field : str
         One of `SOLVER_FIELDS`.
     first, last : int
-        Range of steps. If both are 0, the value is that of the first substep of the first step.
+        Range of steps. If both are 0, the value of the first substep of the first step is read.
     over : str
         "AB" for the ratio A/B, "BA" for B/A, or "" for no ratio.
     """
