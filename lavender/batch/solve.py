@@ -26,7 +26,7 @@ from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.compiled_call import COST_PER_SECOND, NO_STAGE_MESSAGE, compute_postponed_fields
 from lavender.solving.limits import check_accepted, check_budget, check_time_limit
-from lavender.solving.outcome import create_unjudged
+from lavender.solving.outcome import create_unjudged, keep_unjudged_start
 from lavender.solving.solve import solve, solve_prepared
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
@@ -260,7 +260,13 @@ class Solutions(WorldResults, Sequence[Solution]):
             raise self._make_fault(i, error) from None
         start = self._impulse[self._get_rows(i)]
         return create_unjudged(
-            problem, self._spec, self._options, start, self.tol, f"{NO_STAGE_MESSAGE}, unjudged"
+            problem,
+            self._spec,
+            self._options,
+            start,
+            self.tol,
+            f"{NO_STAGE_MESSAGE}, unjudged",
+            keeps_start=True,
         )
 
     def _make_solution(self, i: int) -> Solution:
@@ -413,7 +419,9 @@ def solve_many(
                 deadline.reserve_seconds(-1e-9 * RATES["late world"])
             if deadline.has_passed():
                 check_accepted(problem, spec, deadline)
-                unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")
+                unsolved = create_unjudged(
+                    problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged", keeps_start=True
+                )
                 solutions.store_late_solution(i, unsolved)
                 return
         if has_failed:
@@ -422,7 +430,8 @@ def solve_many(
             solution = solve_prepared(problem, spec, named, start, tol, max_iter, own, failed_call=counts)
         else:
             left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
-            solution = solve(problem, solver, impulse=start, time_limit=left, **more)
+            # Even the choice between start and zero impulse would take time from later worlds.
+            solution = keep_unjudged_start(solve(problem, solver, impulse=start, time_limit=left, **more))
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
         store = solutions.store_solution if is_judged else solutions.store_late_solution
         store(i, solution if "callback" in options else raise_if_interrupted(solution))

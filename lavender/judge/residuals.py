@@ -360,15 +360,23 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
 
 
 def combine_best_islands(
-    problem: Problem, starts: Sequence[FloatArray], impulses: Sequence[FloatArray], tol: float
+    problem: Problem,
+    starts: Sequence[FloatArray],
+    impulses: Sequence[FloatArray],
+    tol: float,
+    by_residual: bool = False,
 ) -> FloatArray:
     """Return the best of starts and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 
-    In each island, the start with the lowest relative residual is chosen first. An impulse replaces it if the impulse
-    solves the island, or if its energy error there is lower and its relative residual not larger.
+    In each island, the best start is chosen first. An impulse replaces it if the impulse solves the island, if its
+    objective is lower (symmetric A, bounded rows or cones), or if its energy error is lower and its relative residual
+    not larger (Coulomb's law, asymmetric A). If `by_residual` is true, objectives are not compared: in an island
+    without a solution they have no minimum.
     """
     get_zero_impulse_reference(problem)
-    best: FloatArray = measure.combine_best_islands(problem.metric, list(starts), list(impulses), tol)
+    best: FloatArray = measure.combine_best_islands(
+        problem.metric, list(starts), list(impulses), tol, by_residual
+    )
     return best
 
 
@@ -525,8 +533,8 @@ def _square_entries(a: Any) -> Any:
 
 
 def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Residual:
-    """Build a `Residual` from a raw judge pass, which is refined first if M is too ill-conditioned for `tol`."""
-    return make_residual(problem, judged.refine(tol) if judged.loss > 0.1 * tol else judged)
+    """Build a `Residual` from a raw judge pass, which is refined first if M is too ill-conditioned."""
+    return make_residual(problem, judged.refine(tol))
 
 
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:

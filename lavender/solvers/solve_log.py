@@ -19,16 +19,12 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
-from lavender_ext.judge.measure import residuals_by_island
+from lavender_ext.judge.measure import replace_stale_start, residuals_by_island
 
 if TYPE_CHECKING:
     from lavender.solvers.recording import Recorder
 
 __all__ = ["SolveLog", "get_relaxation"]
-
-# Sweeps start from the given impulse if its relative residual is at most this, even if the zero impulse has a smaller
-# residual, because the given impulse shows which rows are free.
-MAX_START_RESIDUAL = 1e3
 
 
 # Key in `Derived.cache` of the problem's convex relaxation.
@@ -63,8 +59,6 @@ class SolveLog:
         )
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
-        # Given start (m,) [N s], if it is worse than the zero impulse.
-        self.bad_start: FloatArray | None = None
         self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
@@ -78,12 +72,9 @@ class SolveLog:
     def start_from_better_impulse(self, start: FloatArray) -> None:
         """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
+        start = start.copy()
+        replace_stale_start(self.problem.metric, start)
         self.judge_and_store_best(start, is_start=True)
-        if self.best > 1.0:
-            self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
-            self.judge_and_store_best(
-                self.problem._start, is_start=True
-            )  # The relative residual of the zero impulse is 1.
 
     def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.

@@ -234,13 +234,13 @@ class Sweeps(Iterations):
         return claim
 
     def prepare_and_set_start(self) -> None:
-        """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
+        """Prepare the sweeps; start from the best impulse."""
         p, deadline = self.log.problem, self.log.deadline
         too_late = deadline.has_passed(1e-9 * get_loose_limit(p)) and deadline.has_passed(
             1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
         )
         self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
-        self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
+        self.impulse = self.log.impulse.copy()
 
     def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain at intervals."""

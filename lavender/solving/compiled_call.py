@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import make_residual
+from lavender.judge.residuals import refine_residual
 from lavender.judge.solution import CONFIRMED, CONVERGED, TIME_LIMIT, Claim, Solution, SolverRun, Status
 from lavender.problem import Problem
 from lavender.solvers.loop import select_best_impulse
@@ -105,7 +105,7 @@ def compute_postponed_fields(
     else:
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
     return {
-        "residual": make_residual(problem, judged),
+        "residual": refine_residual(problem, judged, math.inf),
         "iterations": claim.iterations,
         "work": MappingProxyType(dict(claim.work)),
         "solver": SolverRun(spec.name, {}, claim.form),

@@ -44,8 +44,10 @@ from lavender.judge.solution import (
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
-from lavender_ext.judge.measure import Judged, all_finite
+from lavender_ext.judge.measure import Judged, all_finite, are_bit_identical, replace_stale_start
 
+# End of the message of a solution that is its start, unchanged.
+UNJUDGED = ", unjudged"
 # Fields of an unjudged solution, besides its residual, that are computed when one is first read.
 LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
@@ -73,11 +75,11 @@ def finish(
     `refutation` describes a solution that the caller found although the solver claims that none exists; else empty.
     """
     claim = name_lost_row(problem, impulse, claim)
-    if claim.status is INFEASIBLE and tol > 0.0:
+    if claim.status is INFEASIBLE:
         # Project the impulse on its bounds, so that an engine that applies it does not pull at a contact.
-        impulse = combine_best_islands(
-            problem, (problem._start,), (project_impulse(problem.cones, impulse),), tol
-        )
+        impulse = project_impulse(problem.cones, impulse)
+        if tol > 0.0:
+            impulse = combine_best_islands(problem, (problem._start,), (impulse,), tol, by_residual=True)
     # Solvers work in float64, whatever the precision of the data.
     judged = refine_residual(problem, reuse_or_judge_impulse(problem, impulse, claim.judged), tol)
     status, message = claim.status, claim.message
@@ -183,27 +185,61 @@ def create_unjudged(
     tol: float,
     message: str,
     setup_time: float = 0.0,
+    keeps_start: bool = False,
 ) -> Solution:
     """Return the start as a solution without judging it, because even the judge would exceed the time limit.
 
-    Its residual and the fields that depend on it are computed when they are accessed.
+    Its residual and the fields that depend on it are computed when they are accessed. One of them is the impulse, which
+    is zero in islands in which the start has a larger residual than zero impulses, unless `keeps_start` is true.
     """
     start = problem._start if problem.guess is None else problem.guess
-    start = start.copy() if impulse is None else problem.impulse_array(impulse)
-    late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
-    return Solution.with_late_fields(mark_read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
+    start = mark_read_only(start.copy() if impulse is None else problem.impulse_array(impulse))
+    keeps_start = keeps_start or tol == 0.0 or are_bit_identical(start, problem._start)
+    claim = Claim(TIME_LIMIT, 0, {}, message)
+    late = judge_late_fields, (problem, spec, options, start, claim, tol, keeps_start)
+    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time)
+    if not keeps_start:
+        del solution.__dict__["impulse"]
+    return solution
+
+
+def keep_unjudged_start(solution: Solution) -> Solution:
+    """Return a solution of `create_unjudged` with its start as the impulse, and any other solution unchanged."""
+    if "impulse" in vars(solution):
+        return solution
+    problem, spec, options, start, claim, tol, _ = vars(solution)["_rest"][1]
+    return create_unjudged(
+        problem, spec, options, start, tol, claim.message, solution.setup_time, keeps_start=True
+    )
 
 
 def judge_late_fields(
-    problem: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: FloatArray,
+    claim: Claim,
+    tol: float,
+    keeps_start: bool,
 ) -> dict[str, Any]:
-    """Return the fields that `create_unjudged` postpones, for the impulse (m,) [N s], which is read-only."""
+    """Return the fields that `create_unjudged` postpones, for the start (m,) [N s], which is read-only."""
     disk = problem.disk
-    solution = finish(disk, spec, options, problem.on_disk(impulse), claim, tol, 0.0, 0.0, None)
+    start = problem.on_disk(impulse)
+    if not keeps_start:
+        get_zero_impulse_reference(disk)
+        start = start.copy()
+        replace_stale_start(disk.metric, start)
+        if not are_bit_identical(start, problem.on_disk(impulse)):
+            impulse = mark_read_only(start.copy() if problem is disk else problem.cones.stretch * start)
+            message = (
+                claim.message.removesuffix(UNJUDGED) + ", with zero impulses in islands in which it was worse"
+            )
+            claim = replace(claim, message=message)
+    solution = finish(disk, spec, options, start, claim, tol, 0.0, 0.0, None)
     if problem is not disk:
         judged = residual(problem, impulse, "float64")
-        solution = replace(solution.convert_from_disk(problem), residual=judged)
-    return {name: getattr(solution, name) for name in ("residual", *LATE_FIELDS)}
+        solution = replace(solution.convert_from_disk(problem), residual=judged, impulse=impulse)
+    return {name: getattr(solution, name) for name in ("impulse", "residual", *LATE_FIELDS)}
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:

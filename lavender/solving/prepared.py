@@ -58,7 +58,7 @@ from lavender.solving.limits import (
 )
 from lavender.solving.outcome import create_unjudged, decide_empty_rows, finish, name_lost_row
 from lavender.solving.velocity import accept_velocity, relative_tolerance
-from lavender_ext.judge.measure import residuals_by_island
+from lavender_ext.judge.measure import replace_stale_start, residuals_by_island
 from lavender_ext.judge.stopping_test import StoppingTest
 
 if TYPE_CHECKING:
@@ -341,16 +341,18 @@ class Prepared:
             claim = Claim(TIME_LIMIT, 0, {}, SETUP_LATE_MESSAGE)
             loop.replace_by_best_impulse(loop.impulse)
         else:
+            has_checks = isinstance(getattr(self.state, "watch", None), StoppingTest)
+            if loop.tol > 0.0 and not has_checks and not spec.delegates and not problem.has_singular_program:
+                replace_stale_start(problem.metric, loop.impulse)
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
-            if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
+            # Own solvers claim only what the judge confirms.
+            is_own = spec.builtin and not spec.external
+            if loop.tol > 0.0 and not (is_own and claim.status in (CONVERGED, ROUNDOFF_LIMIT)):
                 claim = name_lost_row(problem, loop.impulse, claim)
                 # `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
                 keeps_best = spec.delegates and not problem.has_singular_program
-                if not keeps_best and (
-                    claim.status is TIME_LIMIT
-                    or not isinstance(getattr(self.state, "watch", None), StoppingTest)
-                ):
+                if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
                     loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
             if (
                 claim.status is TIME_LIMIT
@@ -403,7 +405,9 @@ class Prepared:
             max_iter=max_iter,
             time_limit=loop.deadline.get_remaining_seconds(MIN_TIME_LIMIT),
         )
-        loop.impulse[:] = combine_best_islands(self.problem, (loop.impulse,), (solution.impulse,), loop.tol)
+        loop.impulse[:] = combine_best_islands(
+            self.problem, (loop.impulse,), (solution.impulse,), loop.tol, by_residual=True
+        )
         loop.time += solution.setup_time + solution.solve_time
         work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)

@@ -18,8 +18,8 @@ from lavender_ext.core.problem cimport (DERIVED, lav_compute_body_diagonal, deri
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
-                                         score_given_generalized_slack, judge_zero_impulse, refine_view,
+from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
+                                         score_given_generalized_slack, judge_zero_impulse,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack
@@ -85,7 +85,7 @@ cdef inline bint judge_zero_impulse_of_task(task_t* j, view_t* v, workspace_t* i
     v: view of the task's data; w (3 m + `count_judge_scratch`): scratch.
     """
     cdef ssize_t m = j.p.n_rows
-    if not grow_workspace_to(islands, island_workspace_integers(v), 2 * <int64_t>j.p.n_blocks):
+    if not grow_workspace_to(islands, island_workspace_integers(v), 3 * <int64_t>j.p.n_blocks):
         return False
     judge_zero_impulse(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.zero_residual)
     j.p.islands = v.p.islands
@@ -163,8 +163,8 @@ cdef inline void judge_task(task_t* j, double tol, double* x) noexcept nogil:
     j.push = x
     j.relative = relative_residual_of_score(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
     j.float64_relative = NAN
-    if refine_view(&v, j.lam, j.slack_error, j.slack_error + m, x + j.g.n, j.zero_residual[0], j.zero_residual[1], tol, j.relative,
-                   &j.score):
+    if refine_reported_view(&v, j.lam, j.slack_error, j.slack_error + m, x + j.g.n, j.zero_residual[0], j.zero_residual[1], tol,
+                            j.relative, &j.score):
         j.float64_relative = j.relative
         j.relative = relative_residual_of_score(&j.score, j.slack_error, m, j.zero_residual[0], j.zero_residual[1])
     j.floor = relative_floor_of_score(&j.score, j.zero_residual[0], j.zero_residual[1])

@@ -566,9 +566,9 @@ cdef class Data:
             if self.reference_energy >= 0.0:
                 return
             if islands != NULL:
-                numbers = allocate_bytes(2 * islands.n * sizeof(double))
+                numbers = allocate_bytes(3 * islands.n * sizeof(double))
                 marks = allocate_bytes((2 * k + islands.n + 1) * sizeof(int32_t))
-                memcpy(numbers.at, islands.reference, 2 * islands.n * sizeof(double))
+                memcpy(numbers.at, islands.reference, 3 * islands.n * sizeof(double))
                 at = <int32_t*>marks.at
                 memcpy(at, islands.label, k * sizeof(int32_t))
                 memcpy(at + k, islands.order, k * sizeof(int32_t))

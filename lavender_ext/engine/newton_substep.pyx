@@ -95,7 +95,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
         else:
             scratch[1] = 0                              # The factor has too many entries: only the first phase runs.
     scratch[0] = compute_joint_bandwidth(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
-    needed += warm_workspace_size(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
+    needed += warm_workspace_size(&p, scratch[0]) + p.n_rows + 3 * <int64_t>p.n_blocks
     return <int32_t>needed if needed < INDEX_LIMIT else -1
 
 
@@ -187,13 +187,14 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     set_angular_joint_weights(&p, &r, workspace)
     p.nu = workspace
     s.width = scratch[0]
+    s.keeps_start = not all_stages                      # Sweeps follow, which begin from the start.
     s.trace = trace
     s.relative = 0.0
     own = warm_workspace_size(&p, s.width) + p.n_rows
     marks = SCRATCH_HEADER + scratch[1]
     bind_warm_workspace(&s, workspace + p.n_rows, scratch + marks, &p, &r)
     find_substep_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
-    own += 2 * <int64_t>p.n_blocks
+    own += 3 * <int64_t>p.n_blocks
     result = solve_newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
     if p.n_rows > 0 and (all_stages or result != UNDECIDED):
         measure_as_engine(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)

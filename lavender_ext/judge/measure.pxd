@@ -16,6 +16,8 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
                      score_t* out) noexcept nogil
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
                       double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
+cdef bint refine_reported_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
+                               double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
 cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
                                         double* x,
                         score_t* out) noexcept nogil

@@ -13,15 +13,16 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
-                                      count_islands, copy_score_without_islands, store_better_islands, store_better_start)
+from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, clip_zero_to_row,
+                                      count_islands, copy_score_without_islands, replace_stale_islands, store_better_islands,
+                                      store_better_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (
     residual_above_floor, set_zero_impulse, relative_floor_of_score, relative_residual_of_score, count_judge_scratch,
 )
 from lavender_ext.judge.reference cimport reference_needs_islands, compute_reference
-from lavender_ext.judge.refine cimport estimate_factor_loss, refine_generalized_slack
+from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
 from lavender_ext.judge.score cimport all_finite_numbers, is_at_floor, make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
@@ -58,6 +59,19 @@ cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, 
     return True
 
 
+cdef bint refine_reported_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
+                               double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil:
+    """Repeat a pass whose numbers are reported: as `refine_view`, and if the factor of M may cause an error above 1e-8.
+
+    With an infinite tol the pass is not repeated.
+    """
+    cdef double strictest = 10.0 * min_reported_loss()
+    if not tol < 1.0 / 0.0:
+        return False
+    return refine_view(v, lam, w, e, scratch, reference_energy, reference_velocity, tol if tol < strictest else strictest,
+                       relative_ if relative_ < strictest or not relative_ < 1.0 / 0.0 else strictest, out)
+
+
 cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
                                         double* x,
                         score_t* out) noexcept nogil:
@@ -80,7 +94,7 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     """Judge the zero impulse, written to x (m), and write the results of `compute_reference` to out (3).
 
     If there are several islands, v.p receives them with their references. index (`island_workspace_integers`), islands
-    and reference (2 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
+    and reference (3 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
     """
     cdef score_t s = make_empty_score()
     cdef int32_t i
@@ -100,6 +114,8 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     if v.p.islands != NULL:
         for i in range(islands.n):
             if has_no_moving_body(v, islands.order[islands.ptr[i]]):
+                if reference[2 * i] > 0.0 and reference[2 * islands.n + i] >= 0.5:
+                    reference[2 * islands.n + i] = relative_residual(reference[2 * i], reference[2 * i + 1], out[0], out[1])
                 reference[2 * i], reference[2 * i + 1] = out[0], out[1]
 
 
@@ -219,7 +235,7 @@ cdef class Judged:
         return self.known_loss
 
     def refine(self, double tol):
-        """Return the refined pass if a tolerance of `tol` requires it (judge/refine.pxd (2)), otherwise self."""
+        """Return the refined pass if `tol` or a report requires it (judge/refine.pxd (2)), otherwise self."""
         cdef Data p = self.data
         cdef int32_t m = p.blocks.n_rows
         cdef view_t v = p.get_pointers()
@@ -228,7 +244,7 @@ cdef class Judged:
         cdef const double[::1] first
         cdef double[::1] both
         cdef Workspace workspace
-        if not (self.relative < 1.0 / 0.0 and self.loss > 0.1 * max(tol, self.relative)):
+        if not (self.relative < 1.0 / 0.0 and self.loss > min(0.1 * max(tol, self.relative), min_reported_loss())):
             return self
         lam, first = self.impulse, self.both
         workspace = allocate_bytes((2 * m + count_judge_scratch(&v)) * sizeof(double))
@@ -294,12 +310,12 @@ def store_zero_impulse_residual(Data p):
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
-    cdef Workspace workspace = allocate_bytes((2 * m + 2 * k + count_judge_scratch(&v)) * sizeof(double))
+    cdef Workspace workspace = allocate_bytes((2 * m + 3 * k + count_judge_scratch(&v)) * sizeof(double))
     cdef Workspace marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
     cdef double* w = <double*>workspace.at
     start = np.zeros(m)
     x = start
-    judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
+    judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 3 * k, out)
     start.setflags(write=False)
     p.store_reference(v.p.islands, out)
     return start
@@ -341,7 +357,30 @@ def residuals_by_island(Data p, const double[::1] lam):
     return label_, table_
 
 
-def combine_best_islands(Data p, list starts, list impulses, double tol):
+def replace_stale_start(Data p, double[::1] lam):
+    """Set lam (m,) [N s] to zero, clipped to its bounds, in islands in which that has a lower relative residual, in place.
+
+    The references of the zero impulse must be set in the data.
+    """
+    cdef int32_t m = p.blocks.n_rows, n = count_islands(&p.blocks), k = 0
+    cdef view_t v = p.get_pointers()
+    cdef score_t s = make_empty_score()
+    cdef Workspace workspace
+    cdef double* w
+    while k < m and lam[k] == clip_zero_to_row(&p.blocks, k):
+        k += 1
+    if k == m:
+        return
+    workspace = allocate_bytes((2 * (<Py_ssize_t>m + n) + count_judge_scratch(&v)) * sizeof(double))
+    w = <double*>workspace.at
+    s.by_island = w + 2 * m
+    judge_view(&v, &lam[0], w, w + m, s.by_island + 2 * n, False, &s)
+    if p.blocks.islands == NULL:
+        s.by_island[0] = relative_residual_of_score(&s, w, m, p.reference_energy, p.reference_velocity)
+    replace_stale_islands(&p.blocks, s.by_island, p.relative_at_zero, &lam[0])
+
+
+def combine_best_islands(Data p, list starts, list impulses, double tol, bint by_residual=False):
     """Return a new impulse (m,) [N s]: for each island the best of the starts and the impulses (m,), by judge/best.pxd."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.get_pointers()
@@ -353,6 +392,7 @@ def combine_best_islands(Data p, list starts, list impulses, double tol):
     cdef double now
     cdef const double* lam
     bind_best(&best, &p.blocks, &x[0])
+    best.by_residual = by_residual
     for impulse in [*starts, *impulses] if m else []:
         lam = as_double_pointer(impulse, m)
         s = make_empty_score()
@@ -361,9 +401,9 @@ def combine_best_islands(Data p, list starts, list impulses, double tol):
         now = relative_residual_of_score(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
         copy_score_without_islands(&best, &p.blocks, &s, now)
         if best.seen < len(starts):
-            store_better_start(&best, &p.blocks, lam)
+            store_better_start(&best, &v, lam, w, w + m)
         else:
-            store_better_islands(&best, &p.blocks, lam, tol)
+            store_better_islands(&best, &v, lam, w, w + m, tol)
     return np.array(x[:m])
 
 

@@ -132,7 +132,7 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
 cdef inline void compute_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
     """Write E0 [sqrt J], V0 [m/s] and the relative residual of the zero impulse x, slack w, error e (m each) to out (3).
 
-    With several islands their references are set, and the first two are sqrt(sum E0_i^2) and max V0_i over the islands with
+    With several islands their references and residuals are set, and the first two are sqrt(sum E0_i^2) and max V0_i over the islands with
     a positive reference.
     """
     cdef islands_t* s = <islands_t*>p.islands
@@ -144,6 +144,7 @@ cdef inline void compute_reference(blocks_t* p, const double* x, const double* w
     out[1] = out[2] = 0.0
     for i in range(s.n):
         r = compute_island_reference(p, s.order, s.ptr[i], s.ptr[i + 1], x, w, e, s.reference + 2 * i)
+        s.reference[2 * s.n + i] = r
         out[2] = r if r > out[2] else out[2]
         if s.reference[2 * i] > 0.0:
             sum_ += s.reference[2 * i] * s.reference[2 * i]

@@ -18,6 +18,9 @@ and without fused multiply-adds). It is repeated until
 The floor of row i then also contains |w - w'| + sqrt(2 d_i) |dx|_M q, where w' is the slack of the first pass: a solver that
 computes in float64 cannot reduce it. If the corrections do not shrink, twice the last one replaces |dx|_M q. That is 2 |x|_M
 if the first correction already fails, so that no small residual is reported.
+
+A pass whose numbers are reported is also repeated if the left side of (2) is above 1e-8, whatever tol is: otherwise a residual
+of 1e-13 with a floor of 1e-16 would be reported for an impulse with an error of 1e-8.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
@@ -34,6 +37,11 @@ from lavender_ext.judge.score cimport relative_residual, score_t, take_smallest_
 
 cdef enum:
     MAX_CORRECTIONS = 16        # Each correction is less than half of the previous one; the last one enters the floor.
+
+
+cdef inline double min_reported_loss() noexcept nogil:
+    """Return the possible error due to the factor of M above which a reported pass is refined, as a relative residual."""
+    return 1e-8
 
 
 # -- sums of two float64 -----------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Stopping test of sweep solvers: the judge's arithmetic, at sweep counts that depend only on the residuals.
 
-The first checks are at the start and after the first sweep. From the residuals r0, r of the last two checks, k sweeps apart,
+The first checks are at the start and after the first sweep. At the start, islands with a larger residual than the zero
+impulse begin from the zero impulse. From the residuals r0, r of the last two checks, k sweeps apart,
 the end is predicted after n more sweeps, r (r/r0)^(n/k) <= tol. The next check is after n/2 sweeps, but at least an eighth
 of the sweeps done so far and at most as many again. If the residual does not fall, it is after that eighth. The relative
 residual r decides:
@@ -53,6 +54,7 @@ cdef struct stopping_test_t:
     double lowest               # lowest relative residual of all checks
     double reference_energy     # sqrt J, energy error of the zero impulse
     double reference_velocity   # m/s, velocity error of the zero impulse
+    double relative_at_zero     # relative residual of the zero impulse
     best_t best
     double* marked              # (n) sqrt J, E of each island's best at the last better check
     double* w                   # (m) scratch
@@ -70,7 +72,8 @@ cdef inline int64_t stopping_test_workspace_size(int64_t m, int64_t n) noexcept 
 
 
 cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, double reference_energy,
-                                     double reference_velocity, int32_t patience, double* workspace) noexcept nogil:
+                                     double reference_velocity, double relative_at_zero, int32_t patience,
+                                     double* workspace) noexcept nogil:
     """Initialise s before the first sweep; workspace (`stopping_test_workspace_size`)."""
     s.total = s.check_at = s.last_at = 0
     s.start = 0.0
@@ -80,6 +83,7 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
     s.patience = patience
     s.reference_energy = reference_energy
     s.reference_velocity = reference_velocity
+    s.relative_at_zero = relative_at_zero
     bind_best(&s.best, p, workspace)
     s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
     begin_progress(&s.progress, s.marked + s.best.n, p.n_rows)
@@ -98,6 +102,7 @@ cdef inline bint restart_if_stalled(stopping_test_t* s, int32_t patience) noexce
     return True
 
 
+cdef int32_t check_start(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol) noexcept nogil
 cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
                      int32_t n, double tol, int32_t* done) noexcept nogil
 

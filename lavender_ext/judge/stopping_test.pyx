@@ -8,7 +8,8 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport count_islands, copy_score_without_islands, relative_residual_of_best, store_better_islands
+from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, relative_residual_of_best,
+                                      replace_stale_islands, store_better_islands, store_zero_if_better)
 from lavender_ext.judge.measure cimport (
     residual_above_floor, relative_floor_of_score, judge_view, refine_view, relative_residual_of_score,
     count_judge_scratch,
@@ -106,6 +107,13 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_residual_of_check(s, &x)
+    if s.total == 0:                                    # Begin from the better of the start and the zero impulse.
+        copy_score_without_islands(&s.best, p, &x, now)
+        if replace_stale_islands(p, s.best.now, s.relative_at_zero, lam):
+            x = make_empty_score()
+            x.by_island = s.best.now
+            judge_view(v, lam, s.w, s.e, s.v, False, &x)
+            now = relative_residual_of_check(s, &x)
     if now <= tol:                                      # Repeat the pass with a floor.
         now = judge_with_refinement(s, v, lam, tol, &x, &refined)
     elif needs_floor(s, p, lam):
@@ -125,7 +133,9 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
         if end != RUNNING:
             return end
     if not lost or s.best.seen > 0:
-        store_better_islands(&s.best, p, lam, tol)
+        store_better_islands(&s.best, v, lam, s.w, s.e, tol)
+        if s.best.seen == 1:
+            store_zero_if_better(&s.best, v, s.reference_energy, s.relative_at_zero)
         s.best_relative = relative_residual_of_best(&s.best)
     if s.best_relative <= tol:                          # The islands were solved at different checks.
         x = make_empty_score()
@@ -193,6 +203,12 @@ cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view
     return status
 
 
+cdef int32_t check_start(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol) noexcept nogil:
+    """Perform the check before the first sweep, which may change lam (m); return the status."""
+    cdef int32_t step = 1
+    return check_if_due(s, v, confirm, lam, tol, &step)
+
+
 cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
                      int32_t n, double tol, int32_t* done) noexcept nogil:
     """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
@@ -232,7 +248,8 @@ cdef class StoppingTest:
         workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
         scratch = np.empty(workspace + 2 * m + count_judge_scratch(&self.other) + 4)
         self.keep = data, confirm, scratch
-        begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
+        begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, data.relative_at_zero,
+                            patience, &scratch[0])
         self.state.w = &scratch[workspace]
         self.state.e = &scratch[workspace + m]
         self.state.v = &scratch[workspace + 2 * m]
@@ -264,7 +281,7 @@ cdef class StoppingTest:
                 now = judge_with_floor(s, &self.view, &lam[0], &x)
             copy_score_without_islands(&s.best, &self.view.p, &x, now)
             if not now <= tol:
-                store_better_islands(&s.best, &self.view.p, &lam[0], tol)
+                store_better_islands(&s.best, &self.view, &lam[0], s.w, s.e, tol)
                 s.best_relative = relative_residual_of_best(&s.best)
                 memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
 

@@ -247,6 +247,7 @@ cdef inline double* bind_judge_workspace(newton_t* n, double* workspace) noexcep
     n.problem.w, n.problem.error = workspace + 2 * m, workspace + 3 * m
     n.problem.x = workspace + 4 * m + best_workspace_size(m, n.problem.p.n_blocks + 1)
     bind_best(&n.island_best, &n.problem.p, workspace + 4 * m)
+    n.island_best.by_residual = 1                       # Only solved islands are combined.
     return workspace + judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g)
 
 
@@ -392,10 +393,12 @@ cdef inline double judge_and_keep_best_point(newton_t* n, const double* z) noexc
     The best impulses of the islands together may be within tol before a single point is.
     """
     cdef double residual = judge_point(n, z, False), combined
+    cdef view_t v = view_t(n.problem.p, n.problem.a, n.problem.r, n.problem.g)
     if residual < n.best:
         n.best = residual
         copy_vector(n, n.best_z, z)
-    if store_better_islands(&n.island_best, &n.problem.p, n.lam, n.tol) and n.island_best.n > 1 and not n.best <= n.tol:
+    if (store_better_islands(&n.island_best, &v, n.lam, n.problem.w, n.problem.error, n.tol) and n.island_best.n > 1
+            and not n.best <= n.tol):
         combined = relative_residual_of_best(&n.island_best)
         if combined <= n.tol:
             n.best = combined

@@ -33,12 +33,15 @@ cpdef enum:                     # results
 
 
 cdef struct warm_t:
-    double* start               # (m) lam at the start
+    double* given               # (m) the given start
+    double* start               # (m) lam at the start, zero in islands in which the given start is worse
     double* band                # (m, width) band of A
     double* slack               # (m) slack w of the last judged impulse
     double* error               # (m) error e of the last judged impulse
+    double* by_island           # (blocks, 2) relative residual and E of each island of the last judged impulse
     int32_t* last_joint         # (n_bodies) last joint on a body
     int32_t* previous_joint     # (2 joints) previous joint on the same body: 2 joint + side, or -1
+    int32_t keeps_start         # without a result, lam is the given start
     int32_t width               # width of the band; 0 if (3) does not apply
     int32_t sweeps
     int32_t factorisations
@@ -49,7 +52,7 @@ cdef struct warm_t:
 
 cdef inline int64_t warm_workspace_size(const blocks_t* p, int32_t width) noexcept nogil:
     """Return the number of doubles that `bind_warm_workspace` assigns."""
-    return (3 + <int64_t>width) * p.n_rows
+    return (4 + <int64_t>width) * p.n_rows + 2 * <int64_t>p.n_blocks
 
 
 cdef inline void bind_warm_workspace(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -57,7 +60,9 @@ cdef inline void bind_warm_workspace(warm_t* s, double* real, int32_t* index, co
     s.start = real
     s.slack = real + p.n_rows
     s.error = s.slack + p.n_rows
-    s.band = s.error + p.n_rows
+    s.by_island = s.error + p.n_rows
+    s.given = s.by_island + 2 * <int64_t>p.n_blocks
+    s.band = s.given + p.n_rows
     s.last_joint = index
     s.previous_joint = index + r.n_bodies
 

@@ -12,6 +12,7 @@ from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.linear cimport analyse_band, factor_linear_system_matrix, solve_linear_system, linear_t
+from lavender_ext.judge.best cimport replace_stale_islands
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
@@ -85,6 +86,7 @@ cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, 
                           double v0) noexcept nogil:
     """Return the judge's relative residual of lam, given v = M^-1 J^T lam; infinite if it is not finite."""
     cdef score_t x = make_empty_score()
+    x.by_island = s.by_island
     compute_body_slack(p, r, lam, v, s.slack)
     score_given_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
@@ -212,6 +214,8 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
                                int32_t has_velocity) noexcept nogil:
     """Solve in place from lam (m) [N s], which is not zero, to the relative residual tol; return the result code.
 
+    Islands with a larger residual than the zero impulse begin from the zero impulse.
+
     v (n_bodies, 6) receives M^-1 J^T lam; with has_velocity it holds this product of the start on entry.
     """
     cdef double e0, v0
@@ -226,16 +230,25 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
     s.relative = score_impulse(p, r, s, lam, v, e0, v0)
     if s.relative <= tol:
         return JUDGED
+    if p.islands == NULL:
+        s.by_island[0] = s.relative
+    for j in range(p.n_rows):
+        s.given[j] = lam[j]
+    if replace_stale_islands(p, s.by_island, 1.0, lam):
+        compute_velocity_change(p, r, lam, v)
+        s.relative = score_impulse(p, r, s, lam, v, e0, v0)
+        if s.relative <= tol:
+            return JUDGED
     for j in range(p.n_rows):
         s.start[j] = lam[j]
     result = UNDECIDED
-    if r.n_contacts > 0:
+    if r.n_contacts > 0 and not is_zero_impulse(p, lam):
         result = sweep_contacts(p, r, s, tol, e0, v0, lam, v)
-    elif s.width > 0:
+    elif s.width > 0 and not is_zero_impulse(p, lam):
         result = solve_joints(p, r, s, tol, e0, v0, lam, v)
     if result == UNDECIDED:
         for j in range(p.n_rows):
-            lam[j] = s.start[j]
+            lam[j] = s.given[j] if s.keeps_start else s.start[j]
         compute_velocity_change(p, r, lam, v)
     return result
 
@@ -253,6 +266,7 @@ def solve_from_guess(Data data, double[::1] impulse, double tol):
     s.width = compute_joint_bandwidth(&data.blocks, &data.rows, &index[0])
     cdef double[::1] real = np.empty(6 * data.rows.n_bodies + warm_workspace_size(&data.blocks, s.width))
     s.trace = NULL
+    s.keeps_start = 0
     bind_warm_workspace(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
         result = solve_from_warm_start(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)

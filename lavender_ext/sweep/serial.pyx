@@ -21,7 +21,8 @@ from lavender_ext.core.order cimport GIVEN, SYMMETRIC, update_sweep_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport csr_t, view_t
-from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, restart_if_stalled, run_until_stop,
+from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, check_start, restart_if_stalled,
+                                               run_until_stop,
                                                stopping_test_t)
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers, sweep_exact_blocks
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_packed_impulses, pack_blocks_in_order,
@@ -130,6 +131,10 @@ cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, 
     cdef int32_t status, more
     x.context.w = test.e                                # The stopping test needs its errors only during checks.
     if test.total == 0:
+        status = check_start(test, v, confirm, lam, tol)
+        if status != RUNNING:
+            done[0] = 0
+            return status
         compute_sweep_velocities(&x.context, lam)
     if x.packing.single:
         pack_blocks_of_long_run(&x.context, lam, <int64_t>test.total + n)

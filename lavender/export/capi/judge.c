@@ -15,7 +15,7 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, floor, &t);
 #ifndef LAV_SWEEPS_ONLY
   found = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
-  if (floor && judge_measure_refine_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, s->start[0], s->start[1], tol,
+  if (floor && judge_measure_refine_reported_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, s->start[0], s->start[1], tol,
                                         found, &t))
     first = found;
 #else
@@ -40,10 +40,26 @@ static double see(lav_solver *s, struct judge_best_best_t *best, const double *i
   judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
   relative = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   judge_best_copy_score_without_islands(best, &s->p, &t, relative);
-  if (tol < 0.0) judge_best_store_better_start(best, &s->p, impulse);
-  else judge_best_store_better_islands(best, &s->p, impulse, tol);
+  if (tol < 0.0) judge_best_store_better_start(best, &s->read, impulse, s->stopping_test.w, s->stopping_test.e);
+  else judge_best_store_better_islands(best, &s->read, impulse, s->stopping_test.w, s->stopping_test.e, tol);
   return relative;
 }
+
+#ifndef LAV_SWEEPS_ONLY
+/* Begin from the zero impulse in islands in which it has a smaller residual than the start; sweeps do so at their first check. */
+static void replace_stale_start(lav_solver *s) {
+  score_t t = judge_score_make_empty_score();
+  double *now = s->stopping_test.best.now;
+  int32_t i = 0;
+  while (i < s->p.n_rows && s->impulse[i] == judge_best_clip_zero_to_row(&s->p, i)) i++;
+  if (i == s->p.n_rows) return;
+  t.by_island = now;
+  judge_measure_judge_view(&s->read, s->impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
+  judge_best_copy_score_without_islands(&s->stopping_test.best, &s->p, &t,
+      judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]));
+  if (judge_best_replace_stale_islands(&s->p, now, s->start[2], s->impulse)) s->driven = 0;
+}
+#endif
 
 static int32_t enter(lav_solver *s) {
   if (!s) return LAV_ERROR_NULL;

@@ -313,7 +313,10 @@ static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) 
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
-  if (!s->begun) judge_stopping_test_begin_stopping_test(&s->stopping_test, &s->p, s->start[0], s->start[1], row->patience, s->score_workspace);
+  if (!s->begun) judge_stopping_test_begin_stopping_test(&s->stopping_test, &s->p, s->start[0], s->start[1], s->start[2], row->patience, s->score_workspace);
+#ifndef LAV_SWEEPS_ONLY
+  if (!s->begun && budget->tol > 0.0 && row->step != run_sweeps) replace_stale_start(s);
+#endif
   s->begun = 1;
   if (s->p.n_rows == 0) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;

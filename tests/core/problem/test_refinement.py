@@ -5,7 +5,7 @@ from itertools import product
 import judge_twin
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from judge_twin import spec_of
 from random_problems import conditioned, seeds
@@ -182,6 +182,25 @@ def test_the_floor_bounds_what_the_first_pass_loses(seed, condition):
     lost = np.sqrt(np.sum(problem.metric.d * (first.error - found.error) ** 2))
     assert lost <= found.floor_energy
     assert abs(first.relative - found.relative) <= found.roundoff_floor
+
+
+@settings(max_examples=20)
+@given(seed=seeds, condition=st.sampled_from([1e8, 1e10, 1e11]))
+def test_residual_loose_tolerance_and_ill_conditioned_m_reports_the_error_in_long_double(seed, condition):
+    """The first pass alone has a residual of 1e-14 and a floor of 1e-16, but loses up to a tenth of the tolerance."""
+    problem = ill_problem(seed, condition, "linear")
+    lam = lv.solve(problem, tol=1e-3).impulse
+    truth = judge_twin.Problem(spec_of(problem)).judge(lam)
+    many = lv.residual_many([problem], [lam])
+    for relative, floor in (
+        (lv.residual(problem, lam, tol=1e-2).relative, lv.residual(problem, lam, tol=1e-2).roundoff_floor),
+        (lv.solve(problem, impulse=lam, tol=1e-2).residual.relative, 0.0),
+        (many.relative[0], many.roundoff_floor[0]),
+    ):
+        assert abs(relative - truth.relative) <= 1e-8 + truth.allowed + 1e-2 * truth.relative
+        assert (
+            floor == 0.0 or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
+        )
 
 
 def test_a_well_conditioned_m_is_not_refined():

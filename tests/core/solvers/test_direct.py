@@ -321,7 +321,7 @@ def test_ctrl_c_between_two_rounds_gives_the_best_of_them(monkeypatch):
     monkeypatch.setattr(DenseFactor, "factor", interrupted)
     solution = lv.solve(problem, "direct", tol=1e-14, impulse=10.0 * np.ones(m))
     assert solution.status is lv.Status.INTERRUPTED and len(calls) == 90
-    assert solution.residual.relative < 0.01  # of the start 885
+    assert solution.residual.relative < 0.1  # of the zero impulse 1, of the start 885
 
 
 def test_a_panel_that_lost_a_pivot_is_counted_and_named():

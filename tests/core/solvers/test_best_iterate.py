@@ -1,0 +1,196 @@
+"""Which impulse a solve returns: the lowest objective, no worse than its start, and inside its bounds."""
+
+import numpy as np
+import pytest
+from random_problems import random_contact_problem, random_lcp, without_solution
+
+import lavender as lv
+from lavender.judge.residuals import combine_best_islands
+from lavender.solvers.islands import find_islands
+
+DT = 1.0 / 60.0
+SWEEPS = ("pgs", "sequential_impulses", "block_gauss_seidel", "nncg", "anderson")
+
+
+def pendulum(torque, target=4.0):
+    """A pendulum of 0.01 kg m^2 at 2 rad/s whose motor of `torque` N m presses it against its stop at 0.1 rad/s.
+
+    The stop wins: 0.1 rad/s, and the pin of the hinge rests.
+    """
+    builder = lv.RowBuilder([1.0], [100.0], [(0.0, -9.81 * DT, 2.0)], DT, position=[(0.0, 0.0)])
+    builder.hinge(-1, 0, anchor=(0.0, 0.0))
+    builder.motor(-1, 0, speed=target, max_torque=torque)
+    builder.limit(-1, 0, value=0.0, upper=0.1 * DT)
+    return builder, builder.problem()
+
+
+def objective(problem, impulse):
+    return float(0.5 * impulse @ (problem.csr @ impulse) - problem.b @ impulse)
+
+
+@pytest.mark.parametrize("form", ["bodies", "matrix"])
+@pytest.mark.parametrize(("torque", "sweeps"), [(50.0, 10), (50.0, 3), (1e4, 1000)])
+@pytest.mark.parametrize("name", SWEEPS)
+def test_sweeps_motor_against_its_stop_returns_the_last_iterate(name, torque, sweeps, form):
+    builder, problem = pendulum(torque)
+    given = problem
+    if form == "matrix":
+        given = lv.Problem(problem.b, problem.cones, problem.csr)
+    if name not in lv.available(given):
+        pytest.skip("the solver takes another form")
+    solution = lv.solve(given, name, max_iter=sweeps)
+    velocity = builder.velocity_after(problem, solution.impulse)[0]
+    np.testing.assert_allclose(velocity, [0.0, 0.0, 0.1], atol=1e-3)
+    assert objective(problem, solution.impulse) < 0.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sweeps_random_lcp_returns_the_lowest_objective(seed):
+    """Of a few sweeps of bounded rows with finite bounds, the objective falls in each, so the last one is returned."""
+    problem = random_lcp(seed)
+    for sweeps in (1, 2, 5):
+        last = lv.solve(problem, "pgs", tol=0.0, max_iter=sweeps)
+        solution = lv.solve(problem, "pgs", tol=1e-13, max_iter=sweeps)
+        if solution.success or last.residual.relative > 1.0:
+            continue
+        size = abs(objective(problem, last.impulse))
+        assert objective(problem, solution.impulse) <= objective(problem, last.impulse) + 1e-12 * size
+
+
+def test_sweeps_motor_and_friction_in_one_island_keep_the_joint():
+    """Coulomb's law: a motor that runs up to its limit against a contact with friction."""
+    rows = lv.Rows(
+        inv_mass=[1.0], inv_inertia=[np.eye(3)], v_free=[[0.0, 0.0, -0.2, 0.0, 0.0, 0.0]],
+        jac=[[0.0] * 8 + [-1.0] + [0.0] * 3, [0.0] * 6 + [0.0, 1.0, 0.0] + [0.0] * 3],
+        joint_ptr=[0, 1, 2], joint_body=[(-1, 0)] * 2, contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)],
+        tangent=[(1.0, 0.0, 0.0)], arm_a=[np.zeros(3)], arm_b=[np.zeros(3)],
+    )  # fmt: skip
+    # A press of 100 N s at most that wants 4 m/s downwards, a guide along y, and the ground.
+    problem = lv.Problem.from_rows(
+        rows, target=[4.0, 0.0, 0.0, 0.0, 0.0], lower=[-100.0, -np.inf], upper=[100.0, np.inf], mu=0.5
+    )
+    for name in ("sequential_impulses", "block_gauss_seidel"):
+        solution = lv.solve(problem, name, max_iter=10)
+        assert abs(problem.velocity(solution.impulse)[0, 2]) < 1e-9, name
+        assert solution.impulse[2] > 1.0, name
+
+
+def test_sweeps_asymmetric_matrix_with_motor_holds_the_free_rows():
+    _, problem = pendulum(50.0)
+    a = problem.csr.toarray()
+    a[1, 0] *= 1.001  # between the two rows of the pin: asymmetric
+    a[0, 0] *= 1.001
+    given = lv.Problem(problem.b, problem.cones, a + 1e-3 * np.triu(np.abs(a) > 0.0, 1))
+    assert not given.is_symmetric
+    solution = lv.solve(given, "pgs", max_iter=10)
+    slack = given.csr @ solution.impulse - given.b
+    assert abs(solution.impulse).max() > 0.0 and abs(np.delete(slack, 2)).max() < 1e-2
+
+
+def test_combine_best_islands_selects_each_island_by_its_own_objective():
+    first, second = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([[1.0]])
+    a = np.block([[first, np.zeros((2, 1))], [np.zeros((1, 2)), second]])
+    problem = lv.Problem.lcp(a, [1.0, 0.3, 2.0])
+    assert find_islands(problem)[0] == 2
+    one, other = np.array([0.5, 0.0, 0.1]), np.array([0.1, 0.0, 1.9])
+    best = combine_best_islands(problem, (np.zeros(3),), (one, other), 1e-9)
+    np.testing.assert_array_equal(best, [0.5, 0.0, 1.9])
+    outside = np.array([0.6, -0.1, 1.9])  # a lower objective than any impulse inside its bounds
+    best = combine_best_islands(problem, (one,), (outside,), 1e-9)
+    np.testing.assert_array_equal(best[:2], one[:2])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_solve_many_stale_starts_are_never_worse_than_zero_impulses(seed):
+    problems = [random_contact_problem(seed + i) for i in range(4)]
+    rng = np.random.default_rng(seed)
+    starts = [10.0**i * rng.normal(size=p.m) for i, p in enumerate(problems)]
+    for name in ("sequential_impulses", "newton", "auto"):
+        for problem, world in zip(
+            problems, lv.solve_many(problems, name, impulses=starts, tol=1e-13, max_iter=1), strict=True
+        ):
+            relative = lv.residual(problem, world.impulse).islands.relative
+            assert (relative <= 1.0 + 1e-9).all(), name
+
+
+# -- starts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["bodies", "A"])
+@pytest.mark.parametrize(
+    "name", [*SWEEPS, "newton", "direct", "lemke", "jacobi", "gauss_seidel", "sor", "admm", "auto"]
+)
+def test_solve_stale_start_is_never_worse_than_zero_impulses(name, form):
+    for seed in range(6):
+        problem = random_lcp(seed) if form == "A" else random_contact_problem(seed)
+        if name not in lv.available(problem):
+            continue
+        rng = np.random.default_rng(seed)
+        for size in (0.3, 30.0, 1e4):
+            start = size * rng.normal(size=problem.m)
+            islands = lv.residual(problem, start).islands.relative
+            solution = lv.solve(problem, name, impulse=start, tol=1e-12, max_iter=1)
+            found = solution.residual.islands.relative
+            # An island that does not improve ends where it began: at the better of start and zero.
+            worst = np.minimum(islands, 1.0) * (1.0 + 1e-9)
+            allowed = (found <= worst) | (found <= solution.residual.roundoff_floor * 2.0)
+            lower = objective(problem, solution.impulse) <= 1e-12
+            assert allowed.all() or (lower and problem.law != "coulomb"), (seed, size)
+
+
+def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
+    problem = lv.Problem.lcp(np.diag([1.0, 1.0]) + np.array([[0.0, 0.0], [0.0, 0.0]]), [1.0, 1.0])
+    assert find_islands(problem)[0] == 2
+    kept = lv.solve(problem, "jacobi", impulse=[0.9, 1e6], tol=1e-30, max_iter=0)
+    np.testing.assert_array_equal(kept.impulse, [0.9, 1e6])  # Without an iteration nothing is judged.
+    history = []
+    lv.solve(
+        lv.Problem.lcp(np.array([[2.0, 1.0, 0], [1.0, 2.0, 0], [0, 0, 1.0]]), [1.0, 1.0, 1.0]), "jacobi",
+        impulse=[1e6, 1e6, 0.9], tol=1e-9, max_iter=3, callback=lambda n, x, r: history.append(x.copy()),
+    )  # fmt: skip
+    assert np.abs(history[1][:2]).max() < 10.0
+    # With tol = 0 the start is kept: one iteration of Jacobi's method depends on it.
+    exact = lv.solve(
+        lv.Problem.lcp([[1.0, 0.5], [0.5, 1.0]], [1.0, 1.0]), "pgs", impulse=[0.0, 1e6], tol=0.0, max_iter=1
+    )
+    assert exact.impulse[0] == 0.0 and exact.impulse[1] == 1.0
+
+
+def test_solve_start_of_problem_at_rest_begins_at_zero():
+    """Two separating contacts: zero impulses solve them, so that any other start is worse."""
+    problem = lv.Problem.lcp(np.eye(2), [-1.0, -1.0])
+    for name in ("pgs", "newton", "auto", "jacobi", "admm"):
+        solution = lv.solve(problem, name, impulse=[0.3, 0.2], tol=1e-9, max_iter=1)
+        np.testing.assert_array_equal(solution.impulse, 0.0, err_msg=name)
+
+
+@pytest.mark.parametrize("tol", [0.0, 1e-6])
+def test_solve_infeasible_start_outside_its_bounds_is_returned_inside(tol):
+    problem = without_solution(3, 6)
+    start = -5.0 * np.ones(problem.m)
+    for name in ("newton", "auto", "direct", "lemke"):
+        if name not in lv.available(problem):
+            continue
+        solution = lv.solve(problem, name, impulse=start, tol=tol)
+        inside = np.clip(solution.impulse, problem.cones.lower, problem.cones.upper)
+        if solution.status is lv.Status.INFEASIBLE:
+            np.testing.assert_array_equal(solution.impulse, inside, err_msg=name)
+    empty = lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0])
+    solution = lv.solve(empty, "pgs", impulse=[-3.0, -4.0], tol=tol)
+    assert solution.status is lv.Status.INFEASIBLE and (solution.impulse >= 0.0).all()
+
+
+def test_solve_false_claim_returns_no_island_worse_than_its_start(plug_in):
+    """A solver that claims to have converged at an impulse far from the solution."""
+
+    def run(problem, impulse):
+        impulse[:] = 1e6
+        return lv.Claim(lv.Status.CONVERGED, 1, {}, "")
+
+    name = plug_in(run)
+    problem = lv.Problem.lcp(np.diag([1.0, 2.0]), [1.0, 1.0])
+    for start in (None, [0.9, 0.4]):
+        solution = lv.solve(problem, name, impulse=start)
+        begun = lv.residual(problem, problem.start() if start is None else start).islands.relative
+        assert not solution.success and solution.status_conflict
+        assert (solution.residual.islands.relative <= begun).all()
