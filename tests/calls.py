@@ -189,7 +189,7 @@ def newton_without(*phases):
 
 def keep_values(monkeypatch, module, name, values, solvers):
     """Let a table of settings try only some values, beside some solvers or none."""
-    lines = [f for f in getattr(module, name) if f.beside.get("solver", "") in solvers]
+    lines = [f for f in getattr(module, name) if f.fixed.get("solver", "") in solvers]
     kept = [f._replace(values=tuple(x for x in f.values if x in values)) for f in lines]
     monkeypatch.setattr(module, name, tuple(f for f in kept if f.values))
 
