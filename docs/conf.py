@@ -54,7 +54,7 @@ CONTENTS = {
         "diagnose examples generated/examples"
     ),
     "Use": (
-        "commands report formats generalized quadratic-programs mujoco worlds engines audit "
+        "commands report formats own-engine generalized quadratic-programs mujoco worlds engines audit "
         "tune derivatives c solvers generated/api"
     ),
     "LavenderSim": "engine engine-measurements scenes towers web",
