@@ -1,7 +1,7 @@
 """Every number of the chapter's pages is what the command beside it prints.
 
-Comments in the pages hold the claims, section by section: a command in the first line, then `numbers | line`, the line
-as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
+Comments in chapter_claims.txt hold the claims, under the headings of all sections of the pages: a command in the first
+line, then `numbers | line`, the line as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
 half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise; `<0.1`
 holds where what is printed is less.
 `given:` lists settings and numbers of theory, `measured once:` those of another project's engine; a section has no
@@ -30,7 +30,11 @@ COMMENT = re.compile(r"<!-- (.*?) ?-->", re.DOTALL)
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"(?<![\w.])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?(?!\w|\.\d)")
 NUMERAL = r"(?<![\w.])([-+\d.e]*\d)(?!\d)"
-SECTIONS = re.split(r"^#+ .*\n", PAGE, flags=re.MULTILINE)
+HEADING = re.compile(r"^#+ .*\n", re.MULTILINE)
+CLAIMS_TEXT = Path(__file__).with_name("chapter_claims.txt").read_text(encoding="utf-8")
+SECTIONS = [
+    page + comments for page, comments in zip(HEADING.split(PAGE), HEADING.split(CLAIMS_TEXT), strict=True)
+]
 
 
 def value(text):
@@ -95,7 +99,7 @@ def claimed(by):
     return {number.lstrip("<") for found in by.values() for numbers, *_ in found for number in numbers}
 
 
-CLAIMS = claims(PAGE)[0]
+CLAIMS = claims(CLAIMS_TEXT)[0]
 
 
 @pytest.mark.parametrize("command", sorted(CLAIMS))
@@ -110,6 +114,10 @@ def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
     by, others = claims(section)
     stand = set(NUMBER.findall(CODE.sub(" ", COMMENT.sub("", section))))
     assert claimed(by) | others <= stand <= claimed(CLAIMS) | others
+
+
+def test_claims_have_the_headings_of_the_pages():
+    assert HEADING.findall(CLAIMS_TEXT) == HEADING.findall(PAGE)
 
 
 def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
