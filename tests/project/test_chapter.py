@@ -1,9 +1,9 @@
 """Every number of the chapter's pages is what the command beside it prints.
 
-Comments in chapter_claims.txt hold the claims, under the headings of all sections of the pages: a command in the first
-line, then `numbers | line`, the line as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
-half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise; `<0.1`
-holds where what is printed is less.
+Comments in chapter_claims.txt hold the claims, under the headings of all sections of the pages: a command in the
+first line, then `numbers | line`, the line as it is printed with `{}` for a number, `_` for a word, `…` for anything
+and blanks of any width. A number is held to half a unit of its last digit, or to a tolerance after `±` where
+libraries of other machines may round otherwise; `<0.1` holds where what is printed is less.
 `given:` lists settings and numbers of theory, `measured once:` those of another project's engine; a section has no
 further numbers but those claimed elsewhere on the pages. LAVENDER_PRINTED names a folder with what the commands printed
 before, in files of their names with `_` for `/`.
