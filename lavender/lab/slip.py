@@ -57,9 +57,8 @@ REMEDIES = {
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
-REMEDY_STEPS = (
-    25  # Settings are compared again after this number of further steps, when creep has become steady.
-)
+# Settings are compared again after this number of further steps, when creep has become steady.
+REMEDY_STEPS = 25
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 
 

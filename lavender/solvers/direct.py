@@ -2,9 +2,8 @@
 
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
     boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess the set of free rows (all rows if A has
-    a
-             narrow band, otherwise the rows that are free after a few sweeps), solve for them, exchange the rows with
-             the wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
+             a narrow band, otherwise the rows that are free after a few sweeps), solve for them, exchange the rows
+             with the wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
     singular the boxed method on A + s D with s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A
              fixed point solves the problem with A (proximal point method). Once the set of free rows no longer
              changes, each pass is one step of refinement: it multiplies the error along an eigenvector of eigenvalue

@@ -9,13 +9,11 @@
 2. Bounded rows and cones: a cold-started Mehrotra interior point. When the active rows are identified, the solution on
    them is computed to the round-off limit of float64.
 3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then
-proximal
-   damped Newton.
+   proximal damped Newton.
 4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the
-law,
-   in which the convex problem changes with every step. If these stall, a path of smoothed problems (Chen, Mangasarian
-   1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds at which
-   contacts change from stick to slip.
+   law, in which the convex problem changes with every step. If these stall, a path of smoothed problems (Chen,
+   Mangasarian 1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds at
+   which contacts change from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Methods 1 to 4 over the rows of A are used instead if they are estimated to cost less than a tenth (few rows
@@ -69,10 +67,8 @@ from lavender_ext.newton.solve import COUNTED
 FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of the row form.
 VELOCITY_MAX_COST_RATIO = 10.0
-MAX_FORMED_ROWS = (
-    # If the velocity form fails, A is formed and the row form continues if A has up to this many rows.
-    3000
-)
+# If the velocity form fails, A is formed and the row form continues if A has up to this many rows.
+MAX_FORMED_ROWS = 3000
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
 _ENDS = {

@@ -155,14 +155,12 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 @PROC
 @pytest.mark.parametrize("how", ["fork", pytest.param("escape", marks=pytest.mark.nightly)])
 def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
-    """Its child ends with it, or has left the group and keeps the pipe."""
+    """Its child ends with it, or has left the group and keeps the pipe; `watchdog` ends a test that waits."""
     monkeypatch.setattr(bench_worker, "GRACE_TIME", 0.5)
     p = stack()
     with Worker() as worker:
         worker.measure_task(p, task(p, "pgs"))  # starts the process
-        start_time = time.monotonic()
         assert worker.measure_task(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
-        assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE_TIME)
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
         assert worker.measure_task(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
