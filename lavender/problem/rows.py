@@ -242,9 +242,11 @@ class Rows:
     @property
     def moving_block_bodies(self) -> IntArray:
         """`block_bodies` with -1 for bodies that cannot move: their inverse mass and inertia are 0."""
-        moves = np.append((self.inv_mass != 0.0) | self.inv_inertia.any(axis=(1, 2)), False)
         bodies = self.block_bodies
-        return mark_read_only(bodies if moves[:-1].all() else np.where(moves[bodies], bodies, np.int32(-1)))
+        if not self.inv_mass.all():
+            moves = np.append((self.inv_mass != 0.0) | self.inv_inertia.any(axis=(1, 2)), False)
+            bodies = np.where(moves[bodies], bodies, np.int32(-1))
+        return mark_read_only(bodies)
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """Compute J as a CSR matrix (m, 6 n); columns 6 i to 6 i + 5 are body i, linear then angular."""
