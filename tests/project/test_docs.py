@@ -276,3 +276,16 @@ def test_every_column_of_records_is_told():
         ["toy_stack"], ["pgs"], lv.bench.Plan(tolerances=(1e-3,), budgets=(), orders=(), repeats=1)
     )
     assert set(re.findall(r"`(\w+)`", table)) >= set(records.rows()[0])
+
+
+def test_pages_are_within_two_clicks_of_the_readme():
+    """All pages but the index of the built site, which has the same links."""
+
+    def follow(page):
+        links = re.findall(r"\]\(([^):#]+\.md)[#)]", page.read_text(encoding="utf-8"))
+        return {(page.parent / link).resolve() for link in links}
+
+    first = follow(ROOT / "README.md")
+    reached = first.union(*(follow(page) for page in first if page.is_file()))
+    missed = {page.name for page in (ROOT / "docs").glob("*.md")} - {page.name for page in reached}
+    assert missed <= {"index.md"}
