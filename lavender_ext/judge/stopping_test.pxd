@@ -3,7 +3,8 @@
 The first checks are at the start and after the first sweep. At the start, islands with a larger residual than the zero
 impulse begin from the zero impulse. From the residuals r0, r of the last two checks, k sweeps apart,
 the end is predicted after n more sweeps, r (r/r0)^(n/k) <= tol. The next check is after n/2 sweeps, but at least an eighth
-of the sweeps done so far and at most as many again. If the residual does not fall, it is after that eighth. The relative
+of the sweeps done so far, and at most as many again or, from 64 sweeps on, a quarter of them. If the residual does not
+fall, it is after that eighth. The relative
 residual r decides:
 
     r <= tol                                        CONVERGED

@@ -69,7 +69,8 @@ cdef inline int32_t status_after_refinement(const stopping_test_t* s, const scor
 
 cdef inline int32_t sweeps_until_next_check(const stopping_test_t* s, double now, double tol) noexcept nogil:
     """Return the number of sweeps until the next check."""
-    cdef double min_sweeps = s.total >> 3, max_sweeps = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
+    cdef double min_sweeps = s.total >> 3, n = 0.0, gap = s.total - s.last_at, fall, r = now
+    cdef double max_sweeps = s.total if s.total < 64 else s.total >> 2
     if min_sweeps < 1.0:
         min_sweeps = 1.0
     if gap >= 1.0 and now < s.last:
