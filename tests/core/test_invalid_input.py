@@ -259,6 +259,7 @@ CALLS = {
     "known": Call(lv.known, {"problem": LCP}),
     "prepare": Call(lv.prepare, {"problem": LCP, "solver": "pgs"}),
     "History.plot": Call(lv.solve(LCP, "pgs", history=True).history.plot, {"against": "time"}),
+    "Solution.plot": Call(lv.solve(LCP).plot, {"rows": 5}),
     "Prepared.solve": Call(
         lv.prepare(LCP, "pgs").solve, {"problem": LCP, "impulse": B, "history": True} | LIMITS
     ),

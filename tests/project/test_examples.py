@@ -190,7 +190,7 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     assert speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0  # more than the motor's torque
     source = module.__loader__.get_source(module.__name__)
     lines = source.split("# ---")[1].count("\n") - 1
-    for page, words in (("quickstart", "an engine of"), ("examples", "a two-dimensional engine in")):
+    for page, words in (("own-engine", "an engine of"), ("examples", "a two-dimensional engine in")):
         assert f"{words} {lines} lines" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
 
 
