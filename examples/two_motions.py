@@ -19,7 +19,7 @@ import numpy as np
 import lavender as lv
 from lavender import suite
 
-STARTS = ((0.0, 0.0), (1.0, -1.0))  # N s
+STARTS = ("open", "sticks")  # Motions whose impulse is a start.
 
 
 def motions(problem):
@@ -45,7 +45,7 @@ def numbers():
     picks = {}
     for solver in lv.available(problem):
         for start in STARTS if lv.get(solver).impulse else ():
-            end = lv.solve(problem, solver, impulse=np.array(start), tol=1e-9)
+            end = lv.solve(problem, solver, impulse=found[start], tol=1e-9)
             off = {name: lv.motion_error(problem, end.impulse, reference=x).rows for name, x in found.items()}
             picks[solver, start] = min(off, key=off.get) if end.success else "not solved"
     return {"problem": problem, "motions": found, "picks": picks}
@@ -60,7 +60,7 @@ def main():
         relative = lv.residual(problem, impulse).relative
         print(f"{name:<18} tip at {normal:5.2f}, {tangent:5.2f} m/s, relative residual {relative:.0e}")
     for (solver, start), name in found["picks"].items():
-        print(f"{solver:<20} from {start} N s: {name}")
+        print(f"{solver:<20} from the impulse of {start!r}: {name}")
     cone = lv.solve(problem.relaxed("cone"), tol=1e-12)
     print("cone law: one motion, tip at {:.2f}, {:.2f} m/s".format(*cone.slack))
 

@@ -340,6 +340,12 @@ def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
     return data.reference_energy, data.reference_velocity
 
 
+def replace_stale_start(problem: Problem, impulse: FloatArray) -> None:
+    """Set the impulse (m,) [N s] in place to zero, clipped to its bounds, in islands where that is better."""
+    get_zero_impulse_reference(problem)
+    measure.replace_stale_start(problem.metric, impulse)
+
+
 def is_solved_by_zero(problem: Problem) -> bool:
     """Return whether the zero impulse solves every island (`lavender_ext/judge/reference.pxd`), or V0 < 1e-9 m/s.
 

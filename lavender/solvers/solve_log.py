@@ -14,12 +14,13 @@ from lavender.judge.residuals import (
     combine_best_islands,
     find_relative_at_zero,
     get_zero_impulse_reference,
+    replace_stale_start,
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
-from lavender_ext.judge.measure import replace_stale_start, residuals_by_island
+from lavender_ext.judge.measure import residuals_by_island
 
 if TYPE_CHECKING:
     from lavender.solvers.recording import Recorder
@@ -73,7 +74,7 @@ class SolveLog:
         """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
         start = start.copy()
-        replace_stale_start(self.problem.metric, start)
+        replace_stale_start(self.problem, start)
         self.judge_and_store_best(start, is_start=True)
 
     def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:

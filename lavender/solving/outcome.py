@@ -18,6 +18,7 @@ from lavender.judge.residuals import (
     divide_by_reference,
     get_zero_impulse_reference,
     refine_residual,
+    replace_stale_start,
     residual,
     reuse_or_judge_impulse,
 )
@@ -44,7 +45,7 @@ from lavender.judge.solution import (
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
-from lavender_ext.judge.measure import Judged, all_finite, are_bit_identical, replace_stale_start
+from lavender_ext.judge.measure import Judged, all_finite, are_bit_identical
 
 # End of the message of a solution that is its start, unchanged.
 UNJUDGED = ", unjudged"
@@ -72,7 +73,8 @@ def finish(
 ) -> Solution:
     """Build the solution: the judge's residual, the status that it supports, and the check of the claim.
 
-    `refutation` describes a solution that the caller found although the solver claims that none exists; else empty.
+    `refutation` is empty unless the caller knows that the claim is false: it describes a solution that was found
+    although the solver claims that none exists, or the residual of the solver's own impulse if that was replaced.
     """
     claim = name_lost_row(problem, impulse, claim)
     if claim.status is INFEASIBLE:
@@ -139,6 +141,8 @@ def finish(
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
     if status is CONVERGED and not relative <= tol:
         status_conflict = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
+    elif status is CONVERGED and claim.status is CONVERGED and refutation:
+        status_conflict = f"says CONVERGED, {refutation}"
     elif status is ROUNDOFF_LIMIT and not judged.above_floor <= tol:
         status_conflict = (
             f"says ROUNDOFF_LIMIT, rounding does not explain a relative residual of {judged.above_floor:.2e}"
@@ -226,9 +230,8 @@ def judge_late_fields(
     disk = problem.disk
     start = problem.on_disk(impulse)
     if not keeps_start:
-        get_zero_impulse_reference(disk)
         start = start.copy()
-        replace_stale_start(disk.metric, start)
+        replace_stale_start(disk, start)
         if not are_bit_identical(start, problem.on_disk(impulse)):
             impulse = mark_read_only(start.copy() if problem is disk else problem.cones.stretch * start)
             message = (

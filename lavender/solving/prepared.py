@@ -23,6 +23,8 @@ from lavender.judge.residuals import (
     convert_residual_from_disk,
     find_relative_at_zero,
     get_zero_impulse_reference,
+    replace_stale_start,
+    residual,
 )
 from lavender.judge.solution import (
     CONVERGED,
@@ -58,7 +60,7 @@ from lavender.solving.limits import (
 )
 from lavender.solving.outcome import create_unjudged, decide_empty_rows, finish, name_lost_row
 from lavender.solving.velocity import accept_velocity, relative_tolerance
-from lavender_ext.judge.measure import replace_stale_start, residuals_by_island
+from lavender_ext.judge.measure import residuals_by_island
 from lavender_ext.judge.stopping_test import StoppingTest
 
 if TYPE_CHECKING:
@@ -315,6 +317,7 @@ class Prepared:
         """Run the solver unless the problem is decided without it, and build the solution."""
         spec, problem = self.spec, self.problem
         setup_time, self.setup_time = self.setup_time, 0.0
+        given, refutation = loop.impulse.copy(), ""
         proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
             message, certificate, impossible = proof
@@ -343,7 +346,11 @@ class Prepared:
         else:
             has_checks = isinstance(getattr(self.state, "watch", None), StoppingTest)
             if loop.tol > 0.0 and not has_checks and not spec.delegates and not problem.has_singular_program:
-                replace_stale_start(problem.metric, loop.impulse)
+                # Judge the start as given, as compiled calls do: without its empty rows it may be worse than zero.
+                kept = given.copy()
+                replace_stale_start(problem, kept)
+                is_stale = kept != given
+                loop.impulse[is_stale] = kept[is_stale]
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             # Own solvers claim only what the judge confirms.
@@ -353,7 +360,12 @@ class Prepared:
                 # `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
                 keeps_best = spec.delegates and not problem.has_singular_program
                 if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
+                    claimed = loop.impulse.copy()
                     loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
+                    if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
+                        relative = residual(problem, claimed).relative
+                        if relative > loop.tol:
+                            refutation = f"its own impulse has a relative residual of {relative:.2e}"
             if (
                 claim.status is TIME_LIMIT
                 and spec.delegates
@@ -361,7 +373,6 @@ class Prepared:
                 and estimate_import_cost(*SCIPY_MODULES)
             ):
                 claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
-        refutation = ""
         if claim.status is INFEASIBLE and (spec.external or not spec.builtin):
             claim, _, refutation = check_infeasibility_claim(problem, claim, loop.tol, loop.deadline)
         if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:

@@ -84,7 +84,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
 def test_a_path_runs_through_its_folds():
     """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
     paths = 0
-    for step, problem in Pile(12).problems(130):
+    for step, problem in Pile(14).problems(130):
         if step >= 100 and step % 10 == 0:  # which of them need a path differs between processors
             # A path that has to search its way around a fold takes 800 and more.
             solution = lv.solve(problem, "newton", max_iter=800, impulse=np.zeros(problem.m))
