@@ -6,7 +6,7 @@ A command imports its modules when it runs, so that --help is fast.
 import sys
 
 from lavender.base.errors import InputError, require_packages
-from lavender.cli.exits import EXIT_BAD_INPUT, EXIT_CODES, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.base.exits import EXIT_BAD_INPUT, EXIT_CODES, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
 
 try:
     require_packages("the command line", "click", "rich", "threadpoolctl")

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
     FILE,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import limit_to_one_thread, print_escaped
 
 

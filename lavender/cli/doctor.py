@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import click
 
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import ErrorReporter, print_escaped
 
 

@@ -17,7 +17,7 @@ import click
 
 from lavender._version import __version__
 from lavender.base.errors import InputError, LavenderError, UnknownName
-from lavender.cli.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
+from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
 from lavender.cli.options import discard_output, print_escaped
 
 #: Names of the commands by the heading under which `lavender --help` lists them.

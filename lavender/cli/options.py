@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNMET
 
 if TYPE_CHECKING:
     from rich.console import Console

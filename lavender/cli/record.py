@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import (
     FILE,
     FOLDER,

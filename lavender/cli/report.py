@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.exits import EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.measuring import Measured, is_campaign, measure_files
 from lavender.cli.options import (
     PATH,

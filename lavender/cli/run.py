@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import (
     PATH,
     continue_after_closed_output,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_escaped
 from lavender.io.stored import check_figure_path, check_writable, write_figure
 

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.base.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
 from lavender.io.stored import check_writable, write_atomically
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lavender.cli.exits import EXIT_UNMET
+from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output

@@ -81,7 +81,7 @@ cdef inline void compute_fiedler_vector(const dissection_t* g, int32_t begin, in
     """Iterate (1) on x over the subgraph of vertices[begin:end]."""
     cdef int32_t i, q, v, k
     cdef double degree, total, mean, s, size
-    for k in range(POWER_ITERATIONS):
+    for k in range(POWER_ITERATIONS):  # no-cython-lint
         mean = total = size = 0.0
         for i in range(begin, end):
             v = g.vertices[i]
@@ -111,7 +111,7 @@ cdef inline void split_at_median(const dissection_t* g, int32_t begin, int32_t e
     for i in range(begin, end):
         low = min(low, g.x[g.vertices[i]])
         high = max(high, g.x[g.vertices[i]])
-    for k in range(50):
+    for k in range(50):  # no-cython-lint
         middle = 0.5 * (low + high)
         count = 0
         for i in range(begin, end):
@@ -153,7 +153,7 @@ cdef inline bint refine_separator(const dissection_t* g, int32_t begin, int32_t 
             count += 1
     limit = <int32_t>(max_half() * (end - begin))
     smallest, difference = size[2], absolute_difference(size[0], size[1])
-    for k in range(2 * smallest + 20):
+    for k in range(2 * smallest + 20):  # no-cython-lint
         chosen, half, best_gain = -1, 0, 0
         for i in range(count):
             v = g.separator[i]
@@ -205,7 +205,7 @@ cdef inline bint split_subgraph(const dissection_t* g, int32_t begin, int32_t en
     """
     cdef int32_t i, k, v, t, reached = 0, start = g.vertices[begin]
     cdef int32_t place[3]
-    for k in range(3):                                  # Find a distant vertex.
+    for k in range(3):                                  # Find a distant vertex.  # no-cython-lint
         for i in range(begin, end):
             g.x[g.vertices[i]] = -1.0
         reached = compute_distances(g, start)
@@ -216,7 +216,7 @@ cdef inline bint split_subgraph(const dissection_t* g, int32_t begin, int32_t en
     else:
         compute_fiedler_vector(g, begin, end)
         split_at_median(g, begin, end)
-        for k in range(MAX_REFINEMENTS):
+        for k in range(MAX_REFINEMENTS):  # no-cython-lint
             if not refine_separator(g, begin, end):
                 break
     place[0] = place[1] = place[2] = 0

@@ -90,7 +90,8 @@ cdef inline void copy_island_impulse(const blocks_t* p, int32_t island, const do
 # -- objectives -------------------------------------------------------------------------------------------------------
 
 
-cdef inline double objective_of_rows(const blocks_t* p, int32_t first, int32_t end, const double* lam, const double* w) noexcept nogil:
+cdef inline double objective_of_rows(const blocks_t* p, int32_t first, int32_t end, const double* lam,
+                                     const double* w) noexcept nogil:
     """Return f over rows [first, end); four sums shorten the chain of additions."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t k = first

@@ -132,8 +132,8 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
 cdef inline void compute_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
     """Write E0 [sqrt J], V0 [m/s] and the relative residual of the zero impulse x, slack w, error e (m each) to out (3).
 
-    With several islands their references and residuals are set, and the first two are sqrt(sum E0_i^2) and max V0_i over the islands with
-    a positive reference.
+    With several islands their references and residuals are set, and the first two are sqrt(sum E0_i^2) and max V0_i
+    over the islands with a positive reference.
     """
     cdef islands_t* s = <islands_t*>p.islands
     cdef int32_t i

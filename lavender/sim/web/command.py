@@ -89,7 +89,7 @@ def check() -> None:
 
     It needs a checkout of the project, whose tests/sim/web it runs, and Node 18 or newer. Exit code 1: a bit differs.
     """
-    from lavender.cli.exits import EXIT_UNMET
+    from lavender.base.exits import EXIT_UNMET
     from lavender.sim.web import pages
 
     if not pages.compare_with_native_kernels(_print_message):
