@@ -9,8 +9,8 @@
                      1. `anderson`, which sweeps under the cone law until contacts slip, while it predicts fewer sweeps
                         than the lower bound of the cost of Newton's method pays for
                      2. more sweeps, after an analysis of Newton's matrix: at least `sweep_fraction` of its cost, then
-                        unless more sweeps are predicted than its cost pays for
-                     3. `admm` from zero, up to a quarter of that cost, if this pays for 100 iterations
+                        unless more sweeps are predicted than its cost, or stage 3, pays for
+                     3. `admm` from zero, up to 0.4 times that cost and 600 iterations, if this pays for 150
                      4. the interior points of `newton` on the relaxation, until their residual of the relaxation is
                         below `slip_ratio` times that of Coulomb's law: contacts slip
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
@@ -87,9 +87,10 @@ __doc__ += describe_numbers() + "\n"
 
 # Newton's method on the relaxation may use this multiple of its expected number of factorisations.
 RELAXED_BUDGET_RATIO = 2.0
-# On large problems with friction, `admm` may cost this fraction of Newton's method before that runs, if this pays for
-# at least so many iterations. Without a factor, an iteration costs about as much as three sweeps.
-ADMM_FRACTION, MIN_ADMM_ITERATIONS, SWEEPS_PER_ADMM_ITERATION = 0.25, 100.0, 3.0
+# On large problems with friction, `admm` may cost this fraction of Newton's method before that runs, up to the largest
+# number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
+ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
+MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
@@ -288,13 +289,18 @@ class DecisionTree:
         if "newton" not in self.states:
             return
         state = self.states["newton"]
+        cost = ADMM_FRACTION * state.cost
+        iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
+        runs_admm = iterations >= MIN_ADMM_ITERATIONS
         if self.first_stage <= 2:
             why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
-            yield Stage("anderson", inf, state.cost, why, least=state.cost / self.relaxed_sweep, position=2)
-        cost = ADMM_FRACTION * state.cost
-        n = cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep)
-        if self.first_stage <= 3 and n >= MIN_ADMM_ITERATIONS:
-            yield Stage("admm from zero", n, cost, f"{ADMM_FRACTION:g} times newton's cost", position=3)
+            least = state.cost / self.relaxed_sweep
+            if runs_admm:
+                least = min(least, SWEEPS_PER_ADMM_ITERATION * iterations)
+            yield Stage("anderson", inf, state.cost, why, least=least, position=2)
+        if self.first_stage <= 3 and runs_admm:
+            why = f"up to {ADMM_FRACTION:g} times newton's cost"
+            yield Stage("admm from zero", iterations, cost, why, position=3)
         if self.first_stage <= 4:
             n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
             yield Stage("newton on the relaxation", n, state.cost, why, position=4)
@@ -584,7 +590,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             step = steps[stage.solver] = create_solver_step(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
-                if not has_time_to_factorise_after(
+                if not stage.position and not has_time_to_factorise_after(
                     tree,
                     steps,
                     min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds()),
@@ -642,14 +648,18 @@ def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
 
 
 def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Step]) -> None:
-    """Use the remaining time for sweeps, and for `nncg` if they end: no factorising solver would end in time."""
+    """Use the remaining time for sweeps, and for `nncg` if they end: no factorising solver would end in time.
+
+    On large problems with friction, `admm`, which needs no factor there, gets half of the time after the first half.
+    """
     log.timed_out = True
-    for name in ("anderson", "nncg"):
-        step = steps.get(name) or create_solver_step(name, log, tree)
-        if not step.over:
-            step.least = inf
-            if isinstance(step, Sweeps):
-                step.time_fraction = 1.0
+    shared = ("anderson", "admm from zero") if starts_relaxed(log.problem) else ()
+    for k, name in enumerate((*shared, "anderson", "nncg")):
+        step = steps[name] = steps.get(name) or create_solver_step(name, log, tree)
+        setup = 0.0 if step.state is not None else estimate_cost(name, log.problem).setup
+        if not step.over and (name == "anderson" or not log.deadline.has_passed(1e-9 * setup)):
+            assert isinstance(step, Iterations)
+            step.least, step.time_fraction = inf, DECISIONS.time_share if k < len(shared) else 1.0
             step.run(inf)
         if log.done():
             return
