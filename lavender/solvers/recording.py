@@ -81,12 +81,13 @@ class Recorder:
 
     def record_compiled_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
         """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
+        call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
         problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
         before = self.solve.recording_time
         while claim.iterations > self.records[-1][0]:
             watch = Stopwatch()
             result, counts = call.solve_and_judge(problem, start, tol, cost)
-            seconds = max(watch.elapsed_seconds, self.records[-1][1])
+            seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
             if result is not None:
                 part = call.make_claim(problem, counts, start, result.relative)
                 if part.iterations <= claim.iterations:
