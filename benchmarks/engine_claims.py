@@ -24,10 +24,10 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
+from lavender.audit.claims import ClaimComparison, compare_claims
+from lavender.audit.engine_scenes import NewtonScene, start_scene
 from lavender.io.engine_step import EngineStep
-from lavender.lab.claims import ClaimComparison, compare_claims
-from lavender.lab.engine_scenes import NewtonScene, start_scene
-from lavender.lab.report.text import format_size
+from lavender.report.text import format_size
 
 HALF_EDGE, FRICTION, PILE_SEED = 0.1, 0.7, 1
 # Both errors differ by at most this factor: the judge weights the rows of a contact's block.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import lavender as lv
-from lavender.lab.suite.build import FALL_SPEED
+from lavender.suite.build import FALL_SPEED
 
 FRICTION_COEFFICIENT = 0.6
 CORNERS = np.array([(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])

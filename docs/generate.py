@@ -39,15 +39,15 @@ from benchmarks import stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import format_seconds
-from lavender.lab.bench import format_tolerance
-from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
-from lavender.lab.report import compute_mean_times_by_law, summarize_runs_by_case, table_specs
-from lavender.lab.report.figures import build_figures, build_work_precision
-from lavender.lab.report.findings import Report
-from lavender.lab.report.page import render_page
-from lavender.lab.report.plotting import assign_styles, plot_panels
-from lavender.lab.report.text import format_residual
 from lavender.problem import LAWS
+from lavender.report import compute_mean_times_by_law, summarize_runs_by_case, table_specs
+from lavender.report.bench import format_tolerance
+from lavender.report.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
+from lavender.report.figures import build_figures, build_work_precision
+from lavender.report.findings import Report
+from lavender.report.page import render_page
+from lavender.report.plotting import assign_styles, plot_panels
+from lavender.report.text import format_residual
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -626,9 +626,9 @@ def api_page(site):
             rooms.setdefault(".".join(thing.__module__.split(".")[1:3]), []).append((lv, name))
     for room in (
         "io",
-        "lab.suite",
-        "lab.bench",
-        "lab.report",
+        "suite",
+        "report.bench",
+        "report",
         "judge.measures",
         "judge.certificates",
     ):

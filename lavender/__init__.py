@@ -53,22 +53,22 @@ from lavender.solving.solve import solve
 if TYPE_CHECKING:
     from lavender import contract as contract
     from lavender import export as export
-    from lavender import io
+    from lavender import io, report, suite
+    from lavender.audit.slip import SlipExplanation, explain_slip
     from lavender.base import errors as errors
     from lavender.batch.data import Batch
     from lavender.batch.residuals import Residuals, residual_many
     from lavender.batch.solve import Solutions, solve_many
+    from lavender.diagnostics import Diagnostic, diagnose
+    from lavender.diagnostics.motion_error import MotionError, motion_error
+    from lavender.diagnostics.redundancy import Redundancy, redundancy
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
-    from lavender.lab import bench, report, suite
-    from lavender.lab.check import CrossCheck, cross_check
-    from lavender.lab.diagnostics import Diagnostic, diagnose
-    from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
-    from lavender.lab.motion import MotionError, motion_error
-    from lavender.lab.slip import SlipExplanation, explain_slip
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
     from lavender.programs.quadratic import solve_qp
+    from lavender.report import bench
+    from lavender.report.check import CrossCheck, cross_check
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.sim.scene import Scene
@@ -82,11 +82,11 @@ _LAZY_NAMES = {
     "lavender.batch.solve": ("Solutions", "solve_many"),
     "lavender.gradient": ("Derivative", "derivative", "derivatives"),
     "lavender.io": ("load",),
-    "lavender.lab.check": ("CrossCheck", "cross_check"),
-    "lavender.lab.diagnostics": ("Diagnostic", "diagnose"),
-    "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
-    "lavender.lab.motion": ("MotionError", "motion_error"),
-    "lavender.lab.slip": ("SlipExplanation", "explain_slip"),
+    "lavender.report.check": ("CrossCheck", "cross_check"),
+    "lavender.diagnostics": ("Diagnostic", "diagnose"),
+    "lavender.diagnostics.redundancy": ("Redundancy", "redundancy"),
+    "lavender.diagnostics.motion_error": ("MotionError", "motion_error"),
+    "lavender.audit.slip": ("SlipExplanation", "explain_slip"),
     "lavender.problem.row_builder": ("RowBuilder",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
@@ -97,7 +97,7 @@ _MODULE_OF_NAME = {name: module for module, names in _LAZY_NAMES.items() for nam
 
 # Public module -> its full name.
 _LAZY_MODULES = {
-    "bench": "lavender.lab.bench",
+    "bench": "lavender.report.bench",
     "cones": "lavender.problem.cones",
     "contract": "lavender.contract",
     "engine": "lavender.sim.engine",
@@ -105,9 +105,9 @@ _LAZY_MODULES = {
     "export": "lavender.export",
     "io": "lavender.io",
     "registry": "lavender.solvers.registry",
-    "report": "lavender.lab.report",
+    "report": "lavender.report",
     "scene": "lavender.sim.scene",
-    "suite": "lavender.lab.suite",
+    "suite": "lavender.suite",
 }
 
 __all__ = [

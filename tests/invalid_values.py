@@ -17,7 +17,8 @@ import scipy.sparse as sp
 
 import lavender as lv
 
-LAYERS = ("io", "sim", "lab")  # Modules outside of these packages belong to the core.
+# Package -> layer with a table of calls of its own; modules outside of these packages belong to the core.
+LAYERS = {"io": "io", "sim": "sim"} | dict.fromkeys(("audit", "report", "suite", "diagnostics"), "measuring")
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def public_calls(layer, module=lv, prefix=""):
         except ImportError:
             continue  # It belongs to a layer above, which is not there.
         home = (getattr(x, "__module__", None) or "").split(".")
-        if (home[1] if len(home) > 1 and home[1] in LAYERS else "core") != layer:
+        if LAYERS.get(home[1] if len(home) > 1 else "", "core") != layer:
             continue
         if inspect.isclass(x) and issubclass(x, BaseException):
             continue

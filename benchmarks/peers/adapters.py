@@ -31,9 +31,9 @@ from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, explain_refusal
 from lavender.external.running import Limits
 from lavender.judge.residuals import get_zero_impulse_reference
-from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
+from lavender.report.bench.stopwatch import measure_backend_time
 from lavender.solving.prepared import prepare
 
 TARGETS = (1e-3, 1e-6, 1e-9)  # relative residuals to reach

@@ -10,8 +10,8 @@ from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
 from lavender.base.deadline import format_seconds
-from lavender.lab.bench.statistics import compute_geometric_mean
-from lavender.lab.report.text import format_residual
+from lavender.report.bench.statistics import compute_geometric_mean
+from lavender.report.text import format_residual
 
 LARGE = 1000  # minimum rows of a large problem
 

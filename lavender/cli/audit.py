@@ -74,9 +74,9 @@ def audit(
     Exit code 1: a world diverged, a step could not be judged, or an answer that is not at its floor has a velocity
     error above --max-velocity-error. Exit code 130: stopped by Ctrl-C; the page shows the completed steps.
     """
-    from lavender.lab.audit import audit as run
-    from lavender.lab.engine_scenes import CLAIM_ENGINES
-    from lavender.lab.report.text import format_count
+    from lavender.audit.audit import audit as run
+    from lavender.audit.engine_scenes import CLAIM_ENGINES
+    from lavender.report.text import format_count
 
     if max_velocity_error is not None and not max_velocity_error >= 0.0:
         raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
@@ -115,9 +115,9 @@ def _audit_claims(
     context: click.Context, scene: Path, out: Path, max_velocity_error: float | None, options: dict[str, Any]
 ) -> None:
     """Compare the claims of an engine with the verdicts, and write the page."""
-    from lavender.lab.claims import compare_claims
-    from lavender.lab.engine_scenes import step_scene
-    from lavender.lab.simulated_worlds import SPREADS
+    from lavender.audit.claims import compare_claims
+    from lavender.audit.engine_scenes import step_scene
+    from lavender.audit.simulated_worlds import SPREADS
 
     worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
     starts = {name: options[name] for name in ("states", "seed")}

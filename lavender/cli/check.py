@@ -20,8 +20,8 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lavender.lab.bench.cases import Item
-    from lavender.lab.check import CrossCheck
+    from lavender.report.bench.cases import Item
+    from lavender.report.check import CrossCheck
 
 
 @click.command(cls=MultiValueCommand)
@@ -61,8 +61,8 @@ def check(
     """
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
-    from lavender.lab import bench
-    from lavender.lab.check import cross_check
+    from lavender.report import bench
+    from lavender.report.check import cross_check
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
@@ -118,8 +118,8 @@ def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
     """Describe the distance of each answer from the exact solution of a case; None if no solution is known."""
     import numpy as np
 
-    from lavender.lab import suite
-    from lavender.lab.bench.cases import is_path
+    from lavender import suite
+    from lavender.report.bench.cases import is_path
 
     if item.in_memory is not None or is_path(item.source):
         return None

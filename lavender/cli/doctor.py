@@ -27,7 +27,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     if files:
         _diagnose_problems(files, as_json)
         return
-    from lavender.lab.bench.doctor import collect_installation_facts
+    from lavender.report.bench.doctor import collect_installation_facts
 
     results = collect_installation_facts()
     if as_json:
@@ -49,8 +49,8 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
 
 def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
     """Print probable mistakes in the data of problems, and exit with 1 if there is one."""
-    from lavender.lab import bench
-    from lavender.lab.diagnostics import diagnose
+    from lavender.diagnostics import diagnose
+    from lavender.report import bench
 
     diagnostics, errors = {}, ErrorReporter()
     for item in bench.resolve_sources(files):

@@ -23,8 +23,8 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lavender.lab.bench import Event, Item, Plan, Records
-    from lavender.lab.report.summary_page import SummaryPage
+    from lavender.report.bench import Event, Item, Plan, Records
+    from lavender.report.summary_page import SummaryPage
 
     P = TypeVar("P", bound=Plan)
 
@@ -71,7 +71,7 @@ def check_named_problems_load(items: Sequence[Item]) -> None:
     InputError
         A problem does not load. Nothing has been measured and no page changed.
     """
-    from lavender.lab.bench.running.runner import describe_load_error
+    from lavender.report.bench.running.runner import describe_load_error
 
     for item in items:
         if item.named:
@@ -111,8 +111,8 @@ def measure_files(
     InputError
         A named file does not load, or the folder cannot be written or is in use by another process.
     """
-    from lavender.lab import bench
-    from lavender.lab.bench.candidates import time_candidates
+    from lavender.report import bench
+    from lavender.report.bench.candidates import time_candidates
 
     limit_to_one_thread()
     options = context.params
@@ -161,7 +161,7 @@ def measure_files(
 
 def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
     """Make the plan of a report that measures times."""
-    from lavender.lab.bench import Plan
+    from lavender.report.bench import Plan
 
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")

@@ -91,12 +91,12 @@ def report(
         reject_unused_options(context, given, "with --list")
         _list_suite()
         return
-    from lavender.lab import bench
-    from lavender.lab.report.engine import read_engine_answers
-    from lavender.lab.report.findings import Report
-    from lavender.lab.report.terminal import print_report
-    from lavender.lab.report.text import format_count, list_skip_reasons
-    from lavender.lab.report.write import write
+    from lavender.report import bench
+    from lavender.report.engine import read_engine_answers
+    from lavender.report.findings import Report
+    from lavender.report.terminal import print_report
+    from lavender.report.text import format_count, list_skip_reasons
+    from lavender.report.write import write
 
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -150,7 +150,7 @@ def report(
 
 def _list_suite() -> None:
     """Print the families of the suite, with parameters, defaults and purpose, and its sets of cases."""
-    from lavender.lab import suite
+    from lavender import suite
 
     for text, summary in sorted(suite.families().items()):
         print_escaped(text, style="bold")
@@ -203,7 +203,7 @@ def _record_model(
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recording import record_file
-    from lavender.lab.bench.record import make_file_name
+    from lavender.report.bench.record import make_file_name
 
     model, n = str(path.resolve()), 1
     first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")

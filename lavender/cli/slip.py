@@ -35,12 +35,12 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
 
     Exit code 1: no state has a contact with friction.
     """
+    from lavender.audit.slip import explain_slip_of_states, summarize_slip
+    from lavender.audit.slip_figure import draw_slip
     from lavender.base.arrays import check_int
     from lavender.io.recording import load_model
     from lavender.io.states import can_sleep
-    from lavender.lab.report.terminal import print_table
-    from lavender.lab.slip import explain_slip_of_states, summarize_slip
-    from lavender.lab.slip_figure import draw_slip
+    from lavender.report.terminal import print_table
 
     steps = check_int("steps", steps, 1)
     if out is not None:

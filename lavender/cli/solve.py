@@ -53,8 +53,8 @@ def solve(
     infeasible, with a certificate that the judge confirms.
     """
     from lavender.judge.residuals import WRONG
-    from lavender.lab import bench
-    from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
+    from lavender.report import bench
+    from lavender.report.bench.running.worker import TaskFailed, Worker, solve_isolated
 
     limit_to_one_thread()
     if output is not None:

@@ -45,7 +45,7 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     Exit code 1: too few steps have contact, or no setting is within --max-velocity-error. Exit code 130: stopped by
     Ctrl-C; the page shows the completed part.
     """
-    from lavender.lab.tune import tune as run
+    from lavender.audit.tune import tune as run
 
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()

@@ -38,7 +38,7 @@ class EngineStep(NamedTuple):
     claims : Claims
     state : dict of (n, ...) arrays, optional
         State before the step by the engine's names. Importers, which read the state after the step, leave it empty;
-        `lavender.lab.engine_scenes` fills it.
+        `lavender.audit.engine_scenes` fills it.
     """
 
     batch: Batch

@@ -402,7 +402,7 @@ class Solution:
 
     def motion_error(self, reference: Any = None) -> Any:
         """Return the error of the motion in units: see `lavender.motion_error`."""
-        return import_module_lazily("lavender.lab.motion").motion_error(
+        return import_module_lazily("lavender.diagnostics.motion_error").motion_error(
             self.residual._problem, self.impulse, reference
         )
 

@@ -4,7 +4,7 @@ import pytest
 from stacks import stack
 
 from lavender import cli, io
-from lavender.lab.bench.running import alternating
+from lavender.report.bench.running import alternating
 
 
 @pytest.fixture(autouse=True)

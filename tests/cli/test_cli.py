@@ -18,7 +18,7 @@ from worked import python
 import lavender as lv
 from lavender import bench, cli, io, registry
 from lavender.cli import entry
-from lavender.lab.bench.record import Skip, to_json
+from lavender.report.bench.record import Skip, to_json
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
@@ -219,7 +219,16 @@ def test_help_is_quick_and_names_every_command():
     # What takes time to load is loaded by the command that needs it.
     assert (
         set(done.stderr.split())
-        & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2", "lavender.lab"}
+        & {
+            "matplotlib",
+            "h5py",
+            "qpsolvers",
+            "pandas",
+            "rich.table",
+            "jinja2",
+            "lavender.report",
+            "lavender.audit",
+        }
         == set()
     )
 
@@ -254,7 +263,7 @@ def test_an_answer_is_not_written_over_its_problem(lavender, path):
 
 
 def test_report_list_names_families_with_parameters_and_sets(lavender):
-    from lavender.lab.suite.case import FAMILIES
+    from lavender.suite.case import FAMILIES
 
     code, out, _ = lavender("report", "--list")
     assert code == 0
@@ -364,12 +373,12 @@ def _must_not_begin(*_, **__):
         ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
-        ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve_sources"),
+        ("solve toy_stack --output {}/x.npz", "lavender.report.bench.resolve_sources"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.export.library.source"),
         ("web page {}/sub", "lavender.sim.web.pages.get_or_build_module"),
-        ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve_sources"),
-        ("report toy_stack --workers 1 --out {}/sub", "lavender.lab.bench.resolve_sources"),
+        ("report toy_stack --out {}/sub", "lavender.report.bench.resolve_sources"),
+        ("report toy_stack --workers 1 --out {}/sub", "lavender.report.bench.resolve_sources"),
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )

@@ -20,8 +20,8 @@ import lavender as lv
 from lavender import bench, cli, io, suite
 from lavender import export as export
 from lavender.cli import measuring
-from lavender.lab.bench import Event
-from lavender.lab.suite import steps
+from lavender.report.bench import Event
+from lavender.suite import steps
 
 
 def test_a_problem_with_nothing_to_do_is_said_to_have_nothing_to_do(lavender, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from calls import EARLY_BOXES as EARLY
 from calls import keep_values
 
-from lavender.lab.tune import mujoco_settings as tuning
+from lavender.audit.tune import mujoco_settings as tuning
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 

@@ -33,12 +33,12 @@ from lavender.io.stored import (
     write_atomically,
     write_text,
 )
-from lavender.lab.bench import machine
-from lavender.lab.bench.record import KINDS, Skip, make_file_name, to_json
-from lavender.lab.bench.store import Records, Store
-from lavender.lab.bench.timed_call import format_call
-from lavender.lab.report.findings import Report
-from lavender.lab.report.terminal import print_report
+from lavender.report.bench import machine
+from lavender.report.bench.record import KINDS, Skip, make_file_name, to_json
+from lavender.report.bench.store import Records, Store
+from lavender.report.bench.timed_call import format_call
+from lavender.report.findings import Report
+from lavender.report.terminal import print_report
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import save_picture
 
@@ -445,7 +445,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         import os, sys
         from lavender import cli
         from lavender.io.stored import TEMPORARY_NAME
-        from lavender.lab.bench.running import alternating
+        from lavender.report.bench.running import alternating
         from lavender.sim.web import pages
         alternating.MAX_REPETITIONS = 1
         pages.module = lambda say, name: b"a module"
@@ -723,9 +723,9 @@ def show_all(records):
     """Make everything that is shown of records, but the files of figures, in memory."""
     from rich.console import Console
 
-    from lavender.lab.report.figures import build_figures
-    from lavender.lab.report.markdown import summarise_report
-    from lavender.lab.report.page import render_page
+    from lavender.report.figures import build_figures
+    from lavender.report.markdown import summarise_report
+    from lavender.report.page import render_page
 
     shown = records.select_latest_run()
     report = Report(shown, shown)

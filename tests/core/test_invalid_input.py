@@ -315,7 +315,7 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(("Batch.count", "Batch.index", "Solutions.count", "Solutions.index"), "a sequence of Python"),
     "Problem.save": "a file: test_invalid_files.py of tests/cli",
-    "Solution.motion_error": "tests/lab",
+    "Solution.motion_error": "tests/diagnostics",
     "SolverSpec": "tests/core/solvers/test_registry.py",
     "Status": "an enumeration",
 }  # fmt: skip

@@ -102,9 +102,9 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
         for c in settings["contracts"]
         if "layers" in c
     }
-    order = []  # top to bottom: the rooms of lab and sim in the place of their floor
+    order = []  # top to bottom: the packages of audit and sim in the place of their layer
     for floor in layers["lavender"]:
-        below = layers.get(f"lavender.{floor[0]}", []) if floor[0] in ("lab", "sim") else []
+        below = layers.get(f"lavender.{floor[0]}", []) if floor[0] in ("audit", "sim") else []
         order += [[f"{floor[0]}.{room}" for room in layer] for layer in below] or [floor]
     height = {room: i for i, layer in enumerate(reversed(order)) for room in layer if room[0] != "_"}
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -115,8 +115,9 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
             re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in table.splitlines() if line[:3] == "| `"
         ]
 
+    above = ("cli", "export", "audit", "report", "suite", "diagnostics", "sim", "io")
     floors = [name for (name,) in listed("## Layers", "## Data flow")]
-    assert floors == [*(f"lavender.{floor}" for floor in ("cli", "export", "lab", "sim", "io")), "lavender"]
+    assert floors == [*(f"lavender.{layer}" for layer in above), "lavender"]
     rooms = listed("## Packages\n", "## Packages of `lavender_ext`")
     assert {room for row in rooms for room in row} == set(height) - {"cli", "export"}
     highest = [max(height[room] for room in row) for row in rooms]

@@ -12,7 +12,7 @@ BUDGETS = {
     "lavender/contract": 350,
     "lavender/export": 2900,
     "lavender/gradient": 1600,
-    "lavender/lab/suite": 1900,
+    "lavender/suite": 1900,
     "lavender_ext/engine": 2650,
 }
 

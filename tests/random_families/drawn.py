@@ -21,11 +21,11 @@ import numpy as np
 from lavender.base.errors import check_name
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lazy_import import spatial
-from lavender.lab.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
-from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, SPHERE, check_min_sizes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
+from lavender.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
+from lavender.suite.case import Draft
+from lavender.suite.families import BOX, SPHERE, check_min_sizes
 from random_families.wild import (
     FORMS,
     LARGEST_DENSE,

@@ -24,7 +24,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lazy_import import spatial
-from lavender.lab.suite.build import (
+from lavender.problem import Problem
+from lavender.suite.build import (
     Bodies,
     Contacts,
     add_horizontal_velocity,
@@ -32,9 +33,8 @@ from lavender.lab.suite.build import (
     map_scalar,
     place_corner_contacts,
 )
-from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, ROD, SPHERE, check_min_sizes, compute_ball_joint_jacobian
-from lavender.problem import Problem
+from lavender.suite.case import Draft
+from lavender.suite.families import BOX, ROD, SPHERE, check_min_sizes, compute_ball_joint_jacobian
 
 __all__ = ["STRUCTURES", "wild"]
 

@@ -17,7 +17,7 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.state import State
 from lavender.sim.scene.arithmetic import compute_norm
 
-motion = import_module_lazily("lavender.lab.motion")
+motion = import_module_lazily("lavender.diagnostics.motion_error")
 
 RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 

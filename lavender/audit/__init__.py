@@ -1,0 +1,1 @@
+"""Worlds of engines: audit a model, find settings for it, check engines' claims and explain why contacts slip."""

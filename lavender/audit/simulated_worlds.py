@@ -1,0 +1,604 @@
+"""Worlds of one MuJoCo model, stepped by a selectable engine, and the constraint problem of every step.
+
+World 0 is the world that `lavender record` simulates. The other worlds differ from it by their initial velocities and
+their random controls:
+
+    qvel += spread N(0, 1) [m/s, rad/s], drawn with (seed, world)        controls drawn with seed + world
+
+If start states are given, world i starts from state i without this noise. If there are more worlds than states, the
+states are used again with noise. The first step uses the controls of the start state, if it has any.
+
+The constraint problem of a step is the one of the engine's own forward pass, with its warm start and its answer. MJX
+and MuJoCo Warp step all worlds at once, in float32.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
+from lavender.base.errors import CapabilityError, InputError
+from lavender.batch.data import Batch
+from lavender.io.efc import from_efc
+from lavender.io.recording import Control, load_controls, load_model, make_controller
+from lavender.io.states import StartStates, can_sleep, read_states, without_sleep
+from lavender.report.table import Table
+from lavender.report.text import format_count, format_percent
+
+ENGINES = ("mujoco", "mjx", "mujoco_warp")
+# Arrays of the state from which MJX and Warp start.
+START_FIELDS = (
+    "qpos",
+    "qvel",
+    "act",
+    "qacc_warmstart",
+    "mocap_pos",
+    "mocap_quat",
+)
+ACCELERATION_FIELDS = ("qacc_smooth", "qfrc_smooth", "qacc")  # Arrays of each step for `from_efc`.
+STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
+# mjtConstraint -> name of a block that is not a contact.
+BLOCK_KINDS = {
+    0: "equality",
+    1: "friction loss",
+    2: "friction loss",
+    3: "limit of a joint",
+    4: "limit of a tendon",
+}
+PYRAMIDAL_CONTACT = 6  # Value of mjtConstraint of an edge of a pyramidal contact.
+MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
+# If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,
+# and the error that 1 % of the steps exceed, then describe steps without contact. Examples: 6 % of the steps of
+# dm_control's finger model have contact, none of its stacker model.
+MIN_CONTACT_SHARE = 0.2
+
+
+SLEEP_NOTE = (
+    'Sleep was off in all worlds, although the model has <flag sleep="enable"/>: a state does not contain which trees '
+    "sleep, so that a repeated step would wake them."
+)
+# Matches the numbers in a warning of MuJoCo, such as a degree of freedom. Warnings are counted without them.
+WARNING_NUMBER = re.compile(r"\d+")
+
+
+SPREADS = (0.1, 0.01, 0.001, 0.0)  # [m/s, rad/s] Default: the largest one with which no trial world diverges.
+N_TRIAL_WORLDS = 3
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Parameters of a simulation of several worlds.
+
+    Parameters
+    ----------
+    model : path of a model (MJCF)
+    worlds, steps : int
+    control : "random", "zero", or an array (any, nu) of controls that every world applies step by step
+    seed : int
+    spread : float, m/s, rad/s
+        Standard deviation of the noise that is added to the velocities at the start.
+    starts : StartStates, optional
+        States in which the worlds start; default: the model's own.
+    """
+
+    model: str
+    worlds: int
+    steps: int
+    control: Control = "random"
+    seed: int = 0
+    spread: float = SPREADS[0]
+    starts: StartStates | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("worlds", "steps"):
+            check_int(name, getattr(self, name), 1, None)
+        object.__setattr__(self, "control", load_controls(self.control))
+        check_int("seed", self.seed, high=None)
+        check_float("spread", self.spread, low=0.0)
+
+    def load_model(self) -> tuple[Any, Any]:
+        """Load MuJoCo and the model, without sleep.
+
+        Raises
+        ------
+        InputError
+            The model cannot be read, or the controls do not fit it.
+        """
+        mj, model = load_model(self.model)
+        make_controller(model, self.control, self.seed)
+        return mj, without_sleep(mj, model)
+
+    @property
+    def sleep_note(self) -> str:
+        """Sentence about a model whose sleep is not simulated; else empty."""
+        return SLEEP_NOTE if can_sleep(*load_model(self.model)) else ""
+
+    def with_start_states(self, states: Any) -> Runs:
+        """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
+        if states is None:
+            return self
+        return replace(self, starts=read_states(*self.load_model(), states).select_evenly(self.worlds))
+
+    @property
+    def n_exact_worlds(self) -> int:
+        """Number of worlds that start without noise."""
+        return min(self.worlds, 1 if self.starts is None else len(self.starts))
+
+    def choose_spread(self) -> tuple[Runs, str]:
+        """Return these runs with the largest of `SPREADS` that the first worlds with noise survive in MuJoCo.
+
+        The second result is a sentence about a choice that is not the largest; else it is empty. If these worlds
+        diverge without noise, too, the largest is chosen.
+        """
+        mj, model = self.load_model()
+        trial = range(self.n_exact_worlds, min(self.worlds, self.n_exact_worlds + N_TRIAL_WORLDS))
+        with count_engine_warnings(mj):
+            for spread in SPREADS:
+                runs = replace(self, spread=spread)
+                if all(simulate_world(mj, model, runs, world)[1] is None for world in trial):
+                    break
+            else:
+                return replace(self, spread=SPREADS[0]), ""
+        if spread == SPREADS[0]:
+            return runs, ""
+        return runs, (
+            f"The start velocities of the worlds differ by {spread:g} m/s (rad/s) only, because worlds diverged with "
+            f"{SPREADS[SPREADS.index(spread) - 1]:g} m/s and not with {spread:g} m/s (--spread)."
+        )
+
+    def create_start_data(self, mj: Any, model: Any, world: int) -> Any:
+        """Create the MjData with which a world starts."""
+        data = mj.MjData(model)
+        if self.starts is not None:
+            state = self.starts.vectors[world % len(self.starts)]
+            mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+        if world >= self.n_exact_worlds:
+            data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(model.nv)
+        return data
+
+    def make_controller(self, model: Any, world: int) -> Any:
+        """Return the function (data, step) -> controls of a world."""
+        drive = make_controller(model, self.control, self.seed + world)
+        if self.starts is None or self.starts.controls is None:
+            return drive
+        first = self.starts.controls[world % len(self.starts)]
+        # Draw the random controls of step 0, too, so that those of later steps do not depend on the start state.
+        return lambda data, step: (drive(data, step), first)[step == 0]
+
+
+@dataclass(frozen=True, eq=False)
+class StepSizes:
+    """Rows and contacts of each judged step.
+
+    Parameters
+    ----------
+    rows, contacts : (steps,) int
+        Contacts that have rows.
+    can_touch : bool
+        Whether the model has geoms that can collide. If not, the fraction of steps with rows decides.
+    """
+
+    rows: np.ndarray
+    contacts: np.ndarray
+    can_touch: bool
+
+    @property
+    def has_enough_contact(self) -> bool:
+        """Whether enough of the steps have contact to recommend a setting."""
+        return self._n_with_contact >= MIN_CONTACT_SHARE * len(self.rows)
+
+    @property
+    def _n_with_contact(self) -> int:
+        """Number of steps with contact, or with rows if the model has no geoms that can collide."""
+        return int(np.count_nonzero(self.contacts if self.can_touch else self.rows))
+
+    @property
+    def contact_phrase(self) -> str:
+        """Phrase with the number of steps that have contact and the fraction that is needed."""
+        n, object_name = len(self.rows), "contact" if self.can_touch else "a constraint"
+        fraction = f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})" if n else ""
+        needed = f"{100.0 * MIN_CONTACT_SHARE:g} %"
+        return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
+
+    @property
+    def size_table(self) -> Table:
+        """Table of the median and maximum number of rows and contacts, and the fraction of steps that have any."""
+        rows = []
+        for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
+            if len(counts):
+                with_any = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
+                rows.append([name, f"{np.median(counts):g}", str(counts.max()), with_any])
+        heads = ["in a step", "median", "maximum", "steps with any"]
+        return Table(heads, rows, words=frozenset(heads[:1]))
+
+    @property
+    def as_dict(self) -> dict[str, Any]:
+        """The contents of `size_table` for numbers.json."""
+        numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
+        for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
+            with_any = len(counts) > 0
+            numbers[name] = {
+                "median": float(np.median(counts)) if with_any else None,
+                "maximum": int(counts.max()) if with_any else None,
+                "share": float(np.mean(counts > 0)) if with_any else None,
+            }
+        return numbers
+
+
+def describe_exceedance(n_worlds: int) -> str:
+    """Return a sentence on the probability that a further world has a larger error than all worlds measured.
+
+    If n + 1 worlds are drawn from one distribution, each has the largest error with probability 1 / (n + 1), whatever
+    the distribution. This does not hold for steps, because the steps of one world depend on each other.
+    """
+    if not n_worlds:
+        return ""
+    return (
+        f"The maximum is that of {format_count(n_worlds, 'world')} and not a bound: a further world that is drawn "
+        f"alike exceeds it with a probability of up to 1/{n_worlds + 1}."
+    )
+
+
+def can_any_geoms_collide(mj: Any, model: Any) -> bool:
+    """Whether any two geoms of the model can collide."""
+    if model.opt.disableflags & (mj.mjtDisableBit.mjDSBL_CONTACT | mj.mjtDisableBit.mjDSBL_CONSTRAINT):
+        return False
+    if model.npair or model.nflex:
+        return True
+    bit_masks = np.stack([model.geom_contype, model.geom_conaffinity], axis=1)
+    kinds, counts = np.unique(bit_masks, axis=0, return_counts=True)
+    return any(
+        (a[0] & b[1] or b[0] & a[1]) and (i != j or counts[i] > 1)
+        for i, a in enumerate(kinds.tolist())
+        for j, b in enumerate(kinds.tolist())
+    )
+
+
+class Divergence(NamedTuple):
+    """The step in which a world diverged: MuJoCo resets the simulation, or raises an error.
+
+    Parameters
+    ----------
+    world, step : int
+    cause : str
+        The quantity that was not finite or above mjMAXVAL, or MuJoCo's error.
+    is_outside : bool
+        Whether the quantity is the state or the unconstrained acceleration, so that the constraint solve of this step
+        is not the cause.
+    """
+
+    world: int
+    step: int
+    cause: str
+    is_outside: bool
+
+
+class Frame(NamedTuple):
+    """All worlds before one step: problems, the engine's answers, and the state to restart from.
+
+    Parameters
+    ----------
+    batch : Batch
+    impulse : array, N s
+    state : dict of (worlds, ...)
+        State before the step, by the names of MjData.
+    rows : (worlds,) int
+        Number of rows that are not padding.
+    contacts : (worlds,) int
+        Number of contacts with rows that are not padding.
+    """
+
+    batch: Batch
+    impulse: FloatArray
+    state: dict[str, FloatArray]
+    rows: np.ndarray
+    contacts: np.ndarray
+
+
+@contextlib.contextmanager
+def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
+    """Count MuJoCo's warnings by their first sentence instead of printing them, with N for each number."""
+    counts: Counter[str] = Counter()
+    handler = mj.get_mju_user_warning()
+    mj.set_mju_user_warning(
+        lambda message: counts.update([WARNING_NUMBER.sub("N", message.partition(". ")[0])])
+    )
+    try:
+        yield counts
+    finally:
+        mj.set_mju_user_warning(handler)
+
+
+def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:
+    """Simulate a world.
+
+    Returns
+    -------
+    states : (steps, size)
+        Before each step, with controls and warm start (mjSTATE_INTEGRATION); NaN after the step in which the world
+        diverged, and in that step if MuJoCo raised an error.
+    divergence : Divergence or None
+    """
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    data, drive = runs.create_start_data(mj, model, world), runs.make_controller(model, world)
+    states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
+    for step in range(runs.steps):
+        data.ctrl[:] = drive(data, step)
+        mj.mj_getState(model, data, states[step], kind)
+        try:
+            mj.mj_step(model, data)
+        except mj.FatalError as error:  # MuJoCo is out of memory.
+            states[step:] = np.nan
+            return states, Divergence(world, step, f"MuJoCo raised an error: {error}", False)
+        if has_diverged(mj, data):
+            states[step + 1 :] = np.nan
+            return states, _find_cause_of_reset(mj, model, data, states[step], world, step)
+    return states, None
+
+
+def has_diverged(mj: Any, data: Any) -> bool:
+    """Whether MuJoCo has reset the simulation because its numbers were not finite or above mjMAXVAL."""
+    kinds = mj.mjtWarning
+    return any(
+        data.warning[int(k)].number
+        for k in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+    )
+
+
+def _find_cause_of_reset(
+    mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int
+) -> Divergence:
+    """Determine which quantity was too large in a step in which MuJoCo reset the simulation."""
+    kinds = mj.mjtWarning
+    for kind, name in ((kinds.mjWARN_BADQPOS, "position"), (kinds.mjWARN_BADQVEL, "velocity")):
+        if data.warning[int(kind)].number:
+            return Divergence(world, step, f"{name} before the step", True)
+    repeated = mj.MjData(model)
+    mj.mj_setState(model, repeated, state, mj.mjtState.mjSTATE_INTEGRATION)
+    try:
+        mj.mj_forward(model, repeated)
+    except mj.FatalError as error:
+        return Divergence(world, step, f"MuJoCo raised an error: {error}", False)
+    smooth = np.abs(repeated.qacc_smooth).max(initial=0.0)
+    if not smooth <= mj.mjMAXVAL:
+        return Divergence(world, step, "acceleration without constraints", True)
+    return Divergence(world, step, "acceleration", False)
+
+
+def split_state_vector(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:
+    """Convert a state vector to a dict by the names of MjData."""
+    data = mj.MjData(model)
+    mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    return {name: np.array(getattr(data, name)) for name in STEP_FIELDS}
+
+
+def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
+    """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step.
+
+    Raises
+    ------
+    InputError
+        The package is not installed, or does not accept the model.
+    CapabilityError
+        A world has more rows than MuJoCo Warp has memory for.
+    """
+    mj, model = runs.load_model()
+    model = copy.copy(model)
+    model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
+    starts = [runs.create_start_data(mj, model, world) for world in range(runs.worlds)]
+    drives = [runs.make_controller(model, world) for world in range(runs.worlds)]
+    names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
+    start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
+    not_accepted = f"engine {engine!r} does not accept {runs.model}"
+    try:
+        step = {"mjx": _make_mjx_stepper, "mujoco_warp": WarpWorlds}[engine](mj, model, start_arrays)
+    except ImportError as error:
+        package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
+        raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
+    except (NotImplementedError, ValueError) as error:
+        raise InputError(f"{not_accepted}: {error}") from None
+    for k in range(runs.steps):
+        ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
+        try:
+            arrays = step(ctrl)
+        except (
+            NotImplementedError
+        ) as error:  # MJX raises it in the first step, for example for an integrator.
+            raise InputError(f"{not_accepted}: {error}") from None
+        yield make_frame(mj, model, *arrays)
+
+
+def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any) -> Frame:
+    """Build the frame of a step of all worlds from the engine's arrays.
+
+    Parameters
+    ----------
+    state : dict of (worlds, ...)
+    efc : dict
+        Arrays of constraint rows, without the prefix `efc_`.
+    mass : array
+        M, or its lower triangles in compressed rows.
+    contact : tuple
+        World, first row, dim, friction and geoms of the contacts.
+    extra : dict
+        Further arguments of `from_efc`.
+    """
+    world_of, address, dim, friction, _ = contact
+    problem_arrays = {f"efc_{name}": x for name, x in efc.items()} | extra
+    triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+    problem_arrays |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
+    dt = float(model.opt.timestep)
+    problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
+    problems.batch.names_of = _make_block_namer(mj, model, problems.batch, efc["type"], contact)
+    assert problems.impulse is not None
+    return Frame(
+        problems.batch,
+        problems.impulse,
+        state,
+        *_count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address),
+    )
+
+
+def _count_rows_and_contacts(
+    jac: Any, nefc: Any, world_of: Any, address: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Count the rows of each world that are not padding (zeros of J), and the contacts that begin with such a row."""
+    is_active = (jac != 0.0).any(axis=2)
+    if nefc is not None:
+        is_active &= np.arange(is_active.shape[1]) < nefc[:, None]
+    has_row = (address >= 0) & (address < is_active.shape[1])
+    has_row[has_row] = is_active[world_of[has_row], address[has_row]]
+    return is_active.sum(axis=1), np.bincount(world_of[has_row], minlength=len(jac))
+
+
+def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
+    """Return the function that steps all worlds with MJX and returns the data of the step."""
+    import jax
+    from mujoco import mjx
+
+    device_model = mjx.put_model(model)
+    first = mjx.make_data(model)
+    data = jax.vmap(lambda own: first.replace(**own))(start_arrays)
+
+    def step_world(d: Any, c: Any) -> Any:
+        d = d.replace(ctrl=c)
+        return d, mjx.forward(device_model, d), mjx.step(device_model, d)
+
+    step_worlds = jax.jit(jax.vmap(step_world))
+
+    def step(ctrl: Any) -> Any:
+        """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
+        nonlocal data
+        before, now, data = step_worlds(data, ctrl)
+        e, n = now._impl, len(ctrl)
+        efc = {name: np.asarray(getattr(e, f"efc_{name}")) for name in
+               ("J", "D", "aref", "type", "frictionloss", "force")}  # fmt: skip
+        c = e.contact
+        address = np.broadcast_to(np.asarray(c.efc_address), (n, np.shape(c.dist)[1]))
+        size = address.shape[1]
+        contact = (
+            np.repeat(np.arange(n), size), address.ravel(), _concatenate_worlds(c.dim, n, size),
+            _concatenate_worlds(c.friction, n, size, 5),
+            _concatenate_worlds(c.geom, n, size, 2),
+        )  # fmt: skip
+        state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
+        extra = {name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS}
+        return state, efc, np.asarray(e.M), contact, extra
+
+    return step
+
+
+def _concatenate_worlds(x: Any, n: int, size: int, *each: int) -> Any:
+    """Concatenate an array over the contacts of n worlds."""
+    return np.broadcast_to(np.asarray(x), (n, size, *each)).reshape(n * size, *each)
+
+
+class WarpWorlds:
+    """Worlds of a model in MuJoCo Warp.
+
+    Parameters
+    ----------
+    mj : module
+        MuJoCo.
+    model : mujoco.MjModel
+        Model with the option of a dense Jacobian.
+    start_arrays : dict of (worlds, ...)
+        State in which the worlds start, by the names of MjData.
+    """
+
+    def __init__(self, mj: Any, model: Any, start_arrays: dict[str, Any]) -> None:
+        import mujoco_warp as mjw
+        import warp as wp
+
+        wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
+        self.mjw, self.wp, self.nv = mjw, wp, model.nv
+        first = mj.MjData(model)
+        mj.mj_forward(model, first)
+        self.rows = max(MIN_WARP_ROWS, 2 * int(first.nefc))
+        self.n = len(start_arrays["qpos"])
+        self.data = mjw.put_data(model, first, nworld=self.n, njmax=self.rows, nconmax=self.rows)
+        self.configure(model)
+        self.start(start_arrays)
+
+    def configure(self, model: Any) -> None:
+        """Use the options of `model`, which otherwise equals the model of these worlds."""
+        self.device_model = self.mjw.put_model(model)
+        if hasattr(self.device_model.opt, "warn_overflow"):
+            # Do not print a line for each solve that uses up its iterations.
+            self.device_model.opt.warn_overflow = 0
+
+    def start(self, start_arrays: dict[str, Any]) -> None:
+        """Set the state of all worlds to `start_arrays`, arrays (worlds, ...) by the names of MjData."""
+        for name, x in start_arrays.items():
+            if x.size:
+                getattr(self.data, name).assign(x)
+
+    def read_state(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return copies of some arrays of the state."""
+        return {name: getattr(self.data, name).numpy().copy() for name in names}
+
+    def advance(self, ctrl: Any) -> None:
+        """Step all worlds with these controls, and wait until the step is complete."""
+        self.data.ctrl.assign(ctrl)
+        self.mjw.step(self.device_model, self.data)
+        self.wp.synchronize()
+
+    def compute_body_positions(self) -> Any:
+        """Return the positions of all bodies (worlds, bodies, 3) [m] in the present state."""
+        self.mjw.kinematics(self.device_model, self.data)
+        return self.data.xpos.numpy().astype(float)
+
+    def __call__(self, ctrl: Any) -> Any:
+        """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
+        data, rows = self.data, self.rows
+        data.ctrl.assign(ctrl)
+        state = self.read_state(STEP_FIELDS)
+        self.mjw.forward(self.device_model, data)
+        if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > self.n * rows:
+            raise CapabilityError(
+                f"the worlds have up to {int(data.nefc.numpy().max())} rows, and "
+                f"{int(data.nacon.numpy()[0])} contacts together; memory was allocated for {rows} rows in "
+                f"each of {self.n} worlds: use a model with fewer contacts"
+            )
+        e, c = data.efc, data.contact
+        efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
+               ("D", "aref", "type", "frictionloss", "force")}  # fmt: skip
+        efc["J"] = e.J.numpy()[:, :rows, : self.nv].copy()
+        k = int(data.nacon.numpy()[0])
+        parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
+        world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
+        extra = self.read_state((*ACCELERATION_FIELDS, "nefc"))
+        step_data = state, efc, data.M.numpy().copy(), (world_of, address[:, 0], dim, friction, geom)
+        self.mjw.step(self.device_model, data)
+        return *step_data, extra
+
+
+def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact: Any) -> Any:
+    """Return the function that names a world's blocks by the types of its rows and the geoms of its contacts."""
+    world_of, address, _, _, geom = contact
+
+    def geom_name(g: Any) -> str:
+        """Return the name of a geom, or its index without one."""
+        return mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g))
+
+    def name_blocks_of_world(i: int) -> list[str]:
+        """Return the names of the blocks of world i."""
+        types = np.broadcast_to(row_types, (len(batch), row_types.shape[-1]))[i]
+        first = {int(address[k]): k for k in np.flatnonzero((world_of == i) & (address >= 0))}
+        names, name, first_row = [], "contact", 0
+        for row in batch._get_cones_of_world(i).ptr[:-1].tolist():
+            if row in first:
+                name, first_row = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
+            edge = f", edge {row - first_row}" if int(types[row]) == PYRAMIDAL_CONTACT else ""
+            names.append(BLOCK_KINDS.get(int(types[row]), name + edge))
+        return names
+
+    return name_blocks_of_world

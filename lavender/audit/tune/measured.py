@@ -1,0 +1,209 @@
+"""Settings of an engine, their results, and the timing in which settings alternate.
+
+A `Stage` holds worlds of one engine and measures settings on them. Each world is run with the present setting and cut
+into stretches of `horizon` steps. Each setting steps from the start of every stretch by itself. Measured are
+
+    time    [s] of each step, per world: the minimum of several repeats, in which settings alternate
+    error   [m/s] of the engine's answer to the problem of each step, computed by the judge
+    motion  [m] largest distance of a body, at the end of a stretch, from its position in a run with converged solves
+"""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from statistics import fmean
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.report.bench import machine
+from lavender.report.bench.running.runner import Event
+
+ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
+# After the first round, a setting is no longer timed if it takes more than this multiple of the present setting's
+# time.
+MAX_TIME_RATIO = 2.0
+#: Kinds of measurements: the error of a setting, and the times of its steps.
+MEASUREMENTS: tuple[str, ...] = ("judging", "timing")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Options of an engine that differ from the present ones; a derived class writes them in the engine's syntax."""
+
+    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the constraint problem itself.
+    comment: ClassVar[str] = "# {}"  # Format of a comment in the syntax of `option_line`.
+    merge_note: ClassVar[str] = ""  # Note for the user on where to insert `option_line`.
+
+    options: tuple[tuple[str, Any], ...] = ()
+    is_default: bool = field(default=False, compare=False)  # Whether these are the engine's default options.
+
+    @property
+    def option_line(self) -> str:
+        """Line to copy; empty if no option differs."""
+        raise NotImplementedError
+
+    @property
+    def name(self) -> str:
+        """`option_line`, or "the model's own setting" if it is empty."""
+        return self.option_line or "the model's own setting"
+
+    @property
+    def short_name(self) -> str:
+        """Options without the engine's syntax, for narrow tables."""
+        values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)
+        return " ".join(f"{name}={x}" for name, x in values) or "model's own setting"
+
+    @property
+    def changes_problem(self) -> bool:
+        """Whether the setting changes the constraint problem, and not only how it is solved."""
+        return any(name in self.problem_options for name, _ in self.options)
+
+
+@dataclass(eq=False)
+class Measured:
+    """Results of one setting on some worlds.
+
+    Parameters
+    ----------
+    setting : Setting
+    solver : str
+    error : (steps,) m/s
+    motion : (stretches,) m
+    times : (steps,) s
+        Each time is the minimum of all repeats, which removes interruptions.
+    rows, contacts : (steps,) int
+    """
+
+    setting: Setting
+    solver: str
+    error: FloatArray = field(repr=False)
+    motion: FloatArray = field(repr=False)
+    times: FloatArray = field(repr=False)
+    rows: Any = field(default=(), repr=False)
+    contacts: Any = field(default=(), repr=False)
+
+    @property
+    def mean_step_time(self) -> float:
+        """Mean time of a step [s]; infinite if it was not timed."""
+        return float(self.times.mean())
+
+    @property
+    def worst_error(self) -> float:
+        """Error [m/s] that 1 % of the steps exceed."""
+        return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
+
+    @property
+    def worst_motion(self) -> float:
+        """Distance [m] that 1 % of the stretches exceed."""
+        return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
+
+
+class Schedule:
+    """Measurements that are done and expected, for the progress and the remaining time.
+
+    Parameters
+    ----------
+    watch : callable, optional
+        Called with an `Event` at the beginning of each measurement.
+    """
+
+    def __init__(self, watch: Callable[[Event], None] | None) -> None:
+        self.watch = watch
+        self.done = 0
+        self.loads: list[float | None] = []  # Number of runnable processes at each timing.
+        self._expected = dict.fromkeys(MEASUREMENTS, 0)
+        self._reserved = dict.fromkeys(MEASUREMENTS, 0)
+        self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
+
+    def reserve_measurements(self, kind: str, count: int) -> None:
+        """Set the estimated number of measurements of `kind` that will be announced later."""
+        self._reserved[kind] = count
+
+    def announce_measurements(self, kind: str, count: int) -> None:
+        """Announce `count` measurements of `kind`; they are subtracted from the reserved number."""
+        self._expected[kind] += count
+        self._reserved[kind] = max(0, self._reserved[kind] - count)
+
+    def skip_measurement(self, kind: str) -> None:
+        """Count an announced measurement as unnecessary."""
+        self._expected[kind] -= 1
+
+    @property
+    def remaining(self) -> float | None:
+        """Estimate of the remaining time [s], from the mean duration of each kind so far; None before the first."""
+        total = 0.0
+        every = [t for durations in self._durations.values() for t in durations]
+        for kind in MEASUREMENTS:
+            mean = fmean(self._durations[kind] or every or [0.0])
+            total += mean * (self._expected[kind] + self._reserved[kind])
+        return total if every else None
+
+    @contextlib.contextmanager
+    def time_measurement(self, kind: str, text: str) -> Iterator[None]:
+        """Show the progress, then run and time the block, which is one measurement."""
+        if self.watch is not None:
+            count = sum(self._expected.values()) + sum(self._reserved.values())
+            self.watch(Event(self.done, self.done + count, f"{kind}: {text}", "", remaining=self.remaining))
+        if kind == "timing":
+            self.loads.append(machine.count_runnable_processes())
+        begin = perf_counter()
+        yield
+        self._durations[kind].append(perf_counter() - begin)
+        self._expected[kind] -= 1
+        self.done += 1
+
+
+class Stage(ABC):
+    """Worlds of one engine, on which settings are measured."""
+
+    @property
+    @abstractmethod
+    def own_setting(self) -> Setting:
+        """The present setting."""
+
+    @abstractmethod
+    def list_first_settings(self) -> list[Setting]:
+        """List the settings that are tried first; the present one is the first of them."""
+
+    @abstractmethod
+    def list_variants(self, setting: Setting) -> list[Setting]:
+        """List variants of a setting, which are tried if the setting is near the Pareto front of time and error."""
+
+    @abstractmethod
+    def judge_setting(self, setting: Setting) -> Measured:
+        """Judge a setting without timing it; its errors are infinite if a world diverges."""
+
+    @abstractmethod
+    def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
+        """Return a function that runs all stretches with a setting and returns the times of the steps [s]."""
+
+    def time_settings(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
+        """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
+
+        A setting with which a world diverges is not timed.
+        """
+        settings = [m for m in settings if np.isfinite(m.error).all()]
+        runs = [self.prepare_timing(m.setting) for m in settings]
+        schedule.announce_measurements("timing", len(settings) * repeats)
+        for round_index in range(repeats):
+            for m, run in zip(settings, runs, strict=True):
+                # Compare medians over the steps, so that an interrupted step does not exclude a setting.
+                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
+                    schedule.skip_measurement("timing")
+                    continue
+                with schedule.time_measurement(
+                    "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
+                ):
+                    m.times = np.minimum(m.times, run())
+
+
+def make_unmeasured(setting: Setting, solver: str) -> Measured:
+    """Build the result of a setting with which a world diverges: its error, motion and times are infinite."""
+    never = np.full(1, np.inf)
+    return Measured(setting, solver, never, never, never)

@@ -1,0 +1,390 @@
+"""Choose settings from measurements: the Pareto front of time and error, lines to copy, and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender.audit.simulated_worlds import StepSizes, describe_exceedance
+from lavender.audit.tune.measured import Measured, Setting
+from lavender.base.deadline import format_seconds
+from lavender.problem.derived import cached_property
+from lavender.report.figures import Curve, Figure
+from lavender.report.summary_page import PageSection, SummaryPage
+from lavender.report.table import Cell, Table
+from lavender.report.text import format_ratio, format_size
+
+# Times that differ by at most this fraction count as equal: noise is a few per cent.
+TIME_NOISE_FRACTION = 0.05
+# The terminal shows up to this many settings of the front that are slower than the present one.
+N_SLOWER_ROWS = 4
+# The error of each of these does not exceed this fraction of the error of the one before.
+MAX_ERROR_RATIO = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """Result of `tune`; the first of `measured` and of `held` is the model's own setting.
+
+    Parameters
+    ----------
+    model : str
+        Name of the model or scene, or its file.
+    horizon : int
+        Number of steps of a stretch.
+    measured : list of Measured
+        Results on the worlds with even numbers.
+    held : list of Measured
+        Results of the model's own setting and of the chosen settings on the worlds with odd numbers, which are held
+        back; empty if Ctrl-C ended the measurement before.
+    threshold : float, m/s, m
+        Errors [m/s] and distances [m] up to this number count as accurate enough.
+    stopped : bool
+        The measurement was stopped by Ctrl-C.
+    sizes : StepSizes, optional
+        Rows and contacts of the steps of all worlds with the model's own setting.
+    busy : str
+        A warning if other processes used the processors during the timing; else empty.
+    notes : str
+        Sentences about what differs from a simulation of the model as it is: no sleep, a smaller spread.
+    n_held_worlds : int
+        Number of worlds held back.
+    error_limit : float, m/s, optional
+        The fastest setting whose error does not exceed this number in any step is also recommended.
+    held_errors : dict
+        Largest error [m/s] on the worlds held back, of the settings that were judged there.
+    """
+
+    model: str
+    horizon: int
+    measured: list[Measured]
+    held: list[Measured]
+    threshold: float
+    stopped: bool = False
+    sizes: StepSizes | None = None
+    busy: str = ""
+    notes: str = ""
+    n_held_worlds: int = 0
+    error_limit: float | None = None
+    held_errors: Mapping[Setting, float] = field(default_factory=dict)
+
+    @property
+    def present_result(self) -> Measured:
+        """Result of the model's own setting."""
+        return self.measured[0]
+
+    @property
+    def _same_problem(self) -> list[Measured]:
+        """Timed settings that do not change the problem."""
+        return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
+
+    def _is_accurate_enough(self, m: Measured) -> bool:
+        """Return whether a setting's error and motion do not exceed the present setting's, or the threshold."""
+        now, threshold = self.present_result, self.threshold
+        pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
+        return all(x <= max(own, threshold) for x, own in pairs)
+
+    @cached_property
+    def faster(self) -> Measured | None:
+        """Fastest setting that is accurate enough and faster than the present setting; None if there is none."""
+        now = self.present_result
+        good = [
+            m
+            for m in self._same_problem
+            if m.worst_error <= max(now.worst_error, self.threshold) and self._is_accurate_enough(m)
+        ]
+        best = min(good, key=lambda m: m.mean_step_time)
+        return best if best.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time else None
+
+    @cached_property
+    def closer(self) -> Measured | None:
+        """Most accurate setting that is as fast as the present one.
+
+        None if no such setting is more accurate, or if the present error is within the threshold.
+        """
+        now = self.present_result
+        good = [
+            m
+            for m in self._same_problem
+            if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+            and self._is_accurate_enough(m)
+        ]
+        best = min(good, key=lambda m: m.worst_error)
+        return best if best.worst_error < now.worst_error > self.threshold else None
+
+    def _compute_largest_error(self, m: Measured) -> float:
+        """Return the largest error [m/s] of a setting on all worlds on which it was judged."""
+        return max(float(m.error.max()), self.held_errors.get(m.setting, 0.0))
+
+    @property
+    def within_limit(self) -> Measured | None:
+        """Fastest setting with no error above `error_limit`, also on the worlds held back if it was judged there.
+
+        If the present setting takes the same time within noise, it is returned. The result is None if all settings
+        exceed the limit, or without a limit.
+        """
+        if self.error_limit is None:
+            return None
+        now = self.present_result
+        good = [m for m in self._same_problem if self._compute_largest_error(m) <= self.error_limit]
+        noise = {id(now): 1.0 - TIME_NOISE_FRACTION}
+        return min(good, key=lambda m: m.mean_step_time * noise.get(id(m), 1.0), default=None)
+
+    @property
+    def most_accurate(self) -> Measured:
+        """Setting with the smallest maximum error on all worlds on which it was judged."""
+        return min(self._same_problem, key=self._compute_largest_error)
+
+    @property
+    def limit_choice(self) -> Measured:
+        """`within_limit`, or `most_accurate` if that is None."""
+        return self.within_limit or self.most_accurate
+
+    @property
+    def pareto_front(self) -> list[Measured]:
+        """Settings that no other setting beats in both time and error, fastest first."""
+        front: list[Measured] = []
+        for m in sorted(self._same_problem, key=lambda m: (m.mean_step_time, m.worst_error)):
+            if not front or m.worst_error < front[-1].worst_error:
+                front.append(m)
+        return front
+
+    @property
+    def reason_without_line(self) -> str:
+        """Reason why no setting is recommended: too few steps with contact; empty if enough steps have contact."""
+        if self.sizes is None or self.sizes.has_enough_contact:
+            return ""
+        if not self.sizes.can_touch:
+            return f"No setting is recommended: {self.sizes.contact_phrase}; without contact settings have no effect."
+        return (
+            f"No setting is recommended: {self.sizes.contact_phrase}. A setting that is fast and accurate without "
+            "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
+        )
+
+    @property
+    def reason_provisional(self) -> str:
+        """Reason why the lines are provisional; empty if the measurement is complete and its times are valid."""
+        if self.stopped:
+            return "the measurement was interrupted"
+        return "the machine was busy" if self.busy else ""
+
+    @property
+    def _provisional_prefix(self) -> str:
+        """Beginning of a provisional line; empty if the measurement is complete and its times are valid."""
+        return f"PROVISIONAL, {self.reason_provisional}: " if self.reason_provisional else ""
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
+        if self.reason_without_line:
+            return []
+        none = f"none of {len(self._same_problem)} settings"
+        enough = (
+            f"not needed, {format_size(self.present_result.worst_error)} m/s is within {self.threshold:g}"
+        )
+        closer = enough if self.present_result.worst_error <= self.threshold else none
+        lines = self._format_limit_choice()
+        for description, m, reason, gains, max_ratio in (
+            ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
+            ("as fast as now, more accurate", self.closer, closer, "worst_error", 1.0),
+        ):
+            if m is None:
+                provisional = self._provisional_prefix if reason is none else ""
+                lines.append(f"{provisional}{description}: {reason}")
+                continue
+            held = self._find_held_back(m)
+            if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
+                description += ": not on the worlds held back"
+            lines += self._format_choice(m, description, _format_comparison(m, self.present_result))
+        return lines
+
+    def _find_held_back(self, m: Measured) -> Measured | None:
+        """Return the result of a setting on the worlds held back; None if it was not measured there."""
+        return next((h for h in self.held if h.setting == m.setting), None)
+
+    def _format_limit_choice(self) -> list[str]:
+        """Return the lines on `error_limit`; none without a limit."""
+        if self.error_limit is None:
+            return []
+        goal, m = f"error at most {self.error_limit:g} m/s", self.limit_choice
+        lines = []
+        if self.within_limit is None:
+            lines = [
+                f"{self._provisional_prefix}{goal}: none of {len(self._same_problem)} settings; the most accurate is"
+            ]
+        description = f"{goal}, fastest" if self.within_limit else "most accurate"
+        return lines + self._format_choice(m, description, _format_with_largest_error(m, self.present_result))
+
+    def _format_choice(self, m: Measured, description: str, comparison: str) -> list[str]:
+        """Return the line to copy with a description, and the results on both halves of the worlds."""
+        if m.setting.is_default:
+            description += ", MuJoCo's defaults"
+        description = f"{self._provisional_prefix}{description}"
+        held = self._find_held_back(m)
+        line = m.setting.option_line
+        comment = m.setting.comment.format(description)
+        return [
+            f"{line}  {comment}" if line else f"{description}: {m.setting.name}",
+            f"    chosen on: {comparison}",
+            f"    held back: {'not measured' if held is None else _format_with_largest_error(held, self.held[0])}",
+        ]
+
+    @property
+    def _lines_note(self) -> str:
+        """Explanation below the lines: how they were chosen and tested, and the element that they belong to."""
+        if self.reason_without_line:
+            return "None, for the reason above."
+        sentences = ["Chosen on the worlds with even numbers, tested on the others."]
+        if self.faster or self.closer or self.error_limit is not None:
+            sentences.append("The errors were measured on these states. On other states they can be larger.")
+            if self.error_limit is not None:
+                sentences.append("The line for the error limit was chosen on all worlds.")
+            if self.reason_provisional:
+                sentences.append(
+                    f"The lines are provisional, because {self.reason_provisional}: measure again."
+                )
+            if len(self.held) > 1 and self.n_held_worlds:
+                sentences.append(describe_exceedance(self.n_held_worlds))
+            sentences.append(self.present_result.setting.merge_note)
+        return " ".join(filter(None, sentences))
+
+    def _build_table_of_settings(self, settings: Iterable[Measured]) -> Table:
+        """Build the table of some settings."""
+        rows: list[list[str | Cell]] = [
+            [
+                m.setting.name if m.setting.options else "model's own setting", Cell.time(m.mean_step_time),
+                f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
+                Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
+            ]
+            for m in settings
+        ]  # fmt: skip
+        heads = [
+            "setting",
+            "a step",
+            "relative time",
+            "error 99 % [m/s]",
+            "worst",
+            f"motion after {self.horizon} [m]",
+        ]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
+    def terminal_table(self) -> Table:
+        """Table of `terminal_settings`, narrow enough for a terminal of 80 columns."""
+        now = self.present_result.mean_step_time
+        rows: list[list[str | Cell]] = [
+            [m.setting.short_name, f"{m.mean_step_time / now:.2f}", Cell.size(m.worst_error),
+             Cell.size(float(m.error.max()))]
+            for m in self.terminal_settings
+        ]  # fmt: skip
+        heads = ["setting", "relative time", "error 99 % [m/s]", "worst"]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
+    def terminal_settings(self) -> list[Measured]:
+        """Settings in the table of the terminal: the present one first, the others by time.
+
+        The others are MuJoCo's defaults; of the Pareto front the fastest setting, the one with the smallest error
+        in the present time, and up to `N_SLOWER_ROWS` that take more time, with the smallest error of all.
+        """
+        now, front = self.present_result, self.pareto_front
+        max_time = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+        slower: list[Measured] = []
+        for m in front:
+            last_error = slower[-1].worst_error if slower else np.inf
+            if m.mean_step_time > max_time and m.worst_error <= MAX_ERROR_RATIO * last_error:
+                slower.append(m)
+        quick = [m for m in front if m.mean_step_time <= max_time]
+        spaced = np.linspace(0, max(0, len(slower) - 1), min(N_SLOWER_ROWS, len(slower))).round().astype(int)
+        defaults = [m for m in self._same_problem if m.setting.is_default]
+        shown = dict.fromkeys([*quick[:1], *quick[-1:], *(slower[i] for i in spaced.tolist()), *defaults])
+        shown.pop(now, None)
+        return [now, *sorted(shown, key=lambda m: m.mean_step_time)]
+
+    @property
+    def figure(self) -> Figure:
+        """Figure of error over time: every setting, a line through the Pareto front, and the model's own setting."""
+
+        def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
+            notes = tuple(m.setting.option_line for m in settings)
+            places = [(m.mean_step_time, m.worst_error) for m in settings]
+            return replace(Curve.from_points(name, name, places, notes=notes), **more)
+
+        solvers = dict.fromkeys(m.solver for m in self.measured)
+        by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
+        parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
+        parts += [
+            curve("fastest for its error", self.pareto_front, unmarked=True),
+            curve("model's own setting", [self.present_result], points=True),
+        ]
+        return Figure("time-and-error", Path(self.model).name, "time of a step [s]",
+                      "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
+
+    @property
+    def summary_page(self) -> SummaryPage:
+        """Page with the result in a sentence, figures and tables, as `lavender tune` writes it."""
+        now = self.present_result
+        head = (
+            f"{Path(self.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "
+            f"have errors above {format_size(now.worst_error)} m/s."
+        )
+        if self.closer is not None:
+            gain = (
+                format_ratio(now.worst_error / self.closer.worst_error)
+                if self.closer.worst_error
+                else "exact:"
+            )
+            head += f" In the same time the error can be {gain} less on these states."
+        if self.reason_without_line:
+            head += f" {self.reason_without_line}"
+        other = [m for m in self.measured if m.setting.changes_problem]
+        shown = [now, *(m for m in self.pareto_front if m is not now)]
+        every = sorted(self.measured, key=lambda m: m.mean_step_time)
+        sizes = [] if self.sizes is None else [self.sizes.size_table]
+        figures = [] if self.reason_without_line else [self.figure]
+        return SummaryPage(
+            "lavender tune", head,
+            [
+                PageSection("Provisional lines" if self.reason_provisional else "Lines to copy", code=self.lines,
+                     note=self._lines_note),
+                PageSection("Rows and contacts", sizes, short=2,
+                     note="Rows and contacts of the steps with the model's own setting."),
+                PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures,
+                     terminal_table=self.terminal_table),
+                PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
+                     note="Settings that change the problem: the error is that of its own problem."),
+                PageSection("Every setting", [self._build_table_of_settings(every)],
+                     note="Settings with which a world diverges are left out."),
+            ],
+            {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+             "error_limit": self.error_limit,
+             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
+             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
+             "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
+            stopped=self.stopped,
+            warning=" ".join(filter(None, (self.notes, self.busy))),
+        )  # fmt: skip
+
+
+def _format_comparison(m: Measured, now: Measured) -> str:
+    """Compare time and error of a setting with the present ones."""
+    return (
+        f"{m.mean_step_time / now.mean_step_time:.2f} of the time, error {format_size(m.worst_error)} m/s "
+        f"instead of {format_size(now.worst_error)}"
+    )
+
+
+def _format_with_largest_error(m: Measured, now: Measured) -> str:
+    """Compare time and error of a setting with the present ones, and add the largest error."""
+    worst = f"at most {format_size(float(m.error.max()))} in {len(m.error)} steps"
+    return f"{_format_comparison(m, now)} ({worst})"
+
+
+def _to_dict(m: Measured) -> dict[str, Any]:
+    """Convert a result to a dict for JSON."""
+    return {"options": dict(m.setting.options), "default": m.setting.is_default, "seconds": m.mean_step_time,
+            "error": m.worst_error, "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip

@@ -1,0 +1,203 @@
+"""Checks for any problem: friction coefficients, keys, order of rows, duplicate rows, conflicts, impulses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.diagnostics.bodies import are_normals_first
+from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
+from lavender.judge.residuals import residual
+from lavender.problem import Problem
+from lavender.solvers.certify import find_conflict
+
+MAX_PLAUSIBLE_FRICTION = 10.0  # [-] No pair of materials has a larger friction coefficient.
+# Impulses this many times above the momentum of the problem are reported. At the foot of a stack of n bodies they
+# exceed the momentum of one body n times, so the ratio is multiplied by rows / 100.
+MAX_MOMENTUM_RATIO = 1e4
+# [rows] For larger problems, no proof that no solution exists is searched: it takes seconds.
+MAX_CONFLICT_ROWS = 1000
+CONFLICT_TOL = 1e-6  # [-] A proof counts only if it excludes every answer with up to this relative residual.
+
+
+def diagnose_friction(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if friction coefficients exceed the values of materials."""
+    c = p.cones
+    mu = c.coefficients.max(axis=1)
+    blocks = np.flatnonzero(mu > MAX_PLAUSIBLE_FRICTION)
+    if len(blocks):
+        largest = float(mu[blocks].max())
+        yield make_diagnostic(
+            p, "friction", f"mu up to {largest:g}; dry materials have 0.1 to 2", blocks, mu=largest
+        )
+
+
+def diagnose_keys(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if several blocks have the same key."""
+    if p.key is None:
+        return
+    values, first, count = np.unique(p.key, return_index=True, return_counts=True)
+    if len(values) < len(p.key):
+        worst = int(np.argmax(count))
+        blocks = np.flatnonzero(np.isin(p.key, values[count > 1]))
+        reason = f"{len(p.key) - len(values)} of {len(p.key)} keys repeat another block's: {count[worst]} blocks have "
+        yield make_diagnostic(p, "duplicate keys", reason + f"the key of block {first[worst]}", blocks)
+
+
+def diagnose_row_order(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if the rows of contacts do not have the order normal, tangent, tangent."""
+    c = p.cones
+    full = np.flatnonzero(c.n_tangents == 2)
+    if p.rows is not None or len(full) < 2:
+        return
+    if are_normals_first(p):
+        reason = "J has the rows of rigid bodies if all normals come first; the order is contact by contact: normal, "
+        yield make_diagnostic(
+            p, "all normals first", reason + "tangent, tangent, then the next contact", full
+        )
+        return
+    # For a matrix, only b can be checked. On a normal row, b is an approach velocity from gravity, bounce or
+    # penetration.
+    b = p.b[c.ptr[full][:, None] + np.arange(3)]
+    whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
+    size = whole.sum()
+    if size == 0.0:
+        return
+    for row, place in ((1, "second"), (2, "third")):
+        if (
+            toward[row] > 0.98 * whole[row]
+            and whole[row] > 0.8 * size
+            and toward[0] < 0.1 * whole[0] + 1e-9 * size
+        ):
+            reason = f"bodies approach along the {place} row of contacts, not the first; the rows of a contact are "
+            yield make_diagnostic(
+                p, "tangents first", reason + "normal, tangent, tangent", full, b=b[0].tolist()
+            )
+            return
+    flat = b.ravel()
+    k = len(full)
+    late = np.count_nonzero(np.abs(flat[k:]) > 1e-6 * np.abs(flat).max())
+    if np.abs(flat[:k]).sum() > 0.9 * size and (flat[:k] > 0.0).mean() > 0.9 and 2 * late <= k:
+        reason = f"the first {k} contact rows approach, the other {2 * k} hardly; the order is contact by contact: "
+        yield make_diagnostic(
+            p, "all normals first", reason + "normal, tangent, tangent, then the next contact", full
+        )
+
+
+def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about contacts with equal rows, or with opposite rows that cannot both hold."""
+    c = p.cones
+    contacts = np.flatnonzero(c.is_contact)
+    if p.rows is not None or len(contacts) < 2:
+        return
+    a = p.csr if p.generalized is None else p.generalized.jac
+    seen: dict[bytes, int] = {}
+    again, opposed = [], []
+    for i in contacts.tolist():
+        j, end = c.ptr[i], c.ptr[i + 1]
+        part = slice(a.indptr[j], a.indptr[end])
+        index, x = a.indices[part].tobytes() + np.diff(a.indptr[j : end + 1]).tobytes(), a.data[part]
+        if len(x) and seen.setdefault(index + x.tobytes(), i) != i:
+            again.append(i)
+        row = slice(a.indptr[j], a.indptr[j + 1])
+        other = seen.get(b"-" + a.indices[row].tobytes() + (0.0 - a.data[row]).tobytes())
+        seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
+        if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
+            opposed += [other, i]
+    # Fewer duplicates are normal: collision detection repeats points.
+    if len(again) > max(2, 0.3 * len(contacts)):
+        yield make_diagnostic(
+            p, "duplicate rows", f"{len(again)} contacts have the same rows as an earlier one", again
+        )
+    if opposed:
+        reason = "two normals require the same relative motion in opposite directions"
+        yield make_diagnostic(p, "opposed normals", reason, opposed)
+
+
+def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if impulses (m,) [N s] are implausibly large."""
+    r = residual(p, impulse)
+    b = float(np.max(np.abs(p.b), initial=0.0))
+    if r.nothing_to_do or b == 0.0:
+        return
+    # Forces in place of impulses are at least 60 times too large (dt <= 1/60 s); a stale warm start only a few times.
+    if r.relative > 50.0:
+        reason = (
+            f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N], not [N s]?"
+        )
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
+        return
+    excessive = list(_diagnose_momentum(p, impulse, b))
+    yield from excessive
+    if excessive:
+        return
+    row_velocity = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)
+    i = int(np.argmax(row_velocity))
+    # At the foot of a stack of n bodies, impulses are n times as large as for one body.
+    if row_velocity[i] > MAX_MOMENTUM_RATIO * b * max(1.0, p.m / 100):
+        reason = f"an impulse of {impulse[i]:.3g} N s changes its row by {row_velocity[i]:.3g} m/s, while b is at most "
+        yield make_diagnostic(
+            p,
+            "impulses",
+            reason + f"{b:.3g} m/s: far more than the momentum of the problem",
+            [p.block_of(i)],
+            velocity=float(row_velocity[i]),
+        )
+
+
+def _diagnose_momentum(p: Problem, impulse: FloatArray, speed: float) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if an impulse (m,) [N s] is far above the momentum of the problem, or throws a body away.
+
+    The momentum is the sum of M_jj max(|v*_j|, `speed`) over the velocities, with `speed` the largest |b| [m/s].
+    """
+    if p.rows is not None:
+        inertia = np.linalg.pinv(p.rows.inv_inertia, hermitian=True)
+        mass = np.divide(1.0, p.rows.inv_mass, out=np.zeros(p.rows.n_bodies), where=p.rows.inv_mass > 0.0)
+        masses = np.hstack(
+            [np.repeat(mass[:, None], 3, axis=1), np.diagonal(inertia, axis1=1, axis2=2)]
+        ).ravel()
+    elif p.generalized is not None:
+        masses = p.generalized.mass.diagonal()
+    else:
+        return
+    free = p.velocity(np.zeros(p.m)).ravel()
+    momentum = float(masses @ np.maximum(np.abs(free), speed))
+    jac = p.jacobian.tocsr()
+    # Forces on immovable bodies change no momentum.
+    push = (abs(jac) @ (masses > 0.0).astype(float)) * np.abs(impulse)
+    change = np.abs(p.velocity(impulse).ravel() - free)
+    i, j = int(np.argmax(push)), int(np.argmax(change))
+    usual_speed = max(speed, float(np.abs(free).max(initial=0.0)))
+    excess = max(1.0, p.m / 100) * MAX_MOMENTUM_RATIO
+    if push[i] > excess * momentum:
+        reason = (
+            f"the impulse of {p.row_name(i)}, {impulse[i]:.3g} N s, pushes with {push[i]:.3g} N s, but the momentum "
+            f"of the problem is {momentum:.3g} N s: is its row of J nearly zero, or nearly equal to another?"
+        )
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(i)], push=float(push[i]), momentum=momentum)
+    elif change[j] > excess * usual_speed:
+        i = int(np.argmax(abs(jac[:, [j]]).toarray().ravel() * np.abs(impulse)))
+        reason = (
+            f"impulses change velocity {j} by {change[j]:.3g} m/s or rad/s, but v* and b are at most "
+            f"{usual_speed:.3g}"
+        )
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(i)], change=float(change[j]))
+
+
+def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic that names the conflicting blocks if the problem provably has no solution."""
+    if not 0 < p.m <= MAX_CONFLICT_ROWS or not np.isfinite(p.b).all():
+        return
+    proof = find_conflict(p, CONFLICT_TOL)
+    if proof is not None:
+        law = "Of the convex relaxation, " if p.law == "coulomb" else ""
+        reason = law + proof.proof.message + (f"; {proof.advice}" if proof.advice else "")
+        soft = [p.row_name(i) for i in proof.soft_rows]
+        yield make_diagnostic(
+            p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft
+        )
+
+
+CHECKS = (diagnose_friction, diagnose_keys, diagnose_row_order, diagnose_duplicate_contacts)

@@ -1,0 +1,320 @@
+"""Checks of arms, normals and masses, equations (1) and (2), for bodies and for J and M of free rigid bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.base.arrays import FloatArray
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lu import factor_sparse_lu
+from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
+from lavender.problem import Problem
+from lavender.problem.rows import Rows
+
+MAX_DENSE_VELOCITIES = 600  # M of up to this many velocities is converted to a dense matrix and inverted.
+MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problems of J and M.
+    ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
+    ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
+)
+# [-] Contacts of one pair of bodies may imply centre distances that differ by this fraction of the arms.
+MAX_CENTRE_DISTANCE = 0.25
+
+
+def reconstruct_bodies(p: Problem) -> Rows | None:
+    """Return the contacts as `Rows`, also for J and M of free rigid bodies; None if they are not rigid bodies."""
+    if __name__ not in p.derived.cache:
+        p.derived.cache[__name__] = _reconstruct_bodies(p)
+    return p.derived.cache[__name__]
+
+
+def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+    """Compute the result of `reconstruct_bodies`.
+
+    `rows` (c, 3) holds the rows of J of each contact; the default is the rows of the problem's cones.
+    """
+    g, c = p.generalized, p.cones
+    contact = c.is_contact
+    if g is None or g.nv > MAX_DENSE_VELOCITIES or not contact.any() or np.any(c.n_tangents[contact] != 2):
+        return p.rows
+    if rows is None:
+        rows = c.ptr[:-1][contact][:, None] + np.arange(3)
+    mass, part = g.mass.toarray(), g.jac.toarray()[rows]
+    six: list[npt.NDArray[np.intp]] = []
+    for j in find_free_bodies(mass):  # Three equal entries of M may also be the rotational inertia of a ball.
+        if j + 6 <= g.nv and (not six or j > six[-1][-1]):
+            six.append(np.arange(j, j + 6))
+    if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
+        return None
+    at = np.array(six)
+    push, turn = (
+        part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)
+    )  # Shape (bodies, c, 3, 3).
+    moment = push.swapaxes(2, 3) @ turn  # The sum of d (r x d)^T is [r]^T.
+    on = push.any(axis=(2, 3))
+    k, count, first, last = (
+        np.arange(len(part)),
+        on.sum(axis=0),
+        on.argmax(axis=0),
+        -1 - on[::-1].argmax(axis=0),
+    )
+    axes = push[last, k]
+    other = push[first, k] + np.where(count == 2, 1.0, -1.0)[:, None, None] * axes
+    off = np.abs(axes @ axes.swapaxes(1, 2) - np.eye(3)).max() + np.abs(other).max()
+    off += np.abs(moment + moment.swapaxes(2, 3)).max() / max(1.0, np.abs(moment).max())
+    if not off < 1e-6 or np.delete(part, at, axis=2).any() or count.min() < 1 or count.max() > 2:
+        return None
+    arm = np.stack([moment[..., 1, 2], moment[..., 2, 0], moment[..., 0, 1]], axis=-1)
+    return Rows(
+        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.linalg.inv(mass[at[:, 3:, None], at[:, None, 3:]]),
+        v_free=g.v_free[at], normal=axes[:, 0], tangent=axes[:, 1], arm_a=arm[first, k], arm_b=arm[last, k],
+        contact_body=np.stack([np.where(count == 2, first, -1), len(six) + last], axis=1),
+    )  # fmt: skip
+
+
+def are_normals_first(p: Problem) -> bool:
+    """Return whether J has the rows of rigid bodies with all normals first, and not in the order of the cones."""
+    contact = p.cones.is_contact
+    k = int(np.count_nonzero(contact))
+    if (
+        p.generalized is None
+        or k < 2
+        or reconstruct_bodies(p) is not None
+        or 3 * k != np.count_nonzero(p.cones.contact_rows)
+    ):
+        return False
+    first = int(p.cones.ptr[:-1][contact][0])
+    i = np.arange(k)[:, None]
+    each, alike = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
+    return any(_reconstruct_bodies(p, first + order) is not None for order in (each, alike))
+
+
+def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about tangents before normals, normals from b to a, duplicates, and contradicting arms."""
+    r = reconstruct_bodies(p)
+    if r is None or not r.n_contacts:
+        return
+    blocks = np.flatnonzero(p.cones.is_contact)
+    a, b = r.contact_body.T
+    reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
+    size = reach.sum(axis=0)
+    between = r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None]
+    axes = np.stack([r.normal, r.tangent, np.cross(r.normal, r.tangent)], axis=1)
+    along, *aside = np.einsum("cki,ci->kc", axes, between)
+    for row, other in zip(("second", "third"), aside, strict=True):
+        for sign in (1.0, -1.0):
+            if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
+                reason = f"the second body lies along the {row} row of the contacts, not along the first; the rows of "
+                reason += "a contact are normal, tangent, tangent"
+                yield make_diagnostic(p, "tangents first", reason, blocks)
+                return
+    against = np.flatnonzero(along < -0.1 * size)  # (1)
+    if len(against):
+        i = int(against[np.argmin(along[against] / size[against])])
+        reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
+        reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
+        yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
+    if p.rows is None:
+        return  # Without reconstructed bodies, `blocks.diagnose_duplicate_contacts` compares the rows of J.
+    again, opposed = _find_coincident(r, size)
+    if len(again):
+        reason = f"{len(again)} contacts are at the position of another contact of the pair"
+        yield make_diagnostic(p, "duplicate rows", reason, blocks[again])
+    if len(opposed):
+        reason = "two contacts of a pair at one position have opposite normals"
+        yield make_diagnostic(p, "opposed normals", reason, blocks[opposed])
+    moving = np.flatnonzero((a >= 0) & (b >= 0))
+    off = _compute_centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    wrong = moving[off > MAX_CENTRE_DISTANCE * size[moving]]
+    if len(wrong) and len(wrong) <= 0.2 * len(moving):
+        i = int(wrong[0])
+        reason = (
+            f"the arms of contact {i} put the centres of bodies {a[i]} and {b[i]} elsewhere than the other "
+        )
+        yield make_diagnostic(
+            p,
+            "bodies",
+            reason + "contacts do: is a wrong body given?",
+            blocks[wrong],
+            off=float(off.max()),
+        )
+
+
+def _find_coincident(r: Rows, size: FloatArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Return two index arrays of contacts, each compared with the other contacts of its pair of bodies.
+
+    The first holds contacts that are equal to another up to rounding, the second contacts that are opposite to another
+    within 1 %.
+    """
+    pair = np.sort(r.contact_body, axis=1)
+    sign = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
+    # Compare the arms on the body with the larger number, which is a moving body.
+    arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
+    n = sign * r.normal
+    order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
+    again, opposed = [], []
+    for step in (1, 2, 3):
+        i, j = order[:-step], order[step:]
+        near = np.linalg.norm(arm[i] - arm[j], axis=1)
+        same = np.all(pair[i] == pair[j], axis=1)
+        dot = np.einsum("ij,ij->i", n[i], n[j])
+        again.append(j[same & (near <= 1e-12 * size[i]) & (dot > 1.0 - 1e-12)])
+        clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
+        opposed += [i[clash], j[clash]]
+    return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
+
+
+def _compute_centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
+    """Return |c_b - c_a - between| (e,) [m] for the centres c (n, 3) that minimise the sum of these distances.
+
+    The minimum of a sum of distances isolates a few wrong pairs. Iteratively reweighted least squares, 8 iterations.
+    """
+    if not len(pair):
+        return np.zeros(0)
+    at = np.arange(len(pair))
+    incidence = sp.csr_array(
+        (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
+        shape=(len(pair), n),
+    )
+    to_centres = incidence.T.tocsr()
+    a, b = pair.T
+    diagonal = np.arange(n)
+    # Positions of the weights in incidence^T weight incidence. The sparse constructor adds entries with equal
+    # positions.
+    positions = (np.r_[a, b, a, b, diagonal], np.r_[a, b, b, a, diagonal])
+    scale = np.abs(between).max()
+    if not 0.0 < scale < np.inf:
+        return np.zeros(len(pair))
+    weight = np.ones(len(pair))
+    for _ in range(8):
+        entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
+        normal = sp.csc_array((entries, positions), shape=(n, n))
+        centre = factor_sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
+        off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
+        weight = 1.0 / (off + 1e-4)
+    return scale * off
+
+
+def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about masses and inertias that no real body has."""
+    r = reconstruct_bodies(p)
+    if r is None or not r.n_bodies:
+        return
+    turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
+    still = np.flatnonzero((r.inv_mass == 0.0) & turning)
+    if len(still):
+        reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
+        yield make_diagnostic(p, "masses", reason, bodies=still.tolist())
+    eigen = np.linalg.eigvalsh(r.inv_inertia)
+    size = _compute_longest_arms(r)
+    known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
+    if not len(known):
+        return
+    m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
+    given = MISTAKEN_READINGS[p.generalized is not None]
+    # Left side of (2) with mass and inertia as given, and with one or both replaced by the inverse.
+    readings = {
+        "": (1.0 / e).sum(axis=1) * m,
+        given[0]: (1.0 / e).sum(axis=1) / m,
+        given[1]: e.sum(axis=1) * m,
+        given[2]: e.sum(axis=1) / m,
+    }
+    share = {name: float(np.median(np.log10(0.5 * k2 / s2))) for name, k2 in readings.items()}
+    own = share.pop("")
+    best = min(share, key=lambda name: abs(share[name] + 0.4))
+    if abs(own + 0.4) > 1.6 and abs(share[best] + 0.4) < 0.5:
+        reason = (
+            f"radii of gyration are {10 ** (0.5 * own):.2g} times the arms of contacts and joints; ordinary "
+        )
+        yield make_diagnostic(
+            p,
+            "masses",
+            reason + f"({10 ** (0.5 * share[best]):.2g}) if {best} was given",
+            ratio=10 ** (0.5 * own),
+        )
+        return
+    density = np.median(1.0 / m / s2**1.5)
+    if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
+        reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with {given[0]}"
+        yield make_diagnostic(p, "masses", reason, density=float(density))
+
+
+def _compute_longest_arms(r: Any) -> FloatArray:
+    """Return the longest arm of each body (n,) [m] over contacts and joint rows with a linear part."""
+    size = np.zeros(r.n_bodies)
+    joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
+    for side in (0, 1):
+        body = r.contact_body[:, side]
+        arm = np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
+        np.maximum.at(size, body[body >= 0], arm[body >= 0])
+        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
+        has = (joint[:, side] >= 0) & (push > 0.0)
+        np.maximum.at(size, joint[has, side], turn[has] / push[has])
+    return size
+
+
+def diagnose_inverted_matrices(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
+    g = p.generalized
+    if g is None or not 3 <= g.nv <= MAX_DENSE_VELOCITIES:
+        return
+    mass = g.mass.toarray()
+    given = find_free_bodies(mass)
+    if (
+        p.m == g.nv
+        and len(given)
+        and not _are_contact_rows_orthogonal(p, g.jac, given)
+        and _are_contact_rows_orthogonal(p, g.jac.T.tocsr(), given)
+    ):
+        reason = (
+            "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
+        )
+        yield make_diagnostic(p, "J transposed", reason)
+    weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
+    seen = weight > 0.0
+
+    def spread(matrix: FloatArray) -> float:
+        return float(np.ptp(np.log10(matrix.diagonal()[seen] / weight[seen] ** 2)))
+
+    wide = spread(mass) if np.count_nonzero(seen) >= 3 else 0.0
+    if len(given) and not wide > 2.0:
+        return
+    inverse = np.linalg.inv(mass)
+    other = find_free_bodies(inverse)
+    if len(other) and not len(given):
+        reason = "three uncoupled velocities have equal masses in the inverse of M but not in M: was M^-1 given for M?"
+        yield make_diagnostic(p, "masses", reason, velocities=other)
+    narrow = spread(inverse) if wide > 2.0 else wide
+    if len(other) <= len(given) and narrow < 0.25 * wide:
+        reason = f"effective masses of the velocities span 10^{wide:.1f} with M and 10^{narrow:.1f} with M^-1"
+        yield make_diagnostic(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
+
+
+def find_free_bodies(mass: FloatArray) -> list[int]:
+    """Return the index of the first linear velocity of each free body: the first of three uncoupled, equal masses."""
+    n = len(mass)
+    d = mass.diagonal()
+    at = np.arange(n - 2)
+    size = 1e-9 * d[:-2]
+    equal = (np.abs(d[1:-1] - d[:-2]) <= size) & (np.abs(d[2:] - d[:-2]) <= size)
+    off = sum(np.abs(mass[at + i, at + j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    return [int(i) for i in np.flatnonzero(equal & (off <= size))]
+
+
+def _are_contact_rows_orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
+    """Return whether most contacts move some free body along three orthogonal unit vectors."""
+    c = p.cones
+    first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
+    eye = np.eye(3)
+    for j in free:
+        parts = [jac[i : i + 3][:, j : j + 3].toarray() for i in first]
+        unit = [np.allclose(x @ x.T, eye, atol=1e-6) for x in parts if x.any()]
+        if unit and np.mean(unit) > 0.5:
+            return True
+    return False
+
+
+CHECKS = (diagnose_geometry, diagnose_masses, diagnose_inverted_matrices)

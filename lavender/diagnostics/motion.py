@@ -1,0 +1,291 @@
+"""Checks of v* and targets, equations (3) and (4), and their comparison with the state before the step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
+from lavender.base.errors import InputError
+from lavender.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies, reconstruct_bodies
+from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
+from lavender.problem import Problem
+from lavender.problem.rows import Rows
+
+G = 9.81  # [m/s^2]
+# [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
+MAX_SEPARATION_TARGET = 30.0
+# [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
+MAX_APPROACH_TARGET = 1000.0
+# [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
+MIN_RESTITUTION = 0.05
+# [-] Coefficients of restitution that are computed from velocities count as equal up to this difference.
+RESTITUTION_ROUNDING = 1e-6
+# [m/s] Approach speeds in this range suggest a target that lacks a factor dt; larger speeds suggest other units than
+# m/s.
+SUSPICIOUS_APPROACH = 30.0, 1e4
+
+
+def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return J v* (m,) and target (m,) [m/s], and v*; None for a problem in matrix form."""
+    if p.rows is not None:
+        v = p.rows.v_free
+        u = p.jacobian @ v.ravel()
+    elif p.generalized is not None:
+        v = p.generalized.v_free
+        u = p.generalized.velocity_of(v)
+    else:
+        return None
+    target = p.b + u
+    # Smaller targets are rounding of b + J v*.
+    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0
+    return u, target, v
+
+
+def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if rows that connect points of two bodies have targets far above usual speeds."""
+    motion = get_row_velocities_and_targets(p)
+    if p.rows is None or motion is None or not len(p.rows.jac):
+        return
+    jac, count = np.asarray(p.rows.jac), len(p.rows.jac)
+    is_linear = np.any(jac[:, 0:3] != 0.0, axis=1) | np.any(jac[:, 6:9] != 0.0, axis=1)
+    is_rigid = (p.cones.lower[:count] == -np.inf) & (p.cones.upper[:count] == np.inf)
+    if p.compliance is not None:
+        is_rigid &= p.compliance[:count] == 0.0
+    target = motion[1][:count]
+    rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target) > MAX_SEPARATION_TARGET))
+    if len(rows):
+        largest = float(target[rows[np.argmax(np.abs(target[rows]))]])
+        reason = (
+            f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies in "
+            "world coordinates, and is the error of the joint divided by dt once?"
+        )
+        yield make_diagnostic(
+            p, "joint targets", reason, np.searchsorted(p.cones.ptr, rows, side="right") - 1, target=largest
+        )
+
+
+def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about implausible targets of contacts."""
+    c = p.cones
+    motion = get_row_velocities_and_targets(p)
+    contact = c.is_contact
+    if motion is None or not contact.any():
+        return
+    u, target, _ = motion
+    normal, tangent = c.normal_rows, c.friction_rows
+    joints = int(np.count_nonzero(~c.contact_rows))
+    if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
+        reason = (
+            f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none if the {joints} "
+        )
+        yield make_diagnostic(p, "targets", reason + "targets of joints come first, in the order of the rows")
+        return
+    full = np.flatnonzero(c.n_tangents == 2)
+    each = np.abs(target[c.ptr[full][:, None] + np.arange(3)])
+    used, largest = each.any(axis=0), each.max(axis=1, initial=0.0)
+    # Equal targets on tangents are a conveyor's and plausible.
+    if not used[:1].any() and used[1:].sum() == 1 and np.ptp(largest) > 0.01 * largest.max():  # pyright: ignore[reportIndexIssue]
+        reason = (
+            f"the {'second' if used[1] else 'third'} row of contacts has targets, the first never; the rows "  # pyright: ignore[reportIndexIssue]
+        )
+        yield make_diagnostic(p, "tangents first", reason + "of a contact are normal, tangent, tangent", full)
+        return
+    un, tn = u[normal], target[normal]
+    r = reconstruct_bodies(p)
+    speed = None if r is None or not _are_at_rest(r) else np.linalg.norm(r.v_free[:, :3], axis=1)
+    limit = MAX_SEPARATION_TARGET if speed is None else max(1.0, 20.0 * float(speed.max()))
+    wild = (tn > limit) | (tn < -MAX_APPROACH_TARGET)
+    if wild.any():
+        largest = float(tn[np.argmax(np.abs(tn) * wild)])
+        reason = f"{np.count_nonzero(wild)} contacts have targets up to {largest:.3g} m/s, "
+        reason += "more than the speeds of the bodies; "
+        reason += "divide a penetration depth or a gap in m by dt once, and count a gap as negative"
+        yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
+        return
+    if r is None or speed is None:
+        return
+    if (
+        np.all(tn < 0.0)
+        and np.any(un < 0.0)
+        and np.any(np.all(r.moving_block_bodies[r.n_joints :] >= 0, axis=1))
+    ):
+        typical = float(np.median(-tn))
+        if typical > 0.1 * float(np.median(speed)):
+            reason = (
+                f"targets let bodies at rest approach at every contact ({tn.min():.3g} m/s), as over a gap; "
+            )
+            reason += "the target of a depth that is positive inside is +depth/dt"
+            yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
+
+
+def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if v* looks like an acceleration."""
+    motion, r = get_row_velocities_and_targets(p), reconstruct_bodies(p)
+    contact = np.flatnonzero(p.cones.is_contact)
+    if motion is None or not len(contact):
+        return
+    if r is not None and np.any(r.inv_mass > 0.0):
+        v = np.linalg.norm(r.v_free[r.inv_mass > 0.0, :3], axis=1)
+        if np.median(np.abs(v - G)) <= 0.01 * G:
+            reason = f"v* of bodies is {np.median(v):.3g} m/s, the number of g in m/s^2: is it v + dt a?"
+            yield make_diagnostic(p, "v_free", reason, speed=float(np.median(v)))
+            return
+    toward = -motion[0][p.cones.normal_rows]
+    slowest, fastest = SUSPICIOUS_APPROACH
+    if slowest < toward.max() < fastest:
+        i = int(np.argmax(toward))
+        reason = (
+            f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack dt, or is dt "
+            "in ms?"
+        )
+        yield make_diagnostic(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
+
+
+def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if the normals of static bodies push falling bodies further down.
+
+    The check is made only if most bodies have the same v*. This v* is the velocity change by gravity in one step, and
+    static bodies must then support the others from below.
+    """
+    r = reconstruct_bodies(p)
+    if r is None or np.count_nonzero(r.inv_mass) < 2:
+        return
+    body = r.moving_block_bodies[r.n_joints :]
+    still = np.flatnonzero((body < 0).any(axis=1))
+    v = r.v_free[r.inv_mass > 0.0, :3]
+    fall = np.median(v, axis=0)
+    size = float(np.linalg.norm(fall))
+    if len(still) < 4 or size == 0.0 or np.median(np.abs(v @ fall / size - size)) > 0.6 * size:
+        return
+    toward = np.where(body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
+    if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
+        reason = "static bodies push others in the direction of their fall: are normals flipped, or bodies swapped?"
+        yield make_diagnostic(
+            p, "normals", reason, np.flatnonzero(p.cones.is_contact)[still], along=float(toward.mean())
+        )
+
+
+def _are_at_rest(r: Rows) -> bool:
+    """Return whether all bodies have about the same v* and touch another: bodies at rest after a step of gravity."""
+    moving = r.inv_mass > 0.0
+    if not np.isin(np.flatnonzero(moving), r.contact_body).all() or not moving.any():
+        return False
+    v = r.v_free[moving, :3]
+    fall = np.median(v, axis=0)
+    return bool(np.linalg.norm(v - fall, axis=1).max() <= 0.1 * np.linalg.norm(fall))
+
+
+def check_state_arguments(
+    p: Problem, velocity: Any, gap: Any, dt: float | None
+) -> tuple[FloatArray | None, FloatArray | None, float]:
+    """Validate velocity, gap and dt of `diagnose`."""
+    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
+    if motion is None and (velocity is not None or gap is not None):
+        raise InputError(
+            "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
+        )
+    if velocity is not None and motion is not None:
+        if p.rows is not None and get_shape("velocity", velocity) == (p.rows.n_bodies, 3):
+            velocity = embed_planar_velocities(p.rows, velocity)
+        velocity = as_array("velocity", velocity, motion[2].shape, unit="m/s")
+    if gap is not None:
+        if dt is None:
+            raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
+        gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
+    return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
+
+
+def embed_planar_velocities(rows: Rows, velocity: Any) -> FloatArray:
+    """Return the velocities (n, 6) of a problem in the xy plane, given as (v_x, v_y, omega) of each body (n, 3).
+
+    Raises
+    ------
+    InputError
+        A body, joint or contact leaves the plane, so that three numbers may be linear velocities in space.
+    """
+    out_of_plane = [2, 3, 4]
+    jac = np.reshape(rows.jac, (-1, 6))
+    inertia = np.array(rows.inv_inertia)
+    inertia[:, 2, 2] = 0.0
+    vectors = (rows.normal, rows.tangent, rows.arm_a, rows.arm_b)
+    if (
+        rows.v_free[:, out_of_plane].any()
+        or jac[:, out_of_plane].any()
+        or inertia.any()
+        or any(x[:, 2].any() for x in vectors)
+    ):
+        n = rows.n_bodies
+        raise InputError(
+            f"velocity [m/s] has shape ({n}, 3); ({n}, 6) is needed, because the problem is not in the xy plane: "
+            "numpy.hstack([v, omega]) of the linear and the angular velocities, or of (v_x, v_y, omega_z) as v: "
+            "numpy.insert(v, [2, 2, 2], 0.0, axis=1)"
+        )
+    return np.insert(as_array("velocity", velocity, (rows.n_bodies, 3), unit="m/s"), [2, 2, 2], 0.0, axis=1)
+
+
+def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
+    """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
+    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
+    contact = np.flatnonzero(p.cones.is_contact)
+    if motion is None or not len(contact):
+        return
+    normal, g, r = p.cones.normal_rows, p.generalized, p.rows
+
+    def of_normals(v: FloatArray) -> FloatArray:
+        return np.asarray(p.jacobian @ v.ravel() if g is None else g.velocity_of(v))[normal]
+
+    if velocity is not None:
+        step = (motion[2] - velocity).ravel()
+        change = np.abs(of_normals(step))
+        push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
+        if g is not None and g.nv <= MAX_DENSE_VELOCITIES:
+            push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
+        # Use free bodies only, if there are any: light links of a robot have larger accelerations than gravity.
+        fall = np.linalg.norm(push, axis=1) if len(push) else change
+        fall = fall[fall > 0.01 * fall.max()]  # Ignore bodies on which no force acts.
+        typical = float(np.median(fall)) if len(fall) else 0.0
+        if not step.any():
+            yield make_diagnostic(
+                p,
+                "v_free",
+                "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)",
+            )
+        elif typical > 0.5 * G:
+            reason = f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
+            yield make_diagnostic(p, "v_free", reason, change=typical)
+    if gap is None:
+        return
+    target = motion[1][normal]
+    comparable = (target != 0.0) & (np.abs(gap) > 1e-9)
+    if velocity is not None:
+        comparable &= ~_find_bounces(target, of_normals(velocity))
+    if not comparable.any():
+        return
+    if np.mean(target[comparable] * gap[comparable] > 0.0) > 0.7:
+        reason = "targets have the sign of the gaps: distant bodies may approach (-gap/dt), overlapping ones separate"
+        yield make_diagnostic(p, "targets", reason, contact[comparable])
+    share = float(np.median(np.abs(target[comparable] / gap[comparable]))) * dt
+    if not 1.5 * dt <= share <= 0.1 / dt:
+        reason = f"targets are {share:.2g} times gap/dt in the median; 1 is expected: "
+        reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
+        yield make_diagnostic(p, "targets", reason, contact[comparable], share=share)
+
+
+def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return a mask (c,) of the contacts with targets that are bounces and do not depend on gaps.
+
+    A target is a bounce if it is -e times the normal velocity `before` the step (c,) [m/s], with the same restitution
+    coefficient e for all of these contacts.
+    """
+    approach = before < 0.0
+    e = np.zeros(len(target))
+    np.divide(-target, before, out=e, where=approach)
+    bounces = approach & (e > MIN_RESTITUTION) & (e <= 1.0)
+    return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
+
+
+CHECKS = (diagnose_joint_targets, diagnose_targets, diagnose_free_velocities, diagnose_flipped_normals)

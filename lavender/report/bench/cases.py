@@ -1,0 +1,623 @@
+"""Resolve files, folders and names of suite cases to problems, and describe each problem."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lavender import io, suite
+from lavender.base.arrays import FloatArray, check_bool, check_sequence
+from lavender.base.errors import InputError, SolverUnavailable
+from lavender.diagnostics import diagnose
+from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
+from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
+from lavender.problem import Problem, check_problem
+from lavender.problem.derived import cached_property
+from lavender.report.bench.record import CaseInfo, escape_unprintable, make_file_name
+from lavender.suite import Case
+
+MAX_RANK_ROWS = 300  # The rank of A is computed up to this many rows, in a fraction of a second.
+# Singular values up to this fraction of the largest count as zero; condition numbers in practice stay below 1e12.
+ZERO_SINGULAR_VALUE_TOL = 1e-12
+# Up to this many contacts with equal couplings count as contacts of one pair of bodies.
+MAX_MANIFOLD_BLOCKS = 8
+# Problems from this mass ratio on are "large mass ratio": J and M are more accurate than A.
+LARGE_MASS_RATIO = 1e3
+# A matrix with a larger relative asymmetry is not the A of bodies; recorded contact problems stay below 0.01.
+MAX_MECHANICAL_ASYMMETRY = 0.1
+
+# Archives in the folder of an audit that are no problems.
+AUDIT_RESULTS = ("records.npz", "states.npz")
+DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
+
+
+@dataclass(eq=False)
+class Item:
+    """One case of a run; its problem is loaded at the first access.
+
+    Parameters
+    ----------
+    name : str
+    source : str
+        Path, or name in the suite.
+    load : callable
+        Loads the problem.
+    reason : str
+        Property that the case tests.
+    sequence : str
+        Name of the sequence that contains the case as a step; empty for a single case.
+    step : int
+        Number of the step; -1 for a single case.
+    in_memory : Problem, optional
+        The problem itself, if it was passed as an object.
+    load_stored : callable
+        Returns the answer stored with the problem (m,) [N s], or None.
+    named : bool
+        Whether the user named this case. False if it was found in a folder. A named case that does not load is an
+        error of the request.
+    """
+
+    name: str
+    source: str
+    load: Callable[[], Problem]
+    reason: str = ""
+    sequence: str = ""
+    step: int = -1
+    in_memory: Problem | None = None
+    load_stored: Callable[[], FloatArray | None] = lambda: None
+    named: bool = False
+
+    def __post_init__(self) -> None:
+        self.name, self.sequence = escape_unprintable(self.name), escape_unprintable(self.sequence)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The problem; accessing it raises the errors of loading it."""
+        return self.load()
+
+    def judge_stored_answer(
+        self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
+    ) -> Residual | None:
+        """Judge the answer stored with the problem; return None if there is none, or if it does not have m entries."""
+        impulse = self.load_stored()
+        if impulse is None or impulse.shape != (self.problem.m,):
+            return None
+        return residual(self.problem, impulse, precision, threshold)
+
+    def release_problem(self) -> None:
+        """Release the memory of the problem."""
+        self.__dict__.pop("problem", None)
+
+
+def is_path(word: Source) -> bool:
+    """Return whether `word` names a file or folder, which need not exist, and not a case of the suite."""
+    if isinstance(word, Path):
+        return True
+    return isinstance(word, str) and (
+        "/" in word or os.sep in word or Path(word).suffix.lower() in SUFFIXES or Path(word).exists()
+    )
+
+
+Source = str | Path | Problem | Case | Item
+
+
+def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
+    """Resolve files, folders (and folders in them), names and cases of the suite to items; the default suite if none.
+
+    No problem is solved and usually none is loaded, but every source is checked to exist.
+
+    Parameters
+    ----------
+    sources : files, folders, names or cases of the suite, problems; or one of them
+    sequences : bool, optional
+        Folders hold the steps of a simulation. If None, this is assumed for folders with files that differ only in a
+        number and name their blocks (`Problem.key`), as recorded steps do.
+
+    Raises
+    ------
+    InputError
+        An entry of `sources` is neither a file nor a case of the suite, or a folder holds no problem files.
+    UnknownName
+        The suite does not have the case.
+    """
+    if sequences is not None:
+        check_bool("sequences", sequences)
+    items: list[Item] = []
+    visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
+    sources = (
+        [sources]
+        if isinstance(sources, Source)
+        else check_sequence("cases", sources, "files, folders, names or problems")
+    )
+    if not sources:
+        items = [_make_item_of_case(case, case.name) for case in suite.default()]
+    for source in sources:
+        if isinstance(source, Problem):
+            name = source.name or f"problem {len(items)}"
+            items.append(Item(name, name, _make_loader(source), in_memory=source))
+        elif isinstance(source, Item):
+            items.append(source)
+        elif isinstance(source, Case):
+            items.append(_make_item_of_case(source, source.name))
+        elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
+            raise InputError(
+                f"case {source!r:.60} is a {type(source).__name__}; the path of a file, a name of the suite "
+                "or a Problem is needed"
+            )
+        elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
+            steps = _rename_duplicate_sequence(list_steps_in_folder(source), items)
+            name, missing = steps[0].sequence, map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
+            items += [
+                *steps,
+                *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in missing),
+            ]
+        elif Path(source).is_dir():
+            paths = _list_problem_files(Path(source))
+            visited.add(Path(source).resolve())
+            inner = [
+                p
+                for p in sorted(Path(source).iterdir())
+                if p.is_dir()
+                and p.resolve() not in visited
+                and os.access(p, os.R_OK)
+                and not _is_states_folder(p)
+                and _list_problem_files(p)
+            ]
+            sources += inner
+            if not paths and not inner:
+                records = Path(source) / "records.jsonl"
+                shown = f": {records} shows its report again" if records.is_file() else ""
+                raise InputError(f"{source} holds no problem file ({', '.join(SUFFIXES)}){shown}")
+            items += [_make_item_of_file(path) for path in (*paths, *_read_unrecorded_steps(Path(source)))]
+        elif Path(source).exists() or Path(source) in _read_unrecorded_steps(Path(source).parent):
+            items.append(replace(_make_item_of_file(Path(source)), named=True))
+        elif is_path(source):
+            raise InputError(
+                f"{source}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
+            )
+        else:
+            selected = [_make_item_of_name(name) for name in suite.get_case_names_of_set(str(source))]
+            items += (
+                _convert_to_sequence_steps(selected)
+                if str(source).removeprefix("@") == "sequences"
+                else selected
+            )
+    return _append_numbers_to_equal_names(items)
+
+
+def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
+    """Create the item of a source in a worker process; an invalid source raises an error when it is loaded."""
+    try:
+        (item,) = resolve_sources([source])
+    except Exception as error:  # The file was removed, or reading its folder raises an error.
+        item = Item(name, str(source), _raise_when_loaded(error))
+    return replace(item, name=name, reason=reason, sequence="", step=-1)
+
+
+def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
+    """Return consecutive problems as the steps of one sequence."""
+    if not isinstance(name, str):
+        raise InputError(f"the name of a sequence is {name!r:.60}; a string is needed")
+    items = []
+    for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
+        check_problem(problem)
+        items.append(
+            Item(f"{name}[{i}]", name, _make_loader(problem), sequence=name, step=i, in_memory=problem)
+        )
+    return items
+
+
+def list_steps_in_folder(folder: str | Path) -> list[Item]:
+    """Return the problem files of a folder as the steps of one sequence, in the numeric order of their names.
+
+    Raises
+    ------
+    InputError
+        `folder` is not a folder, or it holds fewer than two problem files.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
+        )
+    paths = _list_problem_files(folder)
+    if len(paths) < 2:
+        raise InputError(
+            f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
+        )
+    _check_one_recording(folder, paths)
+    name = folder.resolve().name
+    return [
+        replace(_make_item_of_file(path), name=f"{name}[{i}]", sequence=name, step=i)
+        for i, path in enumerate(paths)
+    ]
+
+
+def _check_one_recording(folder: Path, paths: list[Path]) -> None:
+    """Raise InputError if a folder holds steps of several recordings.
+
+    It does if two files have the same number, if file names have different prefixes, or if the list of steps that the
+    engine wrote to the folder does not contain a file.
+    """
+    numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
+    series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
+    twice = len(numbered) > len(set(numbered))
+    listed = {str(line["file"]) for line in _read_engine_records(folder)}
+    unlisted = [p.name for p in paths if listed and p.name not in listed]
+    if twice or len(series) > 1 or unlisted:
+        reason = (
+            f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
+            if unlisted
+            else "two files have the same number"
+            if twice
+            else f"files are named {series[0]}N and {series[1]}N"
+        )
+        raise InputError(
+            f"{folder} holds steps of more than one recording ({reason}): move each recording into a separate folder"
+        )
+
+
+def _read_engine_records(folder: Path) -> list[dict[str, Any]]:
+    """Read the engine's data of the steps in a folder, each with its "file"; empty if a line cannot be read."""
+    try:
+        text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
+        lines = [dict(json.loads(line)) for line in text.splitlines()]
+        return lines if all("file" in line for line in lines) else []
+    except (ValueError, TypeError, RecursionError):
+        return []
+
+
+def _read_unrecorded_steps(folder: Path) -> dict[Path, str]:
+    """Return {file: reason} for steps that could not be recorded."""
+    steps = {
+        folder / Path(str(t["file"])).name: str(t["left_out"])
+        for t in _read_engine_records(folder)
+        if "left_out" in t
+    }
+    return {path: reason for path, reason in steps.items() if not path.exists()}
+
+
+def _list_problem_files(folder: Path) -> list[Path]:
+    """List the problem files of a folder, in the numeric order of their names, without the results of an audit."""
+    try:
+        results = AUDIT_RESULTS if (folder / "numbers.json").is_file() else ()
+        files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.name not in results)
+        return sorted(files, key=_natural_sort_key)
+    except OSError as error:
+        raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
+
+
+def _is_states_folder(folder: Path) -> bool:
+    """Whether a folder holds the states before recorded steps, whose problems are in its parent."""
+    parent = folder.parent
+    if folder.name != STATES_FOLDER:
+        return False
+    return (parent / ENGINE).is_file() or any((parent / p.name).is_file() for p in folder.glob("*.npz"))
+
+
+def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
+    """Return a sort key in which numbers are ordered by value; digits such as superscripts count as letters."""
+    parts = re.split(r"([0-9]{1,18})", path.name)
+    return [(0, int(t)) if i % 2 else (1, t) for i, t in enumerate(parts) if t]
+
+
+def _holds_recorded_steps(folder: Path) -> bool:
+    """Whether a folder holds the recorded steps of one simulation."""
+    paths = _list_problem_files(folder) if folder.is_dir() else []
+    if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
+        return False
+    try:
+        return _make_item_of_file(paths[0]).problem.key is not None
+    except Exception:  # The error is reported when the case is run.
+        return False
+
+
+def _rename_duplicate_sequence(steps: list[Item], items: list[Item]) -> list[Item]:
+    """Rename a sequence if an earlier one has its name: prefix the parent folder's name, or append a number.
+
+    Figures are files named after sequences, so names must differ as file names, too.
+    """
+    names = {make_file_name(item.sequence).lower() for item in items if item.sequence}
+    name, n = steps[0].sequence, 1
+    if make_file_name(name).lower() in names:
+        with_parent = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
+        name = name if make_file_name(with_parent).lower() in names else with_parent
+    while make_file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
+        n += 1
+    return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
+
+
+def _make_loader(problem: Problem) -> Callable[[], Problem]:
+    """Return a function that returns the problem."""
+    return lambda: problem
+
+
+def _make_item_of_case(case: Case, source: str) -> Item:
+    """Create the item of a case."""
+    return Item(case.name, source, _make_loader(case.problem), case.reason)
+
+
+def _make_item_of_name(name: str) -> Item:
+    """Create the item of a name in the suite; if a package is missing, loading the item raises the error."""
+    try:
+        return _make_item_of_case(suite.case(name), name)
+    except SolverUnavailable as error:
+        return Item(name, name, _raise_when_loaded(error))
+
+
+def _convert_to_sequence_steps(items: list[Item]) -> list[Item]:
+    """Convert consecutive cases that differ only in `at` to the steps of sequences."""
+    out, count = [], Counter[str]()
+    for item in items:
+        name = item.name.rpartition(", at=")[0] + ")"
+        out.append(replace(item, name=f"{name}[{count[name]}]", sequence=name, step=count[name]))
+        count[name] += 1
+    return out
+
+
+def _raise_when_loaded(error: Exception) -> Callable[[], Problem]:
+    """Return a function that raises the error when the problem is loaded."""
+
+    def load() -> Problem:
+        raise error
+
+    return load
+
+
+def _make_item_of_file(path: Path) -> Item:
+    """Create the item of a problem file."""
+
+    def load() -> Problem:
+        if _is_states_folder(path.parent):
+            raise InputError(
+                f"{path} holds the state before a recorded step; its problem is {path.parent.parent / path.name}"
+            )
+        if path.exists() and not path.is_file():
+            # A pipe may never end.
+            raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
+        if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
+            raise InputError(
+                f"{path} was not written, because this step could not be recorded ({reason}): choose "
+                "another step"
+            )
+        return io.load(path)
+
+    return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))
+
+
+def _append_numbers_to_equal_names(items: list[Item]) -> list[Item]:
+    """Append numbers to equal names; figures are files named after cases, so case-insensitive names must differ."""
+    used_names: set[str] = set()
+    for item in items:
+        name, n = item.name, 1
+        while make_file_name(item.name).lower() in used_names:
+            n += 1
+            item.name = f"{name} #{n}"
+        used_names.add(make_file_name(item.name).lower())
+    return items
+
+
+def describe_case(item: Item, run: str) -> CaseInfo:
+    """Load the problem of an item and describe it for the report."""
+    p = item.problem
+    contacts = int(np.count_nonzero(p.cones.is_contact))
+    answer = item.judge_stored_answer()
+    return CaseInfo(
+        run=run,
+        case=item.name,
+        source=item.source,
+        sha=hash_problem(p),
+        law=p.law,
+        rows=p.m,
+        blocks=p.n_blocks,
+        contacts=contacts,
+        bodies=p.rows.n_bodies if p.rows is not None else 0,
+        nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz),
+        mass_ratio=compute_mass_ratio(p),
+        structure=classify_structure(p),
+        symmetric=p.is_symmetric,
+        reason=item.reason,
+        sequence=item.sequence,
+        step=item.step,
+        stored=math.nan if answer is None else answer.relative,
+        stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
+        nothing_to_do=is_solved_by_zero(p),
+        diagnostics=tuple(map(str, diagnose(p))),
+        guess=_classify_guess(item),
+        condition=compute_condition_number(p),
+    )
+
+
+def _classify_guess(item: Item) -> str:
+    """Return the kind of the problem's guess for `CaseInfo.guess`: "", "start" or "answer".
+
+    A guess is an answer if it is the stored answer, or if its residual is at most `DEFAULT_SOLVE_TOL`.
+    """
+    guess = item.problem.guess
+    if guess is None:
+        return ""
+    stored = item.load_stored()
+    is_stored = stored is not None and np.array_equal(guess, stored)
+    return "answer" if is_stored or residual(item.problem, guess).relative <= DEFAULT_SOLVE_TOL else "start"
+
+
+def hash_problem(problem: Problem) -> str:
+    """Hash the numbers of a problem and the keys of its blocks; the v* of bodies is hashed as part of b."""
+    digest = hashlib.sha256(problem.friction.encode())
+    c, r, g = problem.cones, problem.rows, problem.generalized
+    arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
+    arrays += [c.rolling] if c.has_rolling else []
+    if r is None:
+        for a in (problem.csr,) if g is None else (g.jac, g.mass):
+            arrays += [a.indptr, a.indices, a.data]
+        arrays += [] if g is None else [g.v_free, problem.compliance]
+    else:
+        arrays += [r.jac, r.joint_body, r.normal, r.tangent, r.arm_a, r.arm_b, r.contact_body, r.inv_mass]
+        arrays += [r.inv_inertia, problem.compliance]
+    for x in arrays:
+        digest.update(b"-" if x is None else np.ascontiguousarray(x).tobytes() + b"|")
+    if problem.precision != "float64":
+        digest.update(problem.precision.encode())
+    if problem.key is not None:
+        digest.update(b"key" + problem.key.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def compute_mass_ratio(problem: Problem) -> float:
+    """Return the largest body mass divided by the smallest.
+
+    If bodies are not known, it is the ratio of the largest to the smallest d over bounded rows and contact normals.
+    """
+    if problem.rows is not None:
+        x = problem.rows.inv_mass
+    else:
+        c = problem.cones
+        rows = np.flatnonzero(~c.contact_rows)
+        x = problem.d[np.concatenate([rows, c.normal_rows])]
+    x = x[x > 0.0]
+    return float(x.max() / x.min()) if len(x) else 1.0
+
+
+def classify_structure(problem: Problem) -> tuple[str, ...]:
+    """Return the words that describe a problem's structure, from its numbers; they decide which solver suits.
+
+    - The largest connected component of the coupling graph. One moving body (in a matrix: a few blocks that are all
+      coupled, as a body's contacts are): "separate". At most two neighbours on average: "chain" (most couplings are
+      joints) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples more than half of all
+      pairs: "dense".
+    - "redundant": there are fewer independent rows than rows, if the rank is cheap to compute or the counts prove it.
+    - "friction": the law. "ellipses": contacts with two coefficients. "large mass ratio": 1000 or more.
+    - "asymmetric": A is not symmetric. A matrix that is not nearly symmetric comes from no scene of bodies, and gets
+      no word for its graph or masses.
+    """
+    check_problem(problem)
+    if problem.m == 0:
+        return ("empty",)
+    features = []
+    mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
+    if mechanical:
+        features.append(_classify_coupling_graph(problem))
+    if _has_redundant_rows(problem):
+        features.append("redundant")
+    if problem.law in ("coulomb", "cone"):
+        features.append("friction")
+    if problem.cones.has_ellipse:
+        features.append("ellipses")
+    if mechanical and compute_mass_ratio(problem) >= LARGE_MASS_RATIO:
+        features.append("large mass ratio")
+    if not problem.is_symmetric:
+        features.append("asymmetric")
+    return tuple(features)
+
+
+def _classify_coupling_graph(problem: Problem) -> str:
+    """Return the word for the largest connected component of the coupling graph."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n, i, j = _build_body_graph(problem) if problem.rows is not None else _build_block_graph(problem)
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    component = connected_components(graph, directed=False)[1]
+    largest = np.bincount(component).argmax()
+    size = np.count_nonzero(component == largest)
+    neighbours = 2.0 * np.count_nonzero(component[i] == largest) / size
+    bilateral = _is_bilateral(problem)
+    if size == 1:
+        return "separate"
+    if neighbours <= 2.0:
+        return "chain" if bilateral else "stack"
+    if problem.rows is None and size > MAX_MANIFOLD_BLOCKS and neighbours > 0.5 * (size - 1):
+        return "dense"
+    return "mesh" if bilateral else "pile"
+
+
+def _is_bilateral(problem: Problem) -> bool:
+    """Return whether more pairs of bodies share a joint than a contact; for a matrix, whether most blocks are free."""
+    if problem.law == "linear":
+        return True
+    r, c = problem.rows, problem.cones
+    if r is not None:
+        joints, contacts = (
+            len(np.unique(np.sort(x, axis=1), axis=0)) for x in (r.joint_body, r.contact_body)
+        )
+        return joints > contacts
+    first = c.ptr[:-1][~c.is_contact]
+    free = np.count_nonzero(np.isinf(c.lower[first]) & np.isinf(c.upper[first]))
+    return bool(2 * free > c.n_blocks)
+
+
+Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # Number of nodes, and both ends of each edge.
+
+
+def _build_body_graph(problem: Problem) -> Edges:
+    """Return the graph of moving bodies that a joint or a contact connects."""
+    r = problem.rows
+    assert r is not None
+    ends = r.moving_block_bodies
+    pairs = np.unique(np.sort(ends[(ends >= 0).any(axis=1)], axis=1), axis=0)
+    bodies, indices = np.unique(pairs, return_inverse=True)
+    indices = indices.reshape(pairs.shape)[pairs[:, 0] >= 0]
+    # `bodies` is sorted, so the number of static bodies, -1, comes first if it occurs. Moving bodies are numbered from
+    # 0.
+    ground = int(len(bodies) > 0 and bodies[0] < 0)
+    return max(1, len(bodies) - ground), indices[:, 0] - ground, indices[:, 1] - ground
+
+
+def _build_block_graph(problem: Problem) -> Edges:
+    """Return the graph of blocks that A couples; blocks with equal couplings, as of one body pair, are one node."""
+    import scipy.sparse as sp
+
+    c = problem.cones
+    block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
+    a = problem.csr.tocoo()
+    i, j = block[a.coords[0]], block[a.coords[1]]
+    graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(c.n_blocks, c.n_blocks))
+    graph = sp.csr_array(graph + graph.T + sp.eye_array(c.n_blocks))
+    graph.sort_indices()
+    patterns = [graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)]
+    count = Counter(patterns)
+    groups: dict[bytes | int, int] = {}
+    # More blocks with equal couplings than a pair of bodies has contacts mean a dense matrix: keep them separate.
+    keys = [p if count[p] <= MAX_MANIFOLD_BLOCKS else k for k, p in enumerate(patterns)]
+    label = np.array([groups.setdefault(key, len(groups)) for key in keys])
+    g = graph.tocoo()
+    i, j = label[g.coords[0]], label[g.coords[1]]
+    edges = np.unique(np.stack([i[i < j], j[i < j]]), axis=1)
+    return len(groups), edges[0], edges[1]
+
+
+def _has_redundant_rows(problem: Problem) -> bool:
+    """Whether there are fewer independent rows than rows, by the counts or by the singular values."""
+    if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
+        return True
+    values = _compute_singular_values(problem)
+    return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])
+
+
+def compute_condition_number(problem: Problem) -> float | None:
+    """Compute the condition of A, scaled to a unit diagonal, on its range; None for A = 0 or too many rows."""
+    values = _compute_singular_values(problem)
+    nonzero = values[values > ZERO_SINGULAR_VALUE_TOL * values.max(initial=0.0)]
+    return float(f"{nonzero[0] / nonzero[-1]:.1e}") if len(nonzero) else None
+
+
+def _compute_singular_values(problem: Problem) -> NDArray[Any]:
+    """Compute the singular values of A, scaled to a unit diagonal; empty above MAX_RANK_ROWS rows."""
+    if problem.m > MAX_RANK_ROWS:
+        return np.zeros(0)
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(problem.d)
+        a = problem.dense() * scale[:, None] * scale[None, :]
+    return np.linalg.svd(a, compute_uv=False) if np.isfinite(a).all() else np.zeros(0)

@@ -1,0 +1,232 @@
+"""Describe the machine and the versions with which times were measured."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import re
+import subprocess
+import sysconfig
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from lavender._version import __version__
+from lavender.base.errors import require_packages
+from lavender.report.bench.record import Run
+from lavender_ext.sweep import serial
+
+# The processes of backends may use this fraction of the machine's memory together.
+BACKEND_MEMORY_FRACTION = 0.5
+MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled code do not start.
+
+BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
+
+
+def _read_cpuinfo_entry(name: str) -> str:
+    """Return Linux's value of an entry for the first processor; empty on other systems."""
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text(errors="replace")
+        if found := re.search(rf"^(?:{name})\s*:\s*(.+)$", text, re.MULTILINE):
+            return found[1].strip()
+    return ""
+
+
+def get_cpu_name() -> str:
+    """Return the model of the processor, as the system names it."""
+    return _read_cpuinfo_entry("model name|Model") or platform.processor() or platform.machine() or "unknown"
+
+
+def get_total_memory() -> int:
+    """Return the memory of this machine or of its container [bytes]; 0 if it is not known."""
+    found = []
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(ValueError, OSError):
+            found.append(int(Path(path).read_text()))
+    return min((n for n in found if n > 0), default=0)
+
+
+def get_memory_per_process(processes: int = 1) -> int:
+    """Return the memory [bytes] that each of `processes` backend processes may use.
+
+    It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
+    machine is unknown.
+    """
+    return (
+        max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * get_total_memory() / max(1, processes)))
+        if get_total_memory()
+        else 0
+    )
+
+
+def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:
+    """Return the version of each installed distribution, or of a module's; missing ones are left out."""
+    found = {}
+    for name in sorted({*base, *packages}):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found |= {
+                dist: metadata.version(dist) for dist in _map_modules_to_distributions().get(name, ())[:1]
+            }
+    return found
+
+
+@cache
+def _map_modules_to_distributions() -> Mapping[str, list[str]]:
+    """Return {module: distributions}; it reads the file lists of all installed packages."""
+    return metadata.packages_distributions()
+
+
+def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
+    """Describe a run that starts now; its identity is a hash of CPU, versions and plan, not of the time."""
+    facts = {
+        "lavender": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": get_cpu_name(),
+        "cores": os.cpu_count() or 1,
+        "threads": 1,
+        "versions": get_versions(packages),
+    }
+    # These facts affect a single measurement; the selection of cases and solvers does not.
+    identity_facts: dict[str, Any] = {
+        **facts,
+        "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan},
+    }
+    build = describe_build()
+    identity_facts["build"] = build
+    digest = hashlib.sha256(json.dumps(identity_facts, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return Run(
+        run=digest,
+        started=started,
+        plan=dict(plan),
+        build=build | get_processor_clock(),
+        load=get_load_average(),
+        **facts,  # type: ignore[arg-type]
+    )
+
+
+def get_load_average() -> float | None:
+    """Return the mean number of runnable processes in the last minute; None if the system does not provide it."""
+    with contextlib.suppress(AttributeError, OSError):
+        return float(os.getloadavg()[0])
+    return None
+
+
+def count_runnable_processes() -> float | None:
+    """Return the number of runnable processes now, including this one; `get_load_average` if not on Linux."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return float(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
+    return get_load_average()
+
+
+def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
+    """Return a warning if other processes used the processors, else an empty text.
+
+    Parameters
+    ----------
+    loads : numbers of runnable processes during a measurement, None if unknown
+    cores : number of processors
+    consequence : sentence on the results
+    own : number of processes of the measurement itself
+    """
+    known = [load for load in loads if load is not None]
+    # The mean load may exceed the number of cores by 0.5, since the system's own processes run, too.
+    if not known or fmean(known) <= max(cores, own) + 0.5:
+        return ""
+    return (
+        f"The machine was busy: load {fmean(known):.1f} on {_count_cores(cores)} during the measurement. "
+        f"{consequence}"
+    ).rstrip()
+
+
+def summarise_loads(loads: Iterable[float | None], cores: int) -> str:
+    """Return a sentence with the mean and the largest load of runs, then `describe_loaded_runs`; empty if unknown."""
+    known = [load for load in loads if load is not None]
+    if not known:
+        return ""
+    mean_and_max = f"{fmean(known):.1f} on average and {max(known):.0f} at most"
+    text = f"Load during the runs: {mean_and_max}, on {_count_cores(cores)}."
+    return f"{text} {describe_loaded_runs(known, cores)}".rstrip()
+
+
+def describe_loaded_runs(loads: Iterable[float | None], cores: int) -> str:
+    """Return a sentence on the runs during which more processes were runnable than there are cores; empty if none."""
+    known = [load for load in loads if load is not None]
+    n = sum(load > cores for load in known)
+    if not n:
+        return ""
+    return (
+        f"In {n} of {len(known)} runs more processes were runnable (up to {max(known):.0f}) than the machine has cores "
+        f"({cores}), so their times may be too long."
+    )
+
+
+def _count_cores(cores: int) -> str:
+    return f"{cores} core{'s' * (cores != 1)}"
+
+
+def get_processor_clock() -> dict[str, str]:
+    """Return the frequency of the processor and its governor, if the system provides them."""
+    mhz = _read_cpuinfo_entry("cpu MHz")
+    found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
+    with contextlib.suppress(OSError):
+        found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
+    return found
+
+
+@cache
+def describe_build() -> dict[str, str]:
+    """Describe the build: commit of a checkout, hash of the kernels, compiler, flags, BLAS."""
+    package = Path(__file__).resolve().parents[2]
+    library = Path(str(serial.__file__))
+    found = {"commit": commit} if (commit := get_commit(package.parent)) else {}
+    kernels = hashlib.sha256()
+    for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
+        kernels.update(path.read_bytes())
+    found["kernels"] = kernels.hexdigest()[:12]
+    found |= read_compiler_versions(library.read_bytes())
+    flags = sysconfig.get_config_var("CFLAGS")
+    found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
+    require_packages("the description of the machine", "threadpoolctl")
+    from threadpoolctl import threadpool_info
+
+    blas = [f"{i['internal_api']} {i['version']}" for i in threadpool_info() if i.get("user_api") == "blas"]
+    return found | {"blas": ", ".join(sorted(set(blas)))}
+
+
+def get_commit(root: Path) -> str:
+    """Return the commit of a checkout, marked if files differ from it; empty if it is not a checkout."""
+    if not (root / ".git").exists():
+        return ""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        described = subprocess.run(
+            ["git", "--no-optional-locks", "-C", str(root),
+             "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=True,
+        )  # fmt: skip
+        return described.stdout.strip()
+    return ""
+
+
+def read_compiler_versions(library: bytes) -> dict[str, str]:
+    """Return the compiler and the Cython version that a compiled module names, if it names them."""
+    found = {}
+    compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)
+    if compiler:
+        found["compiler"] = compiler[0].decode()
+    cython = re.search(rb"_cython_(\d+)_(\d+)_(\d+)", library)
+    if cython:
+        found["cython"] = ".".join(part.decode() for part in cython.groups())
+    return found

@@ -1,0 +1,591 @@
+"""Measure every solver on every case, in this process or with workers; each record is stored as soon as it is made.
+
+A run with times measures in this process, one solve after the other. A campaign (`CampaignPlan`) measures no times:
+its pairs of case and solver may be distributed over workers, and its records have the same bits with any number of
+them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from lavender.base.arrays import FloatArray, check_sequence
+from lavender.base.errors import InputError, LavenderError, require_packages
+from lavender.problem import Problem, check_problem
+from lavender.report.bench import machine
+from lavender.report.bench.cases import (
+    Item,
+    Source,
+    describe_case,
+    hash_problem,
+    resolve_item,
+    resolve_sources,
+)
+from lavender.report.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
+from lavender.report.bench.running.plan import CampaignPlan, Plan, list_passes
+from lavender.report.bench.running.timing import CallSpec, Task, limit_to_one_thread, measure_task
+from lavender.report.bench.running.worker import Worker
+from lavender.report.bench.running.workers import check_workers, connect_backend, map_unordered
+from lavender.report.bench.store import Records, Store, open_store
+from lavender.solvers import registry
+from lavender.solvers.registry import SolverSpec
+
+# If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
+UNGUARDED_TIME_RATIO = 0.05
+# Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies
+# less.
+MAX_REPEATED_STEPS = 20
+MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
+
+Watch = Callable[["Event"], Any]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Progress of a run.
+
+    Parameters
+    ----------
+    done, total : number of pairs of case and solver, or of other tasks, that are done, and of all; total 0: unknown
+    case, solver : the present task
+    record : the record that was made last
+    reused : whether this record was not measured now
+    remaining : estimate of the remaining time [s]; None if only the counts are known
+    """
+
+    done: int
+    total: int
+    case: str
+    solver: str
+    record: Record | None = None
+    reused: bool = False
+    remaining: float | None = None
+
+
+def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
+    """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
+    check_problem(problem)
+    return problem.carry((before, impulse))
+
+
+def remove_times(record: Record, time_limit: float) -> Record:
+    """Return the record without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
+    nan = math.nan
+    return replace(
+        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
+        calibration_time=None, load=None, backend_time_min=None, time_limit=time_limit,
+    )  # fmt: skip
+
+
+def is_third_party_solver(spec: SolverSpec) -> bool:
+    """Whether a solver is code of another package that a separate process can import by its name."""
+    return spec.from_entry_point or (spec.builtin and (spec.external or bool(spec.requires)))
+
+
+def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
+    """Return the names of the solvers to run: the named ones, each of them installed, or every installed solver.
+
+    Raises
+    ------
+    UnknownName, SolverUnavailable
+    """
+    if names is not None and not isinstance(names, str):
+        names = check_sequence("solvers", names, "names")
+    if names:
+        names = [names] if isinstance(names, str) else names
+        for name in names:
+            registry.get(name)
+        return list(dict.fromkeys(names))
+    return [name for name, spec in sorted(registry.specs().items()) if spec.missing() is None]
+
+
+def run(
+    cases: Source | Iterable[Source] = (),
+    solvers: str | Sequence[str] | None = None,
+    plan: Plan | None = None,
+    store: Store | str | Path | None = None,
+    *,
+    workers: int = 1,
+    backend: str = "loky",
+    watch: Watch | None = None,
+    isolate: bool = True,
+    memory: int | None = None,
+    into: list[Records] | None = None,
+    reuse: bool = True,
+) -> Records:
+    """Measure every solver on every case that it accepts.
+
+    Parameters
+    ----------
+    cases : files, folders, names of the suite, problems
+        Default: `lavender.suite.default()`.
+    solvers : names, optional
+        Default: every installed solver. A solver that refuses a case is skipped with its reason; its bounded variant
+        (`pgs` for `gauss_seidel`) is run instead if there is one, but not in a campaign.
+    plan : Plan, optional
+        Default: `Plan()`, or with several workers or a cluster, which measure no times, `CampaignPlan()`.
+    store : Store or path of a `.jsonl` file, optional
+        Stores each record when it is made; a measurement that it holds from the same machine, versions and plan is not
+        repeated.
+    workers : int
+        Number of processes; 1: this one, -1: one for each core. A cluster determines its own number.
+    backend : str
+        Backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client, or of
+        DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster.
+    watch : callable (Event), optional
+    isolate : bool
+        Run third-party solvers in another process; workers always do.
+    memory : int, bytes, optional
+        Memory limit of that process. Default: half of the machine's memory, shared by the workers here or by the cores
+        of a machine of a cluster.
+    into : list, optional
+        Receives the records before the first is made, so that they are available if the run is interrupted.
+    reuse : bool
+        Do not repeat measurements that `store` holds.
+
+    Returns
+    -------
+    Records
+        New and reused records of this run, in the order of cases and solvers. Records of a campaign have no times.
+
+    Raises
+    ------
+    InputError
+        joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a
+        plan that measures times, or workers were lost repeatedly.
+    """
+    require_packages("a measurement", "joblib", "threadpoolctl")
+    check_workers(workers)
+    spread = workers != 1 or backend != "loky"
+    plan = plan or (CampaignPlan() if spread else Plan())
+    if spread and not plan.campaign:
+        raise InputError(
+            f"workers is {workers}, backend {backend!r}, and the plan measures times, which several workers disturb: "
+            "give a CampaignPlan, or workers=1 with backend 'loky'"
+        )
+    items = resolve_sources(cases)
+    if plan.campaign:
+        items = [replace(item, sequence="", step=-1) for item in items]
+    names = select_solver_names(solvers)
+    packages = {module for name in names for module in registry.specs()[name].requires}
+    this = machine.describe_run(plan.as_dict(), packages)
+    backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
+    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
+        if into is not None:
+            into.append(runner.out)
+        return runner.measure_items(items, workers, backend, memory)
+
+
+@contextlib.contextmanager
+def open_runner(
+    this: Run,
+    plan: Plan,
+    names: list[str],
+    store: Store | str | Path | None,
+    watch: Watch | None = None,
+    isolate: bool = True,
+    memory: int | None = None,
+    reuse: bool = True,
+) -> Iterator[Runner]:
+    """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
+    with (
+        open_store(store) as kept,
+        Worker(memory) as worker,
+        limit_to_one_thread(),
+    ):  # The limit covers the description of cases, which uses BLAS.
+        yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
+
+
+class Runner:
+    """Measures pairs of case and solver. Stored measurements are reused, new ones stored as soon as they are made."""
+
+    def __init__(
+        self,
+        this: Run,
+        plan: Plan,
+        names: list[str],
+        store: Store | None = None,
+        watch: Watch | None = None,
+        worker: Worker | None = None,
+        reuse: bool = True,
+    ) -> None:
+        self.this, self.plan, self.names = this, plan, names
+        self.store, self.watch, self.worker = store, watch, worker
+        self.specs = registry.specs()
+        self.out = Records(source=str(store.path) if store else "")
+        self.done = 0
+        self.total = 0
+        stored = Records() if store is None or not reuse else store.records
+        self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
+        # A campaign reuses stored descriptions of cases: many take longer to describe than to load.
+        self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
+
+    def add_entry(self, entry: Entry) -> None:
+        """Add an entry to the returned records and to the store."""
+        self.out.add(entry)
+        if self.store is not None:
+            self.store.add(entry)
+
+    def report_progress(
+        self, case: str, solver: str, record: Record | None = None, reused: bool = False
+    ) -> None:
+        """Call `watch` with the number of pairs that are done."""
+        if self.watch is not None:
+            self.watch(
+                Event(
+                    done=self.done, total=self.total, case=case, solver=solver, record=record, reused=reused
+                )
+            )
+
+    def measure_items(
+        self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
+    ) -> Records:
+        """Measure every case and sequence; by the workers of a joblib backend if one is named."""
+        self.total = len(items) * len(self.names)
+        self.add_entry(replace(self.this, whole=False))
+        if backend:
+            self.distribute_pairs(items, workers, backend, memory)
+        else:
+            for name, group in _group_sequences(items):
+                if name:
+                    self.measure_sequence(group)
+                else:
+                    self.measure_case(group[0])
+                for item in group:
+                    item.release_problem()
+        self.add_entry(self.this)
+        self.report_progress("", "")
+        return self.out
+
+    def distribute_pairs(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
+        """Measure the pairs of a campaign with workers, and store the entries of each pair when a worker returns them.
+
+        Raises
+        ------
+        InputError
+            Workers were lost `MAX_ATTEMPTS` times.
+        """
+        import joblib
+
+        if backend == "loky" and memory is None:
+            memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
+        local = tuple(
+            spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.from_entry_point)
+        )
+        order = Order(self.plan, self.this, memory, local)
+        known: dict[tuple[str, str], list[Record]] = {}
+        for record in self.known.values():
+            known.setdefault((record.case, record.solver), []).append(record)
+        pairs: list[Pair] = []
+        for item, name in product(items, self.names):
+            # Send a name or path, which the worker reads itself: machines of a cluster share files and suite.
+            source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
+            records = tuple(known.get((item.name, name), ()))
+            info = self.described.get(item.name)
+            pairs.append(
+                Pair(
+                    index=len(pairs),
+                    case=item.name,
+                    source=source,
+                    reason=item.reason,
+                    solver=name,
+                    info=info,
+                    known=records,
+                )
+            )
+        entries: dict[int, list[Entry]] = {}
+        try:
+            for _ in range(MAX_ATTEMPTS):
+                remaining = [p for p in pairs if p.index not in entries]
+                if not remaining:
+                    break
+                calls = ((pair, order) for pair in remaining)
+                for index, new in map_unordered(measure_in_worker, calls, workers, backend):
+                    self.store_new(new)
+                    entries[index], pair = new, pairs[index]
+                    self.done += 1
+                    for record in (entry for entry in new if isinstance(entry, Record)):
+                        self.report_progress(pair.case, pair.solver, record, record.key in self.known)
+                    self.report_progress(pair.case, pair.solver)
+        finally:
+            for index in sorted(entries):
+                for entry in entries[index]:
+                    self.out.add(entry)
+        if len(entries) < len(pairs):
+            raise InputError(
+                f"{len(pairs) - len(entries)} of {len(pairs)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
+                "times; run the same command again, with fewer workers if memory is short"
+            )
+
+    def store_new(self, entries: list[Entry]) -> None:
+        """Store the entries that a worker returned, except the records that are stored already."""
+        for entry in entries:
+            is_stored = isinstance(entry, Record) and entry.key in self.known
+            if self.store is not None and not is_stored:
+                self.store.add(entry)
+
+    def load_case(self, item: Item) -> CaseInfo | None:
+        """Load and describe a case. Return None, with a note in the records, if it does not load."""
+        try:
+            info = self.described.get(item.name)
+            if info is None or info.sha != hash_problem(item.problem):
+                info = describe_case(item, self.this.run)
+        except Exception as error:  # A reader may raise any exception; only its own case is lost.
+            self.add_entry(
+                Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
+            )
+            self.report_progress(item.name, "")
+            return None
+        if not item.sequence:
+            self.add_entry(info)
+        return info
+
+    def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
+        """Measure every solver on a case outside sequences; `info` is its description, if it is known."""
+        if info is not None:
+            self.add_entry(info)
+        else:
+            info = self.load_case(item)
+        for name in self.names:
+            if info is not None:
+                self.report_progress(item.name, name)
+                self.measure_solver(info, item.problem, name)
+            self.done += 1
+
+    def measure_sequence(self, items: list[Item]) -> None:
+        """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
+        infos = [self.load_case(item) for item in items]
+        identity = hashlib.sha256("".join(i.sha for i in infos if i is not None).encode()).hexdigest()[:16]
+        steps = [
+            (item, replace(info, identity=identity))
+            for item, info in zip(items, infos, strict=True)
+            if info is not None
+        ]
+        for _, info in steps:
+            self.add_entry(info)
+        for name in self.names:
+            spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
+            if spec is not None:
+                for call in list_passes(self.plan, spec):
+                    self.report_progress(items[0].sequence, spec.name)
+                    self.measure_pass(steps, spec, call)
+            self.done += len(items)
+
+    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: CallSpec) -> None:
+        """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
+        repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
+        tasks = [
+            Task.from_call_spec(info, call, repeats=repeats, time_limit=self.plan.time_limit)
+            for _, info in steps
+        ]
+        problems = [item for item, _ in steps]
+        limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
+        for task in tasks:
+            record = self.known.get(task.key)
+            if record is None or spent > limit:
+                break
+            spent, made = spent + _get_elapsed_time(record), made + 1
+            self.out.add(record)
+            self.report_progress(task.case, spec.name, record, True)
+        before: tuple[Problem, FloatArray] | None = None
+        if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
+            # If an earlier run was stopped in this pass, repeat its steps without records for the last step's
+            # impulses.
+            for item, task in zip(problems[:made], tasks, strict=False):
+                again = replace(task, repeats=1)
+                before = self.measure_step(item.problem, again, spec, before)[1]
+        while made < len(tasks) and spent <= limit:
+            task = tasks[made]
+            if (
+                record is not None
+                and record.times
+                and record.time_median < UNGUARDED_TIME_RATIO * self.plan.time_limit
+            ):
+                task = replace(task, guarded=False)
+            record, before = self.measure_step(problems[made].problem, task, spec, before)
+            self.add_entry(record)
+            self.report_progress(record.case, spec.name, record)
+            spent, made = spent + _get_elapsed_time(record), made + 1
+        if made < len(tasks):
+            target = describe_target(call.mode, call.tol, call.max_iter)
+            reason = (
+                f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
+                "together (--sequence-time-limit)"
+            )
+            self.add_entry(
+                Skip(self.this.run, f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
+            )
+
+    def measure_step(
+        self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
+    ) -> tuple[Record, tuple[Problem, FloatArray] | None]:
+        """Measure one step; if its task has start "carried", start from the previous problem and impulses."""
+        start = None
+        if task.start == "carried":
+            begun = perf_counter()
+            start = problem.start() if before is None else carry_impulses(*before, problem)
+            task = replace(task, lead=perf_counter() - begun)
+        record, impulse = self.make_record(problem, task, spec, start)
+        return record, None if impulse is None else (problem, impulse)
+
+    def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
+        """Return the solver to run for `name`.
+
+        If it refuses a case, return its bounded variant, or record a note and return None.
+        """
+        spec = self.specs[name]
+        for problem in (item.problem if isinstance(item, Item) else item for item in items):
+            reason = spec.refuses(problem)
+            if reason:
+                break
+        else:
+            return spec
+        # A pair of a campaign has only records of its own solver.
+        other = None if self.plan.campaign else spec.standing_in(problem)
+        if other is not None and other.name in self.names:
+            other = None  # The bounded variant is measured under its own name already.
+        self.add_entry(
+            Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason)
+        )
+        return other
+
+    def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
+        """Measure one solver on one case, at every budget and tolerance."""
+        spec = self.select_solver(info.case, name, [problem])
+        if spec is None:
+            return
+        name = spec.name
+
+        def measure_task(task: Task) -> Record:
+            """Measure one task, or return its record if an earlier run stored it."""
+            record = self.known.get(task.key)
+            reused = record is not None
+            if record is not None:
+                self.out.add(record)
+            else:
+                record = self.make_record(problem, task, spec, None)[0]
+                self.add_entry(record)
+            self.report_progress(info.case, name, record, reused)
+            return record
+
+        self.plan.measure_solver(info, problem, spec, measure_task)
+
+    def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
+        """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
+        if self.plan.campaign and not is_third_party_solver(spec):
+            # In a campaign, a time limit may only end processes of third-party solvers.
+            task = replace(task, time_limit=math.inf)
+        if self.worker is not None and is_third_party_solver(spec):
+            record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
+        else:
+            record, found = measure_task(problem, task, impulse)
+        if found is not None:
+            record = replace(record, solution_hash=hashlib.sha256(found.tobytes()).hexdigest()[:16])
+        return remove_times(record, self.plan.time_limit) if self.plan.campaign else record, found
+
+
+def _get_elapsed_time(record: Record) -> float:
+    """Return the time [s] that a record took, from its fields, so that a resumed pass ends at the same step."""
+    spent = record.time_median * record.repeats
+    return spent if math.isfinite(spent) else record.time_limit
+
+
+def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
+    """Group consecutive items of the same sequence; each item without a sequence is a group with the name ""."""
+    out: list[tuple[str, list[Item]]] = []
+    for item in items:
+        if item.sequence and out and out[-1][0] == item.sequence:
+            out[-1][1].append(item)
+        else:
+            out.append((item.sequence, [item]))
+    return out
+
+
+def describe_load_error(source: str, error: Exception) -> str:
+    """Return the reason why a case is left out, with the type of an unexpected error."""
+    text = str(error)
+    if not isinstance(error, (LavenderError, OSError)):
+        text = f"{type(error).__name__}: {text}"
+    return f"did not load: {text}" if text.startswith(source) else f"did not load: {source}: {text}"
+
+
+# -- pairs of a campaign, in workers -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One case and one solver, as they are sent to a worker."""
+
+    index: int
+    case: str
+    source: str | Problem  # A name or path that the worker resolves itself, or the problem.
+    reason: str
+    solver: str
+    info: CaseInfo | None  # Stored description of the case.
+    known: tuple[Record, ...]  # Stored records of the pair.
+
+
+@dataclass(frozen=True)
+class Order:
+    """Data that all workers need."""
+
+    plan: Plan
+    run: Run
+    # [bytes] Memory limit of each third-party solver's process; None: a share of the machine's.
+    memory: int | None
+    local: tuple[SolverSpec, ...] = ()  # Solvers that are registered only in the parent.
+
+
+@cache
+def _get_isolated_worker(memory: int) -> Worker:
+    """Return the process for third-party solvers; each worker has one, which all of its pairs use."""
+    return Worker(memory)
+
+
+@contextlib.contextmanager
+def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
+    """Register solvers of the parent for one pair: the worker may serve another run later."""
+    before = registry.specs() if specs else {}
+    try:
+        for spec in specs:
+            registry.register(spec, replace=True)
+        yield
+    finally:
+        if specs:
+            registry.registered.clear()
+            registry.registered.update(before)
+
+
+# Source, item and description of the case of the last pair. Pairs of one case are consecutive, so it is loaded once.
+_last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
+
+
+def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
+    """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its entries."""
+    global _last_case
+    shared = machine.get_memory_per_process(os.cpu_count() or 1) if order.memory is None else order.memory
+    with _register_solvers(order.local), limit_to_one_thread(pair.solver):
+        runner = Runner(order.run, order.plan, [pair.solver], worker=_get_isolated_worker(shared))
+        runner.known = {record.key: record for record in pair.known}
+        runner.described = {} if pair.info is None else {pair.case: pair.info}
+        key, item, info = None, None, None
+        if not isinstance(pair.source, Problem):
+            changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
+            key = order.run.run, pair.case, pair.source, changed
+            if _last_case[0] == key:
+                _, item, info = _last_case
+        item = item or resolve_item(pair.source, pair.case, pair.reason)
+        runner.measure_case(item, info)
+    out = runner.out
+    _last_case = key, item, out.cases.get(pair.case)
+    return pair.index, [*out.cases.values(), *out.skips, *out.records]

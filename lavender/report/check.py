@@ -1,0 +1,455 @@
+"""Compare solvers with the judge and with a reference optimum, by default from a QP solver.
+
+If the problem is convex, the distance of two answers is bounded by their residuals. With two answers l1, l2 and their
+errors e1, e2 by the judge, Delta = l1 - l2 and eps = e1 - e2 satisfy
+
+    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
+
+Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
+Cauchy-Schwarz. If A is not symmetric, as in a quadratic program with a singular P, Delta.A Delta >= 0 all the same:
+
+    Delta.A Delta <= |eps.A Delta| + |eps|_D |Delta|_D                                            (2)
+
+A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy norm of the
+difference of velocities, which are unique even if impulses are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import check_sequence
+from lavender.base.errors import InputError, LavenderError, format_error
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
+from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
+from lavender.problem import Problem, check_problem
+from lavender.report.bench.running.worker import TaskFailed, Worker, solve_isolated
+from lavender.solvers.registry import available, get, known, specs
+from lavender.solving.limits import check_budget, check_time_limit
+
+REFERENCES = ("osqp", "clarabel", "piqp", "direct")
+# Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
+CONE_REFERENCES = (
+    "clarabel_cone",
+    "block_gauss_seidel",
+)
+# A reference must reach this relative residual, or 10 times the round-off floor.
+REFERENCE_MAX_RESIDUAL = 1e-9
+
+AGREES = "agrees"
+AGREES_UNCOMPARED = "solved, nothing to compare with"
+PROVED = "no solution, proved"
+# A certificate holds up to rounding: any solution has huge impulses.
+NEAR_NONE = "no solution within rounding"
+# A certificate holds, and another solver's answer meets the tolerance nevertheless.
+INEXACT = "no exact solution"
+NOT_SOLVED = "not solved"
+NOTHING_TO_DO = "nothing to do"
+CLAIM_CONTRADICTED = "claim contradicted"
+UNPROVED = "no solution claimed, not proved"
+BREACH = "breach: a residual is computed wrongly"
+REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class CrossCheckRow:
+    """Comparison of one solver with the reference; a number that does not apply is None.
+
+    Parameters
+    ----------
+    solver : str
+        Name as requested.
+    verdict : str
+    status : str
+    relative, roundoff_floor : float or None
+        Relative residual and its round-off floor, by the judge.
+    velocity : float or None, m/s
+        Velocity error of the worst row, by the judge.
+    distance : float or None, sqrt J
+        |Delta|_A to the reference.
+    allowed : float or None, sqrt J
+        Largest distance that (1) and (2) allow.
+    slack : float or None, m/s
+        Largest difference of a row's slack from the reference's.
+    objective : float or None, J
+        1/2 l.A l - b.l of the solver's impulse l, minus that value for the reference.
+    time : float or None, s
+        Set-up and solve.
+    note : str
+        Operator form, message and reason.
+    ran : str
+        Name of the bounded variant that was run instead, if the requested solver accepts only free rows.
+    solution : Solution or None
+    """
+
+    solver: str
+    verdict: str
+    status: str = ""
+    relative: float | None = None
+    roundoff_floor: float | None = None
+    velocity: float | None = None
+    distance: float | None = None
+    allowed: float | None = None
+    slack: float | None = None
+    objective: float | None = None
+    time: float | None = None
+    note: str = ""
+    ran: str = ""
+    solution: Solution | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the judge contradicts the solver's claim, or inequality (1) is violated."""
+        return self.verdict in (CLAIM_CONTRADICTED, BREACH)
+
+
+@dataclass(frozen=True, repr=False)
+class CrossCheck:
+    """Result of `cross_check`; iterates over its rows, and `str()` gives a plain-text table.
+
+    Parameters
+    ----------
+    problem : Problem
+    tol : float
+    reference : str or None
+        Name of the solver of the reference; None without one.
+    reference_note : str
+        Quality of the reference, or the reason why there is none.
+    rows : tuple of CrossCheckRow
+    """
+
+    problem: Problem
+    tol: float
+    reference: str | None
+    reference_note: str
+    rows: tuple[CrossCheckRow, ...]
+
+    def __iter__(self) -> Iterator[CrossCheckRow]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, solver: str) -> CrossCheckRow:
+        for row in self.rows:
+            if row.solver == solver:
+                return row
+        raise InputError(
+            f"no solver {solver!r} in this check; it has {', '.join(r.solver for r in self.rows)}"
+        )
+
+    @property
+    def contradicted(self) -> tuple[CrossCheckRow, ...]:
+        """Rows with a contradicted claim."""
+        return tuple(row for row in self.rows if row.contradicted)
+
+    @property
+    def agreed(self) -> tuple[CrossCheckRow, ...]:
+        """Rows that agree with the reference."""
+        return tuple(row for row in self.rows if row.verdict == AGREES)
+
+    @property
+    def unsolved(self) -> tuple[CrossCheckRow, ...]:
+        """Rows of solvers that do not solve the problem, or claim without proof that it has no solution."""
+        return tuple(row for row in self.rows if row.verdict in (NOT_SOLVED, UNPROVED))
+
+    @property
+    def refused(self) -> tuple[CrossCheckRow, ...]:
+        """Rows of solvers that do not accept the problem; their notes give the reason."""
+        return tuple(row for row in self.rows if row.verdict == REFUSED)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all solvers that accept the problem solve it and agree with the reference; False if none does.
+
+        Without a reference nothing is compared: `reference` is None, as always under Coulomb's law, and solvers may
+        have found different motions.
+        """
+        verdicts = {row.verdict for row in self.rows} - {REFUSED}
+        return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO}
+
+    def __repr__(self) -> str:
+        return f"<CrossCheck of {len(self)} solvers: {len(self.agreed)} agree, {len(self.unsolved)} did not solve it>"
+
+    def _repr_html_(self) -> str:
+        """Return the table for notebooks."""
+        rows = ("".join(f"<td>{escape(text)}</td>" for text in line) for line in self._cells)
+        return f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+    @property
+    def _cells(self) -> list[Any]:
+        """Texts of the table, beginning with the heads of its columns."""
+        head = (
+            "solver", "verdict", "status", "relative", "floor", "error [m/s]", "distance [√J]", "allowed [√J]",
+            "objective [J]", "time [ms]", "what ran",
+        )  # fmt: skip
+        return [head] + [
+            (
+                f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
+                _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.velocity),
+                _format_number(r.distance), _format_number(r.allowed), _format_number(r.objective),
+                "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
+            )
+            for r in self.rows
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
+        lines = [
+            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in self._cells
+        ]
+        name = self.problem.name or f"{self.problem.m} rows"
+        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
+        return "\n".join(
+            [f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}", *lines]
+        )
+
+
+def _format_number(x: float | None) -> str:
+    """Format a number, or nothing."""
+    return "" if x is None else f"{x:.1e}"
+
+
+def cross_check(
+    problem: Problem,
+    solvers: Iterable[str] | None = None,
+    reference: str = "osqp",
+    *,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+) -> CrossCheck:
+    """Solve from the zero impulse with every solver, and compare each with a judged reference.
+
+    The judged relative residual of the reference must be at most max(1e-9, 10 floor), with the round-off floor, and at
+    most 1e-5. Otherwise the next solver of osqp, clarabel, piqp, direct (relaxed friction: clarabel_cone,
+    block_gauss_seidel) computes the reference; the result names it.
+
+    Parameters
+    ----------
+    problem : Problem
+    solvers : names, optional
+        Default: all available solvers that accept the problem.
+    reference : str
+        Solver that is tried first as the reference. Under Coulomb's law it is not used; `reference_note` of the result
+        states the reason.
+    tol : float
+        Relative residual tolerance of the solvers.
+    max_iter : int, optional
+        Largest number of iterations of each solver; default: the solver's own.
+    time_limit : float, optional, s
+        Time limit of each solver; a solver that cannot be interrupted ignores it.
+
+    Returns
+    -------
+    CrossCheck
+        If a solver accepts only free rows, its bounded variant is run ("gauss_seidel → pgs"), and `ran` names it.
+        Distances, slack and objective are computed only for symmetric positive semidefinite A without Coulomb friction
+        and for quadratic programs.
+
+    Raises
+    ------
+    UnknownName
+        A solver or reference does not exist.
+    InputError
+        `tol` or a limit is invalid.
+    """
+    check_problem(problem)
+    check_budget(specs()["auto"], tol, max_iter)
+    check_time_limit(time_limit)
+    if problem.guess is not None:  # All solvers start from the zero impulse.
+        problem = replace(problem, guess=None, copy=False)
+    if isinstance(solvers, str):
+        solvers = [solvers]
+    names = available(problem) if solvers is None else check_sequence("solvers", solvers, "names")
+    reasons = known(problem)
+    for name in (reference, *names):
+        if not isinstance(name, str) or name not in reasons:
+            get(name)  # Raises UnknownName with similar names.
+    with Worker() as worker:
+        run_solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
+        optimum, reference_solver, note = _solve_reference(problem, reference, reasons, run_solver)
+        run_solver = partial(run_solver, tol=tol, max_iter=max_iter)
+        rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
+    if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
+        rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
+    return CrossCheck(problem, tol, reference_solver, note, tuple(rows))
+
+
+def _check_solver(
+    problem: Problem,
+    name: str,
+    reason: str | None,
+    optimum: Solution | None,
+    run_solver: Callable[..., Solution],
+) -> CrossCheckRow:
+    """Run one solver and compare its solution with `optimum`.
+
+    `reason` says why the solver does not accept the problem; its bounded variant runs instead, if it has one.
+    """
+    other = None if reason is None else specs()[name].standing_in(problem)
+    if reason is not None and other is None:
+        return CrossCheckRow(name, REFUSED, note=reason)
+    run = name if other is None else other.name
+    try:
+        solution = raise_if_interrupted(run_solver(run))
+    except Exception as error:
+        if isinstance(error, TaskFailed):
+            return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
+        if isinstance(error, LavenderError) and not isinstance(error, InputError):
+            # The solver rejected the numbers of the problem.
+            return CrossCheckRow(name, REFUSED, note=str(error))
+        if get(run).builtin:
+            raise
+        # A plug-in may raise any exception; only its own row is lost.
+        return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
+    return replace(compare_with_reference(problem, name, solution, optimum), ran="" if other is None else run)
+
+
+def _solve_reference(
+    problem: Problem, first: str, reasons: dict[str, str | None], run_solver: Callable[..., Solution]
+) -> tuple[Solution | None, str | None, str]:
+    """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
+    if problem.law == "coulomb":
+        reason = reasons.get(first, "not registered")
+        if reason is None:
+            reason = "solves it, but several motions may be solutions, so a distance to one of them is not an error"
+        return (
+            None,
+            None,
+            f"as Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
+        )
+    if not (problem.has_singular_program or problem.is_symmetric):
+        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
+    if not (problem.has_singular_program or problem.is_semidefinite):
+        return (
+            None,
+            None,
+            "A is not positive semidefinite: several solutions with different motions may exist",
+        )
+    defaults = CONE_REFERENCES if problem.law == "cone" else REFERENCES
+    chain = (first, *(r for r in defaults if r != first))
+    failed = []
+    for name in chain:
+        reason = reasons.get(name, "not registered")
+        if reason is not None:
+            failed.append(f"{name} {reason}")
+            continue
+        spec = get(name)
+        try:
+            # A reference may use 100 times the solver's default number of iterations.
+            budget = 100 * spec.max_iter if spec.resumable else None
+            solution = raise_if_interrupted(
+                run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)
+            )
+        except Exception as error:
+            if spec.builtin and not isinstance(error, LavenderError):
+                raise
+            failed.append(f"{name}: {format_error(error)}")
+            continue
+        r = solution.residual
+        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
+        if r.relative <= needed:
+            note = f"relative {r.relative:.1e}"
+            return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
+        failed.append(f"{name}: relative {r.relative:.1e} above {needed:.1e}")
+    return None, None, "; ".join(failed)
+
+
+def compare_with_reference(
+    problem: Problem, name: str, solution: Solution, optimum: Solution | None
+) -> CrossCheckRow:
+    """Compare one solver's solution with the optimum and build its row."""
+    r = solution.residual
+    note = "; ".join(
+        x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x
+    )
+    fields: dict[str, Any] = {
+        "status": solution.status.name,
+        "relative": r.relative,
+        "roundoff_floor": r.roundoff_floor,
+        "velocity": r.velocity,
+        "time": solution.setup_time + solution.solve_time,
+        "solution": solution,
+    }
+    verdict, breached = AGREES_UNCOMPARED, False
+    if optimum is not None and np.isfinite(solution.impulse).all():
+        with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
+            distance, allowed = compute_separation(problem, solution, optimum)
+            fields |= {
+                "distance": distance,
+                "allowed": allowed,
+                "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
+                "objective": _compute_objective(problem, solution) - _compute_objective(problem, optimum),
+            }
+        verdict, breached = AGREES, distance > allowed
+    if breached:
+        verdict = BREACH
+    elif solution.claim_check == CONTRADICTED:
+        verdict, note = CLAIM_CONTRADICTED, f"{solution.status_conflict}; {note}".rstrip("; ")
+    elif solution.claim_check == NOT_PROVEN:
+        verdict = UNPROVED
+    elif solution.status is Status.INFEASIBLE:
+        verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
+    elif r.nothing_to_do and r.verdict != WRONG:
+        units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
+        verdict, note = NOTHING_TO_DO, f"{units}; {note}".rstrip("; ")
+    elif not (solution.success or r.at_floor):
+        verdict = NOT_SOLVED
+    return CrossCheckRow(name, verdict, note=note, **fields)
+
+
+def _compute_objective(problem: Problem, solution: Solution) -> float:
+    """Compute the objective 1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
+    if problem.has_singular_program:
+        return float(problem.qp.solution(solution).objective)
+    lam = solution.impulse
+    return float(0.5 * (lam @ (solution.slack - problem.b)))
+
+
+def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
+    """Compute |Delta|_A [sqrt J] of two judged answers and the largest value that (1), (2) allow, with rounding."""
+    delta = problem.on_disk(one.impulse - two.impulse)
+    eps = problem.on_disk(one.residual.error - two.residual.error)
+    problem = problem.disk
+    d: Any = problem.d
+    a_delta, a_eps = _multiply_by_a(problem, delta), _multiply_by_a(problem, eps)
+    delta_norm = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    # The errors e are known up to the round-off floors of both residuals, in the norm of D.
+    uncertainty = float(sum(s.residual.floor_energy for s in (one, two)))
+    root = 1.0 / np.sqrt(d)
+    max_stiffness = float(np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0)))
+    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + uncertainty
+    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + max_stiffness * uncertainty
+    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    if problem.has_singular_program:
+        allowed_square = (
+            abs(eps @ a_delta) + uncertainty * np.sqrt(np.sum((root * a_delta) ** 2)) + eps_d * delta_d
+        )
+        rounding_square = 2.0**-50 * (max_stiffness * delta_d) ** 2
+        return delta_norm, float(np.sqrt((1.0 + 1e-9) * allowed_square + rounding_square))
+    # x^2 <= x eps_a + eps_d delta_d bounds x = |Delta|_A by the larger root. `rounding` is the error of Delta.A Delta.
+    rounding = 2.0**-50 * max_stiffness * delta_d
+    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
+    return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
+
+
+def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
+    """Compute A x (m,), without forming A if J and M are known.
+
+    `transform` is applied to the entries of each factor; with `abs`, the result is a bound of |A| x for x >= 0.
+    """
+    if problem.generalized is not None:
+        y = transform(problem.whitened)
+        return y @ (y.T @ x) + problem.compliance * x
+    if problem.rows is None:
+        return transform(problem.csr) @ x
+    assert problem.compliance is not None
+    jac = transform(problem.jacobian)
+    return jac @ (transform(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x

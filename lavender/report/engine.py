@@ -1,0 +1,144 @@
+"""Read and rank the answers of the engine that recorded a folder of steps.
+
+The judge computes the residuals of these answers, as of all results. The engine measures the time itself: the time
+includes neither a copy of the problem nor the judge, and the engine starts from its previous step. `rank_engine` ranks
+the engine as solvers are ranked: by the number of cases solved to a tolerance, then by the mean time.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG
+from lavender.report.bench.recommendation import Choice
+from lavender.report.bench.record import escape_unprintable
+from lavender.report.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_penalty_time_of_miss
+from lavender.report.bench.store import Records
+
+_NUMERIC_KEYS = ("rows", "seconds", "relative")
+INSIDE = "inside the engine, warm-started, without copy and judge"
+
+
+@dataclass(frozen=True)
+class EngineAnswers:
+    """Answers of an engine to one folder of recorded steps.
+
+    Parameters
+    ----------
+    folder, source : name of the folder, and its path as in the records
+    solver : solver of the engine
+    steps, left_out : recorded steps, and steps that could not be recorded
+    rows : median number of rows
+    relative, worst : median and largest relative residual [-]
+    above_floor : answers above the round-off floor
+    unconverged : number of answers with an error above the recording's threshold [m/s] that rounding does not explain
+    velocity, where : largest velocity error of a row [m/s], nan if it was not recorded; and the name of that row
+    answers : time inside the engine [s] and relative residual by file name
+    """
+
+    folder: str
+    source: str
+    solver: str
+    steps: int
+    left_out: int
+    rows: float
+    relative: float
+    worst: float
+    above_floor: int
+    unconverged: int
+    velocity: float
+    where: str
+    answers: Mapping[str, tuple[float, float]]
+
+
+def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:
+    """Read the engine's answers in the folders among `sources`, and in the folders of the records' files.
+
+    Lines that cannot be read are left out.
+    """
+    parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
+    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, sources), *parents]))
+    return [engine for engine in engines if engine is not None]
+
+
+def _read_folder(folder: Path) -> EngineAnswers | None:
+    """Read the answers in one folder; return None if it has none."""
+    path = folder / ENGINE
+    if not path.is_file():
+        return None
+    entries, left_out, answers = [], 0, {}
+    for line in read_whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
+        try:
+            entry = json.loads(line)
+            left_out += "left_out" in entry
+            rows, time, relative = (float(entry[name]) for name in _NUMERIC_KEYS)
+            row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
+            verdict = str(entry["verdict"])
+            entries.append((rows, relative, row, verdict, escape_unprintable(str(entry["solver"]))))
+            if math.isfinite(time) and time >= 0.0:
+                answers[escape_unprintable(str(entry.get("file", "")))] = time, relative
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+    if not entries:
+        return None
+    sizes, relatives, worst_rows, verdicts, solvers = zip(*entries, strict=True)
+    velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
+    return EngineAnswers(
+        folder=folder.name,
+        source=escape_unprintable(str(folder)),
+        solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
+        steps=len(entries),
+        left_out=left_out,
+        rows=float(np.median(sizes)),
+        relative=float(np.median(relatives)),
+        worst=float(np.max(relatives)),
+        above_floor=sum(verdict != AT_FLOOR for verdict in verdicts),
+        unconverged=sum(verdict in (UNCONVERGED, WRONG) for verdict in verdicts),
+        velocity=velocity,
+        where=escape_unprintable(where),
+        answers=answers,
+    )
+
+
+def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
+    """Return the cases of the records that are files of the engine's folder."""
+    sources = {name: Path(info.source) for name, info in records.cases.items()}
+    return tuple(name for name, path in sources.items() if str(path.parent) == engine.source)
+
+
+def rank_engine(
+    engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], tolerance: float
+) -> Choice | None:
+    """Return the result of the engine that answered these cases, to be ranked with the solvers to a tolerance.
+
+    Return None if no engine answered every case.
+    """
+    answers: dict[str, tuple[float, float]] = {}
+    solvers: dict[str, None] = {}
+    for engine in engines:
+        for name in cases:
+            source = Path(records.cases[name].source)
+            if str(source.parent) == engine.source and source.name in engine.answers:
+                answers[name] = engine.answers[source.name]
+                solvers[engine.solver] = None
+    if not cases or len(answers) < len(cases):
+        return None
+    times = {name: time if relative <= tolerance else math.inf for name, (time, relative) in answers.items()}
+    limit = get_penalty_time_of_miss(records)
+    score = compute_geometric_mean(
+        [t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT
+    )
+    solved = sum(map(math.isfinite, times.values()))
+    return Choice.from_case_values(" and ".join(solvers), times, solved, score)
+
+
+def is_ranked_before(one: Choice, other: Choice) -> bool:
+    """Return whether one solver ranks before another: it solves more cases, or as many in less time."""
+    return (-one.solved, one.score) < (-other.solved, other.score)

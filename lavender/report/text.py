@@ -1,0 +1,160 @@
+"""Format numbers and short texts of a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from lavender.report.bench.record import Record, Skip
+from lavender.report.bench.store import Records
+
+TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
+NONE = "–"  # Shown in place of a missing number.
+
+
+#: By `Record.timing_mode`: title of an axis for these times.
+TIMED_CODE = {
+    "call": "time of a call [s]",
+    "steps": "time of a call [s]",
+    "batch": "time per problem [s]",
+    "": "time of set-up and solve [s]",
+}
+
+
+def make_time_axis_title(runs: Iterable[Record]) -> str:
+    """Return the title of an axis for the times of some runs."""
+    titles = {TIMED_CODE[r.timing_mode] for r in runs if r.is_usable}
+    return titles.pop() if len(titles) == 1 else "time [s]"
+
+
+def format_residual(x: float) -> str:
+    """Return two digits: 3.4e-7; inf and nan as words."""
+    if not math.isfinite(x):
+        return str(x)
+    if x == 0.0:
+        return "0"
+    mantissa, _, exponent = f"{x:.1e}".partition("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def format_size(x: float) -> str:
+    """Return two digits, without an exponent for usual sizes: 24, 0.31, 3.4e-7."""
+    return f"{x:.2g}" if 0.05 <= x < 99.5 else format_residual(x)
+
+
+def format_sizes(values: Sequence[float]) -> list[str]:
+    """Return two digits of each number: without exponents if no number needs one, else all with exponents."""
+    known = [x for x in values if math.isfinite(x) and x != 0.0]
+    write = format_size if all("e" not in format_size(x) for x in known) else format_residual
+    return [write(x) if math.isfinite(x) and x != 0.0 else "0" if x == 0.0 else NONE for x in values]
+
+
+def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
+    """Return one unit for some times [s], and each time in this unit with three digits."""
+    known = [t for t in values if math.isfinite(t) and t > 0.0]
+    middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 1.0
+    scale, unit = next((u for u in TIME_UNITS if middle >= 0.9995 * u[0]), TIME_UNITS[-1])
+    return unit, [format_significant_digits(t / scale) if math.isfinite(t) else NONE for t in values]
+
+
+def format_significant_digits(x: float, digits: int = 3) -> str:
+    """Return a number with `digits` significant digits and without an exponent: 0.0652, 16.0, 1020."""
+    if x == 0.0:
+        return "0"
+    rounded = float(f"{x:.{digits - 1}e}")
+    return f"{rounded:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
+
+
+def format_ratio(x: float) -> str:
+    """Return a ratio in words: "2.0 times", "850 times"; from a million on, as a power of ten: "1e8 times"."""
+    if not math.isfinite(x):
+        return NONE
+    if x >= 1e6:
+        return f"1e{math.log10(x):.0f} times"
+    return f"{format_significant_digits(x, 2) if x < 99.5 else f'{x:.0f}'} times"
+
+
+def format_count(n: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: 1 contact, 2 contacts."""
+    return f"{n} {noun if n == 1 else plural or noun + 's'}"
+
+
+def list_diagnostics(records: Records) -> list[tuple[str, str]]:
+    """Return (case, possible mistake in its data) for all cases.
+
+    Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
+    """
+    seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, info in records.cases.items():
+        for diagnostic in info.diagnostics:
+            kind = diagnostic.partition(":")[0]
+            seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
+    return [
+        (
+            f"{some[0][0]} and {format_count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0],
+            some[0][1],
+        )
+        for some in seen.values()
+    ]
+
+
+def _get_skip_reason(skip: Skip) -> str:
+    """Return the reason of a skip without the name of its case, so that equal reasons can be grouped."""
+    return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
+
+
+def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
+    """Return each different reason of some skips; if it holds for several cases, with their number."""
+    same: dict[str, list[Skip]] = {}
+    for skip in skips:
+        same.setdefault(_get_skip_reason(skip), []).append(skip)
+    cases = {cause: len({skip.case for skip in some}) for cause, some in same.items()}
+    return [
+        some[0].reason if cases[cause] == 1 else f"{cause} ({cases[cause]} cases)"
+        for cause, some in same.items()
+    ]
+
+
+def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
+    """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
+    same: dict[str, list[Skip]] = {}
+    for skip in records.left_out.get("", ()):
+        same.setdefault(_get_skip_reason(skip), []).append(skip)
+    single = [
+        (some[0].case, some[0].reason)
+        if len(some) == 1
+        else (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", cause)
+        for cause, some in same.items()
+    ]
+    steps = {
+        f"{format_count(len(some), 'step')} of {name}": some
+        for name, some in records.left_out.items()
+        if name
+    }
+    return [*single, *((n_steps, some[0].reason) for n_steps, some in steps.items())]
+
+
+def format_left_out_count(lost: int) -> str:
+    """Return a remark in parentheses that `lost` cases are left out of a number; empty if none is left out."""
+    return f" ({lost} left out)" if lost else ""
+
+
+def format_percent(part: int, whole: int, digits: int = 0) -> str:
+    """Return a percentage with at least `digits` decimals, rounded down.
+
+    More decimals are used if necessary, so that only part = whole gives 100 % and only part = 0 gives 0 %.
+    """
+    while 0 < 100 * 10**digits * part < whole:
+        digits += 1
+    tenths = 100 * 10**digits * part // whole
+    return f"{tenths / 10**digits:.{digits}f} %"
+
+
+def format_solved_share(solved: int, cases: int) -> str:
+    """Return the number of solved cases of all cases as "(7/8)"; empty if all are solved."""
+    return "" if solved == cases else f" ({solved}/{cases})"
+
+
+def format_run_name(solver: str, start: str) -> str:
+    """Return a solver's name with its start in parentheses, as in "newton (warm)"; a cold start is not named."""
+    return solver if start == "cold" else f"{solver} ({start})"

@@ -1,0 +1,284 @@
+"""A test case: a problem, the property that it tests, its known solution; and case names with parameters."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ParamSpec
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, check_float
+from lavender.base.errors import InputError, UnknownName
+from lavender.problem import Problem
+from lavender.problem.derived import cached_property
+
+P = ParamSpec("P")
+MAX_SIZE = 10**7  # Larger integer parameters are rejected: they are typing errors and would fill the memory.
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A solution that is known independently of this package's solvers.
+
+    Parameters
+    ----------
+    impulse : (m,) N s, or None
+        The solution, rounded to float64; None if the problem has no solution.
+    source : str
+        Method by which the solution was obtained, e.g. "closed form".
+    compare : {"impulse", "slack", "error", "nothing"}
+        Quantity that tests compare because it is unique: "impulse" (and the slack), "slack" (if A is singular),
+        "error" (if neither is unique, only the judge's residual), "nothing" (if there is no solution).
+    certificate : (m,) or None
+        Proof that there is no solution.
+    """
+
+    impulse: FloatArray | None
+    source: str
+    compare: str = "impulse"
+    certificate: FloatArray | None = None
+
+
+@functools.cache
+def load_references() -> dict[str, dict[str, str]]:
+    """Load the solutions of `references.json`, which have no closed form, by case name.
+
+    Each has "impulse", the m decimal numbers [N s] with up to 31 digits, "sha", the hash of the problem's data, and
+    "source" and "compare" as in `Reference`.
+    """
+    text = Path(__file__).with_name("references.json").read_text(encoding="ascii")
+    return {entry["name"]: entry for entry in json.loads(text)}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One problem of the suite.
+
+    Parameters
+    ----------
+    name : str
+        A name such as "pyramid(k=10, mass_ratio=1e6)"; `case(name)` builds the case again.
+    problem : Problem
+    reason : str
+        The property that the case tests, in one line.
+    family : str
+        Name of the function that builds the case.
+    parameters : mapping
+        Parameters of that function.
+    expect : str
+        Description of the result that solvers should have.
+    solve_reference : callable, optional
+        Computes the reference if it has a closed form.
+    """
+
+    name: str
+    problem: Problem
+    reason: str
+    family: str
+    parameters: Mapping[str, Any]
+    expect: str = ""
+    solve_reference: Callable[[], Reference] | None = field(default=None, repr=False)
+
+    @cached_property
+    def reference(self) -> Reference | None:
+        """Known solution, or None if only the judge can assess an answer."""
+        if self.solve_reference is not None:
+            return self.solve_reference()
+        stored = load_references().get(self.name)
+        if stored is None:
+            return None
+        impulse = np.array([float(digits) for digits in stored["impulse"].split()])
+        return Reference(impulse, stored["source"], stored["compare"])
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and unpickle a case by building it again."""
+        from lavender.suite import case
+
+        return case, (self.name,)
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """Return value of a family function; the decorator `register_family` adds name and parameters."""
+
+    problem: Problem
+    reason: str
+    reference: Callable[[], Reference] | None = None
+    expect: str = ""
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family function under one of its names.
+
+    Parameters
+    ----------
+    name : str
+    make : callable
+        Builds the case of all parameters.
+    signature : inspect.Signature
+        Signature of the family function.
+    preset : mapping
+        Parameters that the name fixes, e.g. friction="coulomb".
+    summary : str
+        First line of the function's docstring.
+    """
+
+    name: str
+    make: Callable[..., Case]
+    signature: inspect.Signature
+    preset: Mapping[str, Any]
+    summary: str
+
+    def build_case(self, **parameters: Any) -> Case:
+        """Build the case of these parameters; parameters that are not given have their defaults."""
+        known = [name for name in self.signature.parameters if name not in self.preset]
+        for name in parameters:
+            if name not in known:
+                raise UnknownName(f"parameter of {self.name}", name, known)
+        return self.make(**self.preset, **parameters)
+
+
+FAMILIES: dict[str, Family] = {}
+
+
+def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
+    """Register a function under its name, and under aliases with some parameters fixed."""
+
+    def decorate(function: Callable[P, Draft]) -> Callable[P, Case]:
+        """Wrap the function so that it returns a `Case`, and register it."""
+        name = function.__name__
+        signature = inspect.signature(function, eval_str=True)
+        summary = (function.__doc__ or "").partition("\n")[0]
+
+        @functools.wraps(function)
+        def make(*args: P.args, **kwargs: P.kwargs) -> Case:
+            bound = signature.bind(*args, **kwargs)
+            explicit = frozenset(bound.arguments)
+            bound.apply_defaults()
+            values = {
+                n: _convert_parameter(name, signature.parameters[n], v) for n, v in bound.arguments.items()
+            }
+            text = _format_case_name(name, values, explicit)
+            try:
+                draft = function(**values)  # type: ignore[call-arg]
+            except MemoryError as error:
+                raise InputError(
+                    f"{text}: there is not enough memory ({str(error) or 'none left'}); give smaller parameters"
+                ) from None
+            return Case(
+                name=text,
+                problem=replace(draft.problem, name=text, copy=False),
+                reason=draft.reason,
+                family=name,
+                parameters=MappingProxyType(values),
+                expect=draft.expect,
+                solve_reference=draft.reference,
+            )
+
+        for alias, preset in {name: {}, **aliases}.items():
+            FAMILIES[alias] = Family(alias, make, signature, MappingProxyType(dict(preset)), summary)
+        return make
+
+    return decorate
+
+
+def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> Any:
+    """Convert a value to the type that the signature declares, or raise InputError."""
+    expected_type = parameter.annotation
+    prefix = f"{name}: {parameter.name} is {value!r}"
+    if expected_type is str:
+        if not isinstance(value, str):
+            raise InputError(f"{prefix}; a word is needed, such as kind=zero")
+        return value
+    converted = check_float(f"{name}: {parameter.name}", value)
+    if expected_type is int:
+        if converted != int(converted) or not 0 <= converted <= MAX_SIZE:
+            raise InputError(f"{prefix}; a whole number from 0 to {MAX_SIZE} is needed")
+        return int(converted)
+    return converted
+
+
+def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
+    """Return the canonical name of a case; it has the parameters that are `explicit` or differ from their defaults."""
+    best = name
+    preset: Mapping[str, Any] = {}
+    for alias in FAMILIES.values():
+        fixed = alias.preset
+        if alias.make.__name__ == name and fixed and all(values.get(n) == v for n, v in fixed.items()):
+            best, preset = alias.name, fixed
+    parameters = FAMILIES[name].signature.parameters
+    shown = [
+        f"{n}={format_parameter_value(v)}"
+        for n, v in values.items()
+        if n not in preset and (n in explicit or v != parameters[n].default)
+    ]
+    return f"{best}({', '.join(shown)})" if shown else best
+
+
+def format_parameter_value(value: Any) -> str:
+    """Return the shortest text of a value that is read back as the same number, for a case name."""
+    if not isinstance(value, float):
+        return str(value)
+    mantissa, _, exponent = f"{value:.16e}".partition("e")
+    spellings = [repr(value), f"{value:.17g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"]
+    mantissa, _, exponent = repr(value).partition("e")
+    if exponent:
+        spellings.append(f"{mantissa}e{int(exponent)}")
+    return min((s for s in spellings if float(s) == value), key=len)
+
+
+def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
+    """Split "pyramid(k=10, mass_ratio=1e6)" into name and parameters; strings need no quotes.
+
+    Raises
+    ------
+    InputError
+        The text is not a name with parameters in brackets.
+    """
+    problem = InputError(
+        f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
+    )
+    if not isinstance(text, str):
+        raise problem
+    try:
+        node = ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise problem from None
+    if isinstance(node, ast.Name):
+        return node.id, {}
+    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or node.args:
+        raise problem
+    values: dict[str, Any] = {}
+    for keyword in node.keywords:
+        if keyword.arg is None or keyword.arg in values:
+            raise problem
+        values[keyword.arg] = _evaluate_parameter(keyword.value, problem)
+    return node.func.id, values
+
+
+def _evaluate_parameter(node: ast.expr, problem: InputError) -> Any:
+    """Evaluate a literal or a bare word of a parameter; raise `problem` for anything else."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        value = _evaluate_parameter(node.operand, problem)
+        if isinstance(value, (int, float)):
+            return -value
+    if (
+        isinstance(node, ast.Constant)
+        and isinstance(node.value, (int, float, str))
+        and not isinstance(node.value, bool)
+    ):
+        return node.value
+    raise problem

@@ -1,0 +1,574 @@
+"""Every step of many worlds judged: MuJoCo's own answers, which stopped before convergence, and the worst states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calls import BOXES
+from calls import EARLY_BOXES as EARLY
+from mujoco_scene import mj, whole_mass
+
+import lavender as lv
+from lavender.audit import audit as module
+from lavender.audit import simulated_worlds
+from lavender.audit.audit import AUDIT_VERDICTS, audit
+from lavender.audit.simulated_worlds import Frame, Runs
+from lavender.io.efc import from_efc
+from lavender.io.states import read_states
+
+
+def own_errors(path, world, steps, seed=0, spread=0.1):
+    """The judge on the forward pass of each step, in the run itself, by the importer of one problem."""
+    made = mj.MjModel.from_xml_path(str(path))
+    data, rng = mj.MjData(made), np.random.default_rng(seed + world)
+    if world:
+        data.qvel[:] += spread * np.random.default_rng([seed, world]).standard_normal(made.nv)
+    out = []
+    for _ in range(steps):
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, made.nu)
+        mj.mj_forward(made, data)
+        out.append(lv.residual(lv.io.from_mujoco(made, data), lv.io.mujoco.impulse(made, data)))
+        mj.mj_step(made, data)
+    return out
+
+
+@pytest.mark.parametrize("options", [EARLY, f'{EARLY} cone="elliptic"', EARLY + ' jacobian="sparse"'])
+def test_numbers_are_those_of_the_run_itself(boxes, options):
+    path = boxes(options)
+    found = audit(path, worlds=2, steps=30, workers=1)
+    for world in range(2):
+        want = own_errors(path, world, 30)
+        np.testing.assert_allclose(found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12)
+        pushes = [abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0 for r in want]
+        np.testing.assert_allclose(found.numbers[1, world], pushes, rtol=1e-6, atol=1e-12)
+        assert found.is_unconverged[world].tolist() == [
+            r.verdict in ("stopped before convergence", "wrong") for r in want
+        ]
+    assert found.is_unconverged.any()
+
+
+def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes, monkeypatch):
+    monkeypatch.setattr(module, "DEFAULT_DURATION", 0.5)
+    events = []
+    found = audit(boxes(EARLY), steps=20, workers=1, watch=events.append)
+    assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.n_judged == 20 * found.runs.worlds
+    assert (events[0].case, events[1].remaining) == ("timing one world", 0.5)
+    assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[1:])
+    assert events[-1].done == events[-1].total == 20 * found.runs.worlds
+    same = audit(boxes(EARLY), worlds=found.runs.worlds, steps=20, workers=1)
+    assert same.numbers.tobytes() == found.numbers.tobytes()
+
+
+def test_a_busy_machine_is_named_and_changes_no_error(boxes, monkeypatch):
+    cores = module.os.cpu_count()
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: cores + 9.0)
+    found = audit(boxes(EARLY), worlds=1, steps=5, workers=1)
+    assert "The machine was busy" in found.busy and "errors do not depend on the load" in found.busy
+    assert found.busy == found.summary_page.warning
+    monkeypatch.setattr(module.machine, "count_runnable_processes", lambda: 2.0)  # a worker and this process
+    assert not audit(boxes(EARLY), worlds=1, steps=5, workers=1).busy
+
+
+def test_workers_change_no_bit(boxes, monkeypatch):
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
+    path = boxes(EARLY)
+    one, two = (audit(path, worlds=4, steps=20, workers=n) for n in (1, 2))
+    assert one.numbers.tobytes() == two.numbers.tobytes()
+    assert one.where == two.where
+    assert [(w.world, w.step) for w in one.worst] == [(w.world, w.step) for w in two.worst]
+
+
+def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
+    path = boxes(EARLY)
+    found = audit(path, worlds=3, steps=25, workers=1)
+    found.write(tmp_path / "out")
+    made = mj.MjModel.from_xml_path(str(path))
+    states = np.load(tmp_path / "out" / "states.npz")
+    speeds = np.where(found.is_unconverged, found.numbers[0], 0.0)
+    assert states["world"].tolist() == np.argsort(-speeds.max(axis=1)).tolist()
+    for i, (world, step) in enumerate(zip(states["world"], states["step"], strict=True)):
+        stored = lv.io.read(tmp_path / "out" / "worst" / f"worst_{i + 1}.npz")
+        assert lv.residual(stored.problem, stored.impulse).velocity == pytest.approx(speeds[world].max())
+        data = mj.MjData(made)
+        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+            getattr(data, name)[:] = states[name][i]
+        mj.mj_forward(made, data)
+        np.testing.assert_allclose(lv.io.mujoco.impulse(made, data), stored.impulse, rtol=1e-9, atol=1e-12)
+        assert speeds[world].argmax() == step
+
+
+def make_frames(change):
+    """Return frames of another engine: those of MuJoCo, with `change(arrays of one world, step)` instead of them."""
+    names = ("qpos", "qvel", "qacc", "qacc_smooth", "qfrc_smooth", "efc_D", "efc_aref", "efc_force")
+
+    def frames(engine, runs):
+        _, model = runs.load_model()
+        data = mj.MjData(model)
+        for step in range(runs.steps):
+            mj.mj_forward(model, data)
+            arrays = {name: np.array(getattr(data, name))[None] for name in names}
+            arrays |= {"efc_J": data.efc_J.reshape(1, -1, model.nv), "M": whole_mass(model, data)[None]}
+            arrays = change(arrays, step)
+            state = {"qpos": arrays.pop("qpos")}
+            n = len(state["qpos"])
+            problems = from_efc(**arrays, efc_type=data.efc_type, timestep=model.opt.timestep)
+            yield Frame(*problems, state, np.full(n, data.nefc), np.full(n, data.ncon))
+            mj.mj_step(model, data)
+
+    return frames
+
+
+def test_audit_of_float32_tells_its_floor_from_an_early_stop(boxes, monkeypatch):
+    planted = {3, 9, 12}
+
+    def change(arrays, step):
+        arrays["efc_force"] *= 0.99 if step in planted else 1.0
+        return {
+            name: x.astype(np.float32) for name, x in arrays.items() if name not in ("qacc", "qfrc_smooth")
+        }
+
+    monkeypatch.setattr(module, "iterate_frames", make_frames(change))
+    found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
+    assert set(np.flatnonzero(found.is_unconverged[0])) == planted
+    assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
+
+
+def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, monkeypatch):
+    """MJX and MuJoCo Warp go on with numbers that are not finite."""
+
+    def change(arrays, step):
+        bad = np.nan if step >= 4 else 1.0
+        return {
+            name: np.concatenate([x, bad * x]).astype(np.float32)
+            for name, x in arrays.items()
+            if name != "qacc"
+        }
+
+    monkeypatch.setattr(module, "iterate_frames", make_frames(change))
+    found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (14, 6, 1)
+    assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
+    assert "1 world diverged, in step 4 at the earliest; 6 steps were not judged" in found.summary_text
+
+
+def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
+
+    def watch(event):
+        if event.done:
+            raise KeyboardInterrupt
+
+    found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
+    assert found.stopped and found.n_processed == 20
+    assert np.isnan(found.numbers[:, 1:]).all()
+    found.write(tmp_path / "out")
+    assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
+
+
+def test_what_is_close_enough_may_still_not_be_accepted(boxes):
+    found = audit(boxes(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
+    assert not found.is_unconverged.any() and found.max_velocity_error == found.numbers[0].max() > 1e-3
+
+
+def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(boxes, monkeypatch):
+    step = mj.mj_step
+
+    def dies(boxes, data):
+        if data.time > 0.03:
+            raise mj.FatalError("out of memory")
+        step(boxes, data)
+
+    monkeypatch.setattr(mj, "mj_step", dies)
+    found = audit(boxes(), worlds=1, steps=12, workers=1)
+    assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (8, 4, 1)
+    assert (
+        "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8"
+        in found.summary_text
+    )
+    assert "4 steps were not judged" in found.summary_text
+    assert "out of memory" in found.divergences[0].cause
+    assert "outside" not in found.summary_text  # An error of MuJoCo says nothing about the solver.
+
+
+# A motor that drives itself: its force grows with the velocity, so that no answer of the constraint solver helps.
+RUNAWAY = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  <body pos="2 0 1"><joint name="j" axis="0 1 0"/><geom size=".1" mass="1" pos=".1 0 0"/></body></worldbody>
+  <actuator><general joint="j" biastype="affine" biasprm="0 0 {gain}" gainprm="1"/></actuator></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("threshold", [1e-6, 1e3])  # What is close enough to the user need not be exact.
+@pytest.mark.parametrize("options", ["", 'solver="PGS" iterations="1"'])
+def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
+    tmp_path, monkeypatch, options, threshold
+):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
+    found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
+    assert found.n_diverged == 3 and found.n_unjudged > 0 and "random velocities" not in found.summary_text
+    assert found.n_judged + found.n_unjudged == found.verdict.size
+    assert found.n_judged == np.isfinite(found.numbers[0]).sum()
+    assert f"of {found.n_judged} steps judged" in found.summary_text and "inf" not in found.summary_text
+    assert np.isfinite(found.max_velocity_error)
+    exact = options == ""  # One sweep of PGS does not hold the box.
+    assert found.is_unconverged.any() == (not exact and threshold < 1.0)
+    assert ("outside the constraint solver" in found.summary_text) == exact
+    # Otherwise a sentence says how to separate the solver from the model.
+    assert ('audit again with <option solver="Newton"' in found.summary_text) != exact
+    assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][
+        not exact
+    ] * 3
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
+    steps = 1 + audit("runaway.xml", worlds=1, steps=60, workers=1, spread=0.0).divergences[0].step
+    found = audit("runaway.xml", worlds=1, steps=steps, workers=1, spread=0.0)
+    assert found.n_diverged == 1
+    assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).n_diverged == 0
+
+
+def test_shares_are_never_rounded_to_nothing(boxes):
+    found = audit(boxes(), worlds=1, steps=3, workers=1)
+    verdict = np.zeros((10, 320), np.int8)
+    verdict[0, :3] = AUDIT_VERDICTS.index("stopped before convergence")
+    many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
+    assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.summary_text
+
+
+def test_rows_and_contacts_are_those_of_the_run(boxes):
+    path = boxes()
+    found = audit(path, worlds=2, steps=60, workers=1)
+    made = mj.MjModel.from_xml_path(str(path))
+    data, rng = mj.MjData(made), np.random.default_rng(0)
+    for step in range(60):
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, made.nu)
+        mj.mj_forward(made, data)
+        acting = np.count_nonzero(data.contact.efc_address >= 0) if data.ncon else 0
+        assert (found.rows[0, step], found.contacts[0, step]) == (data.nefc, acting)
+        mj.mj_step(made, data)
+    assert found.judged_sizes.has_enough_contact and found.contacts.max() >= 8
+    assert found.totals["contacts"]["maximum"] == found.contacts.max()
+    assert found.totals["contacts"]["share"] == np.mean(found.contacts > 0)
+
+
+def test_an_audit_of_steps_without_contact_says_so(tmp_path):
+    (tmp_path / "high.xml").write_text(
+        BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20")
+    )
+    found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
+    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.summary_text
+    none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
+    (tmp_path / "none.xml").write_text(
+        none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"')
+    )
+    found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
+    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.summary_text
+
+
+@pytest.mark.parametrize(
+    "names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")]
+)
+def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, names):
+    path = boxes(EARLY)
+    found = audit(path, worlds=3, steps=25, workers=1)
+    found.write(tmp_path / "out")
+    states = np.load(tmp_path / "out" / "states.npz")
+    np.savez(tmp_path / "some.npz", **{name: states[name] for name in names})
+    again = audit(path, worlds=4, steps=2, workers=1, states=tmp_path / "some.npz")
+    # The fourth world starts from the first state with other velocities.
+    assert [w.velocity for w in found.worst] == again.numbers[0, :3, 0].tolist()
+    assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (
+            ("qpos", "qvel"),
+            "have no warm start and no controls: the first solve of each world starts cold and the",
+        ),
+        (
+            ("qpos", "qvel", "ctrl"),
+            "have no warm start: the first solve of each world starts cold. The first step",
+        ),
+        (("qpos", "qvel", "qacc_warmstart"), "have no controls: the first step uses the controls of"),
+        (("state",), ""),
+        (("qpos", "qvel", "ctrl", "qacc_warmstart"), ""),
+    ],
+)
+def test_states_without_warm_start_or_controls_are_warned_of(boxes, names, words):
+    path = boxes(EARLY)
+    worst = audit(path, worlds=3, steps=25, workers=1).worst
+    states = {name: np.array([w.state[name] for w in worst]) for name in names}
+    found = audit(path, worlds=2, steps=1, workers=1, states=states)  # two of three states are selected
+    assert words in found.start_warning and bool(found.start_warning) == bool(words)
+    assert found.start_warning in found.summary_page.warning
+    same = [w.velocity for w in worst][:1] == found.numbers[0, :1, 0].tolist()
+    if "no controls: " not in words:  # The worst row does not depend on the controls.
+        assert same == (not words)
+    assert not audit(path, worlds=1, steps=1, workers=1).start_warning
+
+
+def test_physics_vectors_are_states_without_warm_start_and_controls(boxes):
+    made = mj.MjModel.from_xml_path(str(boxes()))
+    vector = np.concatenate([made.qpos0, np.zeros(made.nv)])
+    for kind, missing in (("PHYSICS", ("warm start", "controls")), ("INTEGRATION", ())):
+        data = mj.MjData(made)
+        data.qpos[:], data.qvel[:] = np.split(vector, [made.nq])
+        size = mj.mj_stateSize(made, getattr(mj.mjtState, f"mjSTATE_{kind}"))
+        state = np.empty(size)
+        mj.mj_getState(made, data, state, getattr(mj.mjtState, f"mjSTATE_{kind}"))
+        assert read_states(mj, made, state[None]).missing == missing
+
+
+KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".5"/>
+  <key qpos="0 0 2 1 0 0 0  0 0 3 1 0 0 0  0"/></keyframe></mujoco>"""
+
+
+def test_worlds_start_from_keyframes(tmp_path):
+    (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
+    found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
+    assert found.contacts[:, 0].tolist() == [4, 0]
+    assert (
+        len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
+    )
+
+
+NV, NQ = 13, 15
+REFUSED = [
+    *(({"states": arrays}, words) for arrays, words in (
+        ({"qpos": np.zeros((2, NQ))}, "has no qvel"),
+        ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "different numbers: 2 of qpos, 3 of qvel"),
+        ({"qpos": np.zeros((2, NQ - 1)), "qvel": np.zeros((2, NV))}, "qpos"),
+        ({"qpos": np.full((1, NQ), np.nan), "qvel": np.zeros((1, NV))}, "qpos"),
+        ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "at least one"),
+        ({"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)}, "has an array 'speed'"),
+        ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"))),
+    ({"states": "torn.npz"}, "torn.npz"), ({"states": "no.npz"}, "no.npz"),
+    ({"states": "keyframes"}, "has no keyframes"),
+    ({"engine": "bullet"}, "engine"), ({"worlds": 0}, "worlds"), ({"control": "zero", "seed": -1}, "seed"),
+    ({"spread": -1.0}, "spread"), ({"precision": "float16"}, "precision"), ({"workers": 0}, "workers"),
+    ({"control": "sometimes"}, "controls sometimes"), ({"backend": "carrier pigeon"}, "backend"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "words"), REFUSED)
+def test_audit_refuses_wrong_arguments_by_name(boxes, tmp_path, monkeypatch, given, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "torn.npz").write_bytes(b"PK torn")
+    if isinstance(given.get("states"), dict):
+        np.savez("bad.npz", **given["states"])
+        given = {"states": "bad.npz"}
+    with pytest.raises(lv.LavenderError, match=words):
+        audit(boxes(), **{"worlds": 1, "steps": 2, "workers": 1} | given)
+
+
+def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypatch):
+    def ends(*_):
+        raise mj.FatalError("not supported")
+
+    monkeypatch.setattr(mj, "mj_forward", ends)
+    with pytest.raises(lv.InputError, match="state 0: MuJoCo raised an error, not supported"):
+        audit(boxes(), worlds=1, steps=12, workers=1)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
+    assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
+    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(
+        found.max_velocity_error
+    )
+    assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
+
+
+def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, tmp_path, capfd):
+    monkeypatch.chdir(tmp_path)
+    handler = mj.get_mju_user_warning()
+    found = audit(boxes(), worlds=3, steps=5, workers=1, spread=1e12)
+    ((text, count),) = found.engine_warnings.items()
+    assert count >= found.n_diverged == 2 and text.startswith("Nan, Inf or huge value in QVEL at DOF N")
+    assert f"MuJoCo's own warnings: {text} ({count} times)." in found.summary_text
+    assert found.totals["engine_warnings"] == {text: count}
+    assert "WARNING" not in "".join(capfd.readouterr()) and not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    assert mj.get_mju_user_warning() is handler
+    assert not audit(boxes(), worlds=1, steps=5, workers=1).engine_warnings
+
+
+def test_a_file_that_is_no_model_is_told(tmp_path):
+    (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
+    with pytest.raises(lv.InputError, match=r"torn\.xml"):
+        audit(tmp_path / "torn.xml", worlds=1, steps=2)
+
+
+@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
+def test_an_engine_that_is_not_installed_says_how(boxes, engine, package, monkeypatch):
+    import sys
+
+    for name in (package, "jax", "warp"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(lv.InputError, match="pip install mujoco-"):
+        audit(boxes(), worlds=1, steps=2, engine=engine)
+
+
+@pytest.mark.parametrize("options", ['solver="Newton"', 'solver="Newton" cone="elliptic"'])
+@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
+@pytest.mark.filterwarnings("ignore")
+def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package, options):
+    pytest.importorskip(package, reason="needs the engine")
+    path = str(boxes(options + ' iterations="100" ls_iterations="50"'))
+    (frame,) = list(module.iterate_frames(engine, Runs(path, 2, 1)))
+    made = mj.MjModel.from_xml_path(path)
+    for world in range(2):
+        data = mj.MjData(made)
+        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+            getattr(data, name)[:] = frame.state[name][world]
+        mj.mj_forward(made, data)
+        want = lv.io.from_mujoco(made, data)
+        moved = want.velocity(lv.solve(want, tol=1e-9).impulse)
+        own = frame.batch[world]
+        np.testing.assert_allclose(own.velocity(lv.solve(own, tol=1e-6).impulse), moved, atol=2e-3)
+        assert any("floor" in name for name in frame.batch.names_of(world))
+
+
+SLEEPING = BOXES.format(options="").replace(
+    "<worldbody>", '<option><flag sleep="enable"/></option><worldbody>'
+)
+
+
+def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
+    # Replayed states of sleeping boxes woke them with the warm start of a free fall: most solves seemed unconverged.
+    path = tmp_path / "sleep.xml"
+    path.write_text(SLEEPING)
+    data = mj.MjData(mj.MjModel.from_xml_path(str(path)))
+    if not hasattr(data, "tree_asleep"):
+        pytest.skip("this MuJoCo has no sleep")
+    found = audit(path, worlds=1, steps=400, workers=1, control="zero")
+    awake = mj.MjModel.from_xml_string(SLEEPING.replace("enable", "disable"))
+    data = mj.MjData(awake)
+    for step in range(400):
+        mj.mj_forward(awake, data)
+        judged = lv.residual(lv.io.from_mujoco(awake, data), lv.io.mujoco.impulse(awake, data))
+        assert found.numbers[0, 0, step] == pytest.approx(judged.velocity, rel=1e-6, abs=1e-12)
+        mj.mj_step(awake, data)
+    assert "Sleep was off" in found.summary_page.warning
+    assert (
+        "Sleep" not in audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1).summary_page.warning
+    )
+
+
+def path_without_sleep(folder):
+    path = folder / "awake.xml"
+    path.write_text(BOXES.format(options=""))
+    return path
+
+
+# A joint whose damping is negative above 0.025 rad/s: it runs away from larger velocities, and from no smaller one.
+FRAGILE = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .099"><joint type="slide" axis="0 0 1"/><geom type="box" size=".1 .1 .1"/></body>
+  <body pos="2 0 1"><joint axis="0 1 0" damping="0.5 -20 0"/><inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/>
+  </body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def fragile(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there.
+    if not hasattr(mj.MjModel, "dof_dampingpoly"):
+        pytest.skip("this MuJoCo has no damping that depends on the velocity")
+    path = tmp_path / "fragile.xml"
+    path.write_text(FRAGILE)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_of_worlds_that_diverge_by_their_random_velocities_blames_these(fragile):
+    found = audit(fragile, worlds=9, steps=50, workers=1, spread=0.5)
+    assert found.n_diverged > 2 and 0 not in [d.world for d in found.divergences]
+    assert "World 0, which starts without random velocities, did not diverge" in found.summary_text
+    assert f"{found.divergences[0].world}, " in found.summary_text
+    assert "the random velocities are the cause, not the model or its solver" in found.summary_text
+    assert "--spread 0" in found.summary_text and "outside the constraint" not in found.summary_text
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_without_a_spread_chooses_one_that_trial_worlds_survive(fragile, boxes):
+    found = audit(fragile, worlds=4, steps=50, workers=1)
+    assert (found.runs.spread, found.n_diverged) == (0.01, 0)
+    assert "0.01 m/s (rad/s) only, because worlds diverged with 0.1 m/s" in found.summary_page.warning
+    found = audit(boxes(), worlds=2, steps=5, workers=1)
+    assert (found.runs.spread, found.notes) == (0.1, "")
+
+
+def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
+    found = audit(boxes(EARLY), worlds=1, steps=40, workers=1, keep=7)
+    speeds = np.where(found.is_unconverged, found.numbers[0], 0.0)[0]
+    assert [w.step for w in found.worst] == np.argsort(-speeds, kind="stable")[:7].tolist()
+    found.write(tmp_path)
+    assert len(np.load(tmp_path / "states.npz")["state"]) == 7
+
+
+def test_audit_keeps_states_before_steps_with_contact(boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_CONTACT_STATES", 20)
+    path = boxes(EARLY)
+    found = audit(path, worlds=2, steps=60, workers=1, keep_contact_states=True)
+    n = found.save_states("contact", tmp_path / "states.npz")
+    assert 20 <= n <= 22  # Up to one more for each of the batches.
+    stored = np.load(tmp_path / "states.npz")
+    assert (found.contacts[stored["world"], stored["step"]] > 0).all()
+    again = audit(path, worlds=n, steps=1, workers=1, states=tmp_path / "states.npz")
+    assert again.numbers[0, :, 0] == pytest.approx(found.numbers[0, stored["world"], stored["step"]])
+    with pytest.raises(lv.InputError, match="kind"):
+        found.save_states("best", tmp_path / "states.npz")
+
+
+def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_forces(boxes, monkeypatch):
+    """MJX returns forces of 0 with an acceleration of NaN, and goes on."""
+
+    def change(arrays, step):
+        arrays["efc_force"] *= step != 3
+        arrays["qacc"] *= np.nan if step == 3 else 1.0
+        return arrays
+
+    monkeypatch.setattr(module, "iterate_frames", make_frames(change))
+    found = audit(boxes('jacobian="dense"'), worlds=1, steps=6, engine="mjx", spread=0.0)
+    assert np.flatnonzero(found.verdict[0] == AUDIT_VERDICTS.index("not judged")).tolist() == [3]
+    assert [(d.step, d.is_outside) for d in found.divergences] == [(3, False)]
+    assert "1 step was not judged, because numbers are not finite" in found.summary_text
+    assert "no better than zero forces" not in found.summary_text
+    assert "--engine mujoco" in found.summary_text
+
+
+def test_audit_counts_each_verdict_once(boxes):
+    found = audit(boxes(EARLY), worlds=2, steps=20, workers=1)
+    counts = {row[0]: int(row[1]) for row in found.table_of_verdicts.cell_texts}
+    unconverged, wrong = counts["stopped before convergence"], counts["wrong"]
+    assert unconverged and wrong
+    assert (
+        f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence (" in found.summary_text
+    )
+    assert (
+        f", and {wrong} are wrong ({2.5 * wrong:.1f} %): no better than zero forces, in "
+        in found.summary_text
+    )
+    assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
+    assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
+    assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
+
+
+def test_audit_of_a_model_that_an_engine_rejects_in_its_first_step_says_so(boxes, monkeypatch):
+    """MJX accepts a model with the integrator "discrete", and raises an error when it steps it."""
+
+    def reject(ctrl):
+        raise NotImplementedError("integrator 4 not implemented.")
+
+    monkeypatch.setattr(simulated_worlds, "WarpWorlds", lambda mj, model, arrays: reject)
+    with pytest.raises(
+        lv.InputError, match=r"'mujoco_warp' does not accept .*boxes.xml: integrator 4 not implemented"
+    ):
+        audit(boxes(), worlds=1, steps=2, engine="mujoco_warp")

@@ -1,0 +1,316 @@
+"""The cause of slip of scenes whose answer is known."""
+
+import copy
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.audit.slip import (
+    CAUSES,
+    REMEDY_STEPS,
+    average_slip,
+    explain_slip,
+    explain_slip_of_states,
+    summarize_slip,
+)
+from lavender.audit.slip_figure import draw_slip
+from lavender.report.text import NONE
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
+
+GRAVITY = 9.81
+
+
+def block(angle, friction=0.5, option="", condim=3):
+    """A box on a slope of this angle [rad], as a plane under tilted gravity."""
+    return mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <option timestep="0.002" gravity="{GRAVITY * np.sin(angle)} 0 {-GRAVITY * np.cos(angle)}" {option}/>
+      <default><geom friction="{friction} 0.005 0.0001" condim="{condim}"/></default>
+      <worldbody><geom name="slope" type="plane" size="50 50 .1"/>
+      <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body>
+      </worldbody></mujoco>""")
+
+
+def dominant(explanation):
+    """Return the cause of the fastest contact."""
+    return explanation.causes[int(np.argmax(explanation.variants[0].speeds))]
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
+    angle = 0.3  # tan 0.309 < 0.5
+    explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600)[0]
+    assert set(explanation.causes) == {"softness of friction"}
+    hard = explanation.variants[3]
+    assert hard.name == "hard" and hard.speeds.max() < 1e-6
+    assert all(v.relative <= 1e-9 for v in explanation.variants[1:] if not v.note)
+
+
+def test_creep_has_the_speed_of_the_softened_row():
+    """A steady creep v of n equal contacts has b v + R f = 0 on tangent rows, aref = -b v, f = m g sin(angle) / n."""
+    angle = 0.2
+    model = block(angle, option='cone="elliptic"')
+    data = mujoco.MjData(model)
+    for _ in range(1500):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    tangent = int(data.contact.efc_address[0]) + 1
+    explanation = explain_slip_of_states(model, steps=1501)[0]
+    force = GRAVITY * np.sin(angle) / data.ncon
+    damping = (
+        -data.efc_aref[tangent : tangent + 2]
+        @ np.ones(2)
+        / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
+    )
+    speed = data.efc_R[tangent] * force / damping
+    assert explanation.variants[0].speeds == pytest.approx(np.full(data.ncon, speed), rel=0.02)
+
+
+def test_above_the_friction_angle_the_load_is_too_large():
+    angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
+    steps = 150
+    explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
+    assert set(explanation.causes) == {"load above the friction limit"}
+    expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
+    assert explanation.variants[-1].speeds == pytest.approx(
+        np.full(len(explanation.contacts), expected), rel=0.05
+    )
+
+
+def test_iterations_that_are_missing_are_the_cause():
+    model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
+    exact = block(0.3, option='cone="elliptic" impratio="1000"')
+    assert dominant(explain_slip_of_states(exact, steps=40)[0]) != "unfinished solving"
+    data = mujoco.MjData(exact)
+    for _ in range(40):
+        mujoco.mj_step(exact, data)
+    state = np.empty(mujoco.mj_stateSize(exact, mujoco.mjtState.mjSTATE_INTEGRATION))
+    data.qacc_warmstart[:] = 0.0
+    mujoco.mj_getState(exact, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    assert dominant(explain_slip_of_states(model, state[None])[0]) == "unfinished solving"
+
+
+def slide(velocity, cones, friction="coulomb", compliance=None):
+    """Build a step of a particle of 1 kg on the ground that falls with 1 m/s and slides with `velocity` (2,) [m/s]."""
+    jac = np.eye(3)[[2, 0, 1]]
+    free = [*velocity, -1.0]
+    return lv.Problem.from_jacobian(
+        jac,
+        np.eye(3),
+        free,
+        cones=cones,
+        friction=friction,
+        compliance=compliance,
+        names=["contact 0 (foot, ground)"],
+    )
+
+
+def test_the_convex_relaxation_is_a_cause():
+    # Coulomb: the normal impulse is 1 N s, friction 0.5: 2 - 0.5 = 1.5 m/s remain. The relaxation lifts the particle
+    # with v_n = mu v_t, and takes (2 - 0.5) / (1 + 0.25) = 1.2 m/s.
+    problem = slide([2.0, 0.0], lv.Cones.contacts(0.5), friction="cone")
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    speeds = {v.name: v.speeds[0] for v in explanation.variants}
+    assert speeds["solved"] == pytest.approx(1.2) and speeds["coulomb"] == pytest.approx(1.5)
+    assert explanation.parts["convex relaxation"] == pytest.approx([0.3])
+    assert explanation.parts["load above the friction limit"] == pytest.approx([1.5])
+
+
+def test_the_shape_of_the_cone_is_a_cause():
+    # A box bounds each tangent by 0.5 N s, a disk their norm: along the diagonal 0.707 or 0.5 m/s are lost.
+    problem = slide([1.0, 1.0], lv.Cones.contacts(0.5).shaped("box"))
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    speeds = {v.name: v.speeds[0] for v in explanation.variants}
+    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(
+        np.sqrt(2.0) - 0.5
+    )
+    assert explanation.parts["shape of the cone"] == pytest.approx([np.sqrt(2.0) - 0.5 - np.sqrt(0.5)])
+
+
+@pytest.mark.parametrize(
+    ("grip", "cause"), [(30.0, "softness of friction"), (6.0, "load above the friction limit")]
+)
+def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
+    # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
+      <default><geom friction="0.5 0.005 0.0001"/></default><worldbody>
+      <body pos="-.07 0 1"><joint name="left" type="slide" axis="1 0 0"/>
+        <geom name="left" type="box" size=".02 .05 .05" mass=".1"/></body>
+      <body pos=".07 0 1"><joint name="right" type="slide" axis="-1 0 0"/>
+        <geom name="right" type="box" size=".02 .05 .05" mass=".1"/></body>
+      <body pos="0 0 1"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
+      <actuator><motor joint="left" ctrllimited="false"/><motor joint="right" ctrllimited="false"/></actuator>
+      <keyframe><key ctrl="{grip} {grip}"/></keyframe></mujoco>""")
+    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20)[0]
+    assert dominant(explanation) == cause
+
+
+def test_velocity_of_the_engines_impulses_is_the_engines_own():
+    model = block(0.3, option='cone="elliptic"')
+    data = mujoco.MjData(model)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    after = problem.velocity(lv.io.mujoco.impulse(model, data))
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(after, data.qvel, atol=1e-6)
+
+
+def test_chosen_contacts_and_summary():
+    explanations = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
+    table = summarize_slip(explanations)
+    assert [str(row[0]) for row in table.rows] == ["slope, box"]
+    assert table.rows[0][-1] == "load above the friction limit"
+    with pytest.raises(lv.InputError, match="but no geom's name contains it"):
+        explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
+
+
+def test_bars_of_the_figure_are_the_parts():
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=200, contacts="box")
+    (average,) = average_slip(explanations)
+    axes = draw_slip(explanations).axes[0]
+    assert [bar.get_label() for bar in axes.containers] == list(CAUSES.values())
+    widths = [float(bar.patches[0].get_width()) for bar in axes.containers]
+    assert widths == pytest.approx(list(average.parts.values()), rel=1e-6)
+    assert axes.lines[0].get_xdata() == [average.speeds[0]] and average.count == len(explanations[0].contacts)
+    with pytest.raises(lv.InputError, match="have no contact to draw"):
+        draw_slip([])
+
+
+@pytest.mark.parametrize("option", ['cone="elliptic"', 'cone="pyramidal"', 'cone="elliptic" impratio="10"'])
+def test_every_variant_is_solved_and_judged(option):
+    """Each solution has a relative residual of at most 1e-9, and an engine that converged has the same velocity."""
+    for angle in (0.2, 0.6):
+        explanation = explain_slip_of_states(block(angle, option=option), steps=100)[0]
+        for variant in explanation.variants[1:]:
+            assert not variant.note.startswith("not solved")
+            assert variant.relative <= 1e-9, variant.name
+
+
+def test_problems_without_contacts_or_velocities_are_rejected():
+    with pytest.raises(lv.InputError, match="no contact with tangents"):
+        explain_slip(lv.Problem.lcp(np.eye(2), np.ones(2)), np.zeros(2))
+    matrix = lv.Problem.contact(np.eye(3), np.array([1.0, 1.0, 0.0]), mu=0.5)
+    with pytest.raises(lv.LavenderError):
+        explain_slip(matrix, np.zeros(3))
+
+
+def test_the_sentence_names_a_remedy_that_works():
+    """A larger impratio, the remedy of softness, reduces the slip."""
+    angle = 0.3
+    soft = explain_slip_of_states(block(angle, option='cone="elliptic"'), steps=600)[0]
+    assert "impratio above 1" in soft.sentence
+    stiff = explain_slip_of_states(block(angle, option='cone="elliptic" impratio="10"'), steps=600)[0]
+    # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
+    assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
+
+
+def test_a_law_that_is_not_defined_has_no_value():
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100)
+    table = explanations[0].table
+    column = table.heads.index("coulomb [m/s]")
+    assert {str(row[column]) for row in table.rows} == {NONE}
+    assert "not defined" in explanations[0].sentence
+    summary = summarize_slip(explanations)
+    assert all(str(row[summary.heads.index("coulomb [m/s]")]) == NONE for row in summary.rows)
+
+
+def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
+    """A box of 1 kg that rests on a belt of 1 m/s and moves with it, by bodies or by J and M."""
+    if form == "bodies":
+        rows = lv.Rows(
+            inv_mass=[1.0], inv_inertia=[np.eye(3)], v_free=[[1.0, 0.0, -0.1, 0.0, 0.0, 0.0]],
+            contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)], tangent=[(1.0, 0.0, 0.0)],
+            arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, 0.0)],
+        )  # fmt: skip
+        return lv.Problem.from_rows(
+            rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance]
+        )
+    return lv.Problem.from_jacobian(
+        np.eye(3)[[2, 0, 1]], np.eye(3), [1.0, 0.0, -0.1], target=[0.0, belt, 0.0], cones=lv.Cones.contacts(mu),
+        compliance=[0.0, compliance, compliance],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M"])
+def test_explain_slip_box_carried_by_conveyor_does_not_slip(form):
+    problem = conveyor(form)
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    assert explanation.causes == ("no slip",)
+    # A belt of 2 m/s slides under the box: 1 m/s minus the friction of 0.5 * 0.1 N s on 1 kg.
+    problem = conveyor(form, belt=2.0)
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    assert explanation.variants[0].speeds == pytest.approx([0.95])
+    assert explanation.causes == ("load above the friction limit",)
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M"])
+def test_explain_slip_softened_rows_need_surface_velocity(form):
+    problem = conveyor(form, belt=1.2, compliance=10.0, mu=5.0)
+    impulse = lv.solve(problem, tol=1e-9).impulse
+    # v_t = 1.2 - 10 lambda and lambda = v_t - 1: a belt that softness lets slip by 10 / 11 of 0.2 m/s.
+    explanation = explain_slip(problem, impulse, surface_velocity=[0.0, 1.2, 0.0])
+    assert explanation.variants[0].speeds == pytest.approx([0.2 * 10 / 11])
+    assert explanation.causes == ("softness of friction",)
+    assert explanation.variants[3].speeds == pytest.approx([0.0], abs=1e-9)
+    # Without it, the target is an engine's damping.
+    assert explain_slip(problem, impulse).variants[0].speeds == pytest.approx([1.2 - 0.2 * 10 / 11])
+
+
+def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
+    for cone in ("elliptic", "pyramidal"):
+        model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="{cone}"/><worldbody>
+          <geom name="belt" type="plane" size="9 9 1" surfacevel="1 0 0 0 0 0"/>
+          <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body></worldbody>
+          </mujoco>""")
+        explanation = explain_slip_of_states(model, steps=1000)[0]
+        assert explanation.causes == ("no slip",) * len(explanation.contacts)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives(cone):
+    """Each <option> is pasted into the model, which then continues from the explained state in MuJoCo alone."""
+    angle, steps, state_kind = 0.3, 100, mujoco.mjtState.mjSTATE_INTEGRATION
+    model = block(angle, option=f'cone="{cone}"')
+    data = mujoco.MjData(model)
+    for _ in range(steps - 1):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    state = np.empty(mujoco.mj_stateSize(model, state_kind))
+    mujoco.mj_getState(model, data, state, state_kind)
+    (explanation,) = explain_slip_of_states(model, steps=steps)
+    settings = {remedy.setting: remedy for remedy in explanation.remedies}
+    assert next(iter(settings)) == "as it is" and '<geom solref="0.004 1"/>' in settings
+    assert ('<option cone="elliptic" noslip_iterations="20"/>' in settings) == (cone == "pyramidal")
+    for text, remedy in settings.items():
+        if not text.startswith("<option"):
+            continue
+        option = text.removeprefix("<option ").removesuffix("/>")
+        typed = block(angle, option=option if "cone=" in option else f'cone="{cone}" {option}')
+        data = mujoco.MjData(typed)
+        mujoco.mj_setState(typed, data, state, state_kind)
+        for expected, further in ((remedy.slip, 0), (remedy.later, REMEDY_STEPS)):
+            for _ in range(further):
+                mujoco.mj_step(typed, data)
+            mujoco.mj_forward(typed, data)
+            jacobians = np.zeros((data.ncon, 3, typed.nv))
+            for jacobian, point in zip(jacobians, data.contact.pos, strict=True):
+                mujoco.mj_jac(typed, data, jacobian, None, point, 1)
+            following = copy.deepcopy(data)
+            mujoco.mj_step(typed, following)
+            speeds = np.linalg.norm((jacobians @ following.qvel)[:, :2], axis=1)  # The normal is z.
+            assert speeds.mean() == pytest.approx(expected, rel=1e-6, abs=1e-12), text
+    best = min(explanation.remedies, key=lambda remedy: remedy.later)
+    assert best.setting in explanation.sentence
+    assert best.later < 0.3 * explanation.remedies[0].later
+
+
+def test_explain_slip_of_states_skips_states_in_which_the_geom_touches_nothing():
+    model = block(0.3, option='cone="elliptic"')
+    touching, flying = model.qpos0.copy(), model.qpos0.copy()
+    flying[2] = 5.0
+    states = {"qpos": np.array([flying, touching]), "qvel": np.zeros((2, model.nv))}
+    assert len(explain_slip_of_states(model, states, contacts="box", steps=20)) == 1
+    assert explain_slip_of_states(model, {k: x[:1] for k, x in states.items()}, contacts="box", steps=2) == []

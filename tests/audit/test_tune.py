@@ -1,0 +1,358 @@
+"""Settings of MuJoCo beside each other: what is measured, what is chosen, and the line to copy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calls import BOXES, keep_values
+from calls import EARLY_BOXES as EARLY
+
+import lavender as lv
+from lavender.audit.audit import audit
+from lavender.audit.simulated_worlds import Runs, StepSizes
+from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
+from lavender.audit.tune.measured import Schedule
+from lavender.audit.tune.mujoco_settings import MujocoSetting as Setting
+from lavender.audit.tune.mujoco_settings import MujocoStage as Stage
+from lavender.audit.tune.mujoco_settings import list_first_settings
+
+mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
+
+
+def fewer(monkeypatch):
+    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
+
+
+def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, monkeypatch):
+    fewer(monkeypatch)
+    path = boxes(EARLY)
+    found = tune(path, worlds=4, steps=30, repeats=1)
+    whole = audit(path, worlds=4, steps=30, workers=1).numbers[0]
+    assert found.measured[0].setting == Setting()
+    np.testing.assert_allclose(found.measured[0].error, whole[0::2].ravel(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.held[0].error, whole[1::2].ravel(), rtol=1e-6, atol=1e-12)
+    best = min(found.measured, key=lambda m: m.worst_error)
+    assert best.worst_error < 1e-6 < found.present_result.worst_error
+    assert best.worst_motion < 1e-6 < found.present_result.worst_motion
+    assert all(m.mean_step_time > 0.0 for m in found.measured)
+
+
+def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
+    fewer(monkeypatch)
+    path = tmp_path / "passive.xml"
+    path.write_text(BOXES.format(options="").partition("<actuator>")[0] + "</mujoco>")
+    assert len(tune(path, worlds=2, steps=20, repeats=1).measured) > 1
+
+
+def test_the_converged_run_does_not_move_away_from_itself(boxes):
+    runs = Runs(str(boxes()), 1, 20)
+    handle, made = runs.load_model()
+    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
+    same = stage.judge_setting(Setting.from_options(handle, made, **mujoco_settings.CONVERGED_OPTIONS))
+    assert same.motion.max() == 0.0 and same.worst_error < 1e-9
+
+
+def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
+    runs = Runs(str(boxes()), 1, 40)
+    handle, made = runs.load_model()
+    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
+    found = [stage.judge_setting(s) for s in (Setting(), Setting((("iterations", 5),)))]
+    rng, now = np.random.default_rng(1), 0.0
+
+    def busy():
+        nonlocal now
+        now += 1e-6 + (rng.random() < 0.05)  # one time in twenty somebody else has a second
+        return now
+
+    monkeypatch.setattr(mujoco_settings, "perf_counter", busy)
+    stage.time_settings(found, 6, Schedule(None))
+    for m in found:
+        assert m.mean_step_time == pytest.approx(
+            1e-6, abs=1e-9
+        )  # the clock itself rounds to 1e-14 of its 30 s
+
+
+@pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
+def test_a_line_means_in_a_model_what_was_measured(options):
+    plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
+    for setting in [*list_first_settings(mj, plain), *mujoco_settings.list_variants(mj, plain, Setting())]:
+        text = setting.option_line.removeprefix("<option").removesuffix("/>")
+        names = {name for name, _ in setting.options}
+        kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
+        copied = mj.MjModel.from_xml_string(BOXES.format(options=f"{kept} {text}")).opt
+        tried = setting.apply_to(mj, plain).opt
+        for name in (*mujoco_settings.OPTIONS, *mujoco_settings.PROBLEM_OPTIONS):
+            assert getattr(copied, name) == getattr(tried, name), setting
+    assert Setting.from_options(mj, plain, iterations=int(plain.opt.iterations)).option_line == ""
+
+
+def measured(time, error, **options):
+    return Measured(
+        Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time)
+    )
+
+
+def chosen(*some, held=(), threshold=1e-6):
+    return Tuning("m.xml", 10, list(some), list(held), threshold)
+
+
+@pytest.mark.parametrize(("with_contact", "is_enough"), [(19, False), (20, True)])
+def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enough):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    contacts = (np.arange(100) < with_contact).astype(int)
+    found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
+    assert bool(found.lines) == is_enough == (not found.reason_without_line)
+    assert ("No setting is recommended: 19 of 100" in found.summary_page.head) != is_enough
+    assert "(19.0 %)" in found.reason_without_line or is_enough
+    # A model without geoms that can collide is judged by its rows.
+    assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
+    assert not replace(found, sizes=StepSizes(0 * contacts, 0 * contacts, False)).lines
+
+
+def test_what_is_chosen():
+    now = measured(10.0, 1e-3)
+    quick, loose = measured(8.0, 1e-3, iterations=9), measured(2.0, 1e-1, iterations=1)
+    exact, slow = measured(10.2, 1e-5, tolerance=1e-9), measured(20.0, 1e-9, tolerance=1e-15)
+    other = measured(1.0, 0.0, cone="elliptic")
+    found = chosen(now, quick, loose, exact, slow, other)
+    assert found.faster is quick and found.closer is exact
+    assert found.pareto_front == [loose, quick, exact, slow]
+    assert '<option iterations="9"/>' in found.lines[0]
+
+
+def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
+    now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
+    rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)
+    rare.error[0] = 0.5  # One step in a hundred: the limit is for every step.
+    slow, other = measured(20.0, 1e-9, tolerance=1e-15), measured(1.0, 0.0, cone="elliptic")
+    found = replace(chosen(now, quick, rare, good, slow, other), error_limit=1e-3)
+    assert found.within_limit is found.limit_choice is good
+    assert found.lines[0] == '<option tolerance="1e-06"/>  <!-- error at most 0.001 m/s, fastest -->'
+    assert found.lines[1].endswith("(at most 1.0e-5 in 100 steps)") and "not measured" in found.lines[2]
+    assert "On other states they can be larger" in found.summary_page.render_html()
+    # What exceeds the limit on the worlds held back is not within it.
+    refuted = replace(found, held_errors={good.setting: 2e-3})
+    assert refuted.within_limit is slow
+    none = replace(found, error_limit=1e-12)
+    assert none.within_limit is None and none.most_accurate is slow
+    assert none.lines[:2] == [
+        "error at most 1e-12 m/s: none of 5 settings; the most accurate is",
+        '<option tolerance="1e-15"/>  <!-- most accurate -->',
+    ]
+    assert none.summary_page.numbers["is_limit_met"] is False
+    own = replace(chosen(now, slow), error_limit=0.2)
+    assert own.lines[0] == "error at most 0.2 m/s, fastest: the model's own setting"
+    assert "error at most" not in "".join(replace(found, error_limit=None).lines)
+
+
+@pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
+def test_the_limit_of_the_error_holds_on_the_worlds_held_back(boxes, monkeypatch, limit, is_met):
+    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-3, 1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
+    found = tune(boxes(EARLY), worlds=4, steps=30, repeats=1, max_velocity_error=limit)
+    choice = found.limit_choice
+    (held,) = (h for h in found.held if h.setting == choice.setting)
+    assert np.isfinite(held.mean_step_time) and found.held_errors[choice.setting] == held.error.max()
+    assert (found.within_limit is choice) == is_met == (max(choice.error.max(), held.error.max()) <= limit)
+    for m in found.measured:  # Every faster setting exceeds the limit on one half of the worlds.
+        if is_met and m.mean_step_time < 0.95 * choice.mean_step_time and not m.setting.changes_problem:
+            assert max(m.error.max(), found.held_errors.get(m.setting, 0.0)) > limit
+    assert "held back: not measured" not in "".join(found.lines)
+
+
+def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
+    fewer(monkeypatch)
+    path = boxes('solver="CG" iterations="4" ls_iterations="8" tolerance="1e-3"')
+    found = tune(path, worlds=2, steps=10, repeats=1, max_velocity_error=1e3)
+    (default,) = (m for m in found.measured if m.setting.is_default)
+    model = mj.MjModel.from_xml_path(str(path))
+    applied, plain = default.setting.apply_to(mj, model).opt, mj.MjOption()
+    assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
+    assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
+    assert found.summary_page.render_html().count("MuJoCo&#39;s defaults: &lt;option") >= 1
+    assert "MuJoCo's defaults" in [row[0] for row in found.terminal_table.cell_texts]
+    assert default in found.terminal_settings and found.terminal_settings[0] is found.present_result
+    line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
+    assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
+    # A model with the default options: its own setting is not measured twice.
+    assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
+
+
+def test_the_terminal_shows_the_front_beyond_the_present_time():
+    now = measured(10.0, 0.4)
+    loose = [measured(float(t), 1.0 / t, iterations=t) for t in (2, 4, 6, 8)]
+    slow = [measured(10.0 + k, 10.0 ** -(k + 2), tolerance=10.0**-k) for k in range(1, 8)]
+    shown = chosen(now, *loose, *slow).terminal_settings
+    assert shown[:3] == [now, loose[0], loose[-1]]
+    assert shown[3:] == [slow[0], slow[2], slow[4], slow[6]]
+    assert chosen(now).terminal_settings == [now]
+    # An error that is hardly smaller is not worth a row.
+    assert len(chosen(now, slow[0], measured(12.0, 0.95e-3, tolerance=1e-3)).terminal_settings) == 2
+    texts = [row[0] for row in chosen(now, *loose, *slow).terminal_table.cell_texts]
+    assert texts[:2] == ["model's own setting", "iterations=2"] and texts[-1] == "tolerance=1e-07"
+
+
+def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
+    now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
+    found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
+    assert found.faster is None and found.closer is None
+    assert "not needed" in found.lines[1]
+    loose = measured(5.0, 1e-7, tolerance=1e-4)
+    assert chosen(now, loose).faster is loose  # further off than now, and no further than anybody asks
+    rare = measured(5.0, 1e-10, tolerance=1e-4)
+    rare.error[0] = 1.0  # one step in a hundred: below the quantile, not below the worst
+    assert chosen(now, rare).faster is None
+    astray = measured(5.0, 1e-10, tolerance=1e-4)
+    astray.motion[:] = 1e-3  # its answers are right, and the bodies elsewhere
+    assert chosen(now, astray).faster is None
+
+
+def test_both_sides_of_the_choice_are_printed():
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    held = [measured(10.0, 2e-3), measured(11.0, 3e-3, iterations=9)]
+    lines = chosen(now, quick, held=held).lines
+    assert "0.80 of the time, error 1.0e-3" in lines[1]
+    assert "1.10 of the time, error 3.0e-3 m/s instead of 2.0e-3" in lines[2]
+
+
+def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
+    now, quick, exact = (
+        measured(10.0, 1e-3),
+        measured(8.0, 1e-3, iterations=9),
+        measured(10.0, 1e-5, tolerance=1e-9),
+    )
+    # Times within 5 % are equal: no gain.
+    for time, error, refuted in ((7.0, 1e-5, False), (9.8, 1e-3, True), (11.0, 2e-3, True)):
+        held = [now, measured(time, 1e-3, iterations=9), measured(10.0, error, tolerance=1e-9)]
+        lines = [line for line in chosen(now, quick, exact, held=held).lines if "<option" in line]
+        assert len(lines) == 2
+        assert all(("not on the worlds held back" in line) == refuted for line in lines)
+
+
+def test_the_largest_error_held_back_is_told_with_the_probability_of_a_larger_one(boxes, monkeypatch):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    held = [measured(10.0, 2e-3), measured(8.0, 2e-3, iterations=9)]
+    held[1].error[7] = 0.5
+    found = replace(chosen(now, quick, held=held), n_held_worlds=8)
+    assert found.lines[2].endswith("instead of 2.0e-3 (at most 0.5 in 100 steps)")
+    assert "8 worlds and not a bound" in found.summary_page.render_html()
+    assert "probability of up to 1/9" in found.summary_page.render_html()
+    assert "1/9" not in replace(found, held=[]).summary_page.render_html()
+    fewer(monkeypatch)
+    assert tune(boxes(EARLY), worlds=5, steps=10, repeats=1).n_held_worlds == 2
+
+
+@pytest.mark.parametrize("how", [{"stopped": True}, {"busy": "The machine was busy: load 9.0"}])
+def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    found = replace(chosen(now, quick), **how)
+    assert found.lines[0].startswith('<option iterations="9"/>  <!-- PROVISIONAL, the m')
+    page = found.summary_page.render_html()
+    assert "Provisional lines" in page and "Lines to copy" not in page and "measure again" in page
+    assert "PROVISIONAL" not in chosen(now, quick).lines[0]
+    none = replace(chosen(now), **how)
+    assert none.lines[0].startswith("PROVISIONAL, the m") and "none of 1 settings" in none.lines[0]
+
+
+def test_a_line_after_the_model_s_own_option_wins_and_before_it_does_not():
+    model = BOXES.format(options='iterations="7"')
+    line = Setting((("iterations", 50),)).option_line
+    head, own, rest = model.partition("<option")
+    option, end, tail = (own + rest).partition("/>")
+    after, before = f"{head}{option}{end}{line}{tail}", f"{head}{line}{option}{end}{tail}"
+    assert mj.MjModel.from_xml_string(after).opt.iterations == 50
+    assert mj.MjModel.from_xml_string(before).opt.iterations == 7
+    assert "after the model's own <option>" in mujoco_settings.MERGE_NOTE
+
+
+def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
+    fewer(monkeypatch)
+    events = []
+    tune(boxes(EARLY), worlds=2, steps=10, repeats=2, watch=events.append)
+    texts = [event.case for event in events]
+    assert texts[0] == "judging: the model's own setting"
+    assert any(text.startswith("judging: <option ") for text in texts)
+    assert "timing: round 2 of 2, the model's own setting" in texts
+    assert any(text.startswith("timing: round 1 of 2, <option ") for text in texts)
+    assert [event.done for event in events] == list(range(len(events)))
+    assert events[0].remaining is None and all(event.remaining >= 0.0 for event in events[1:])
+    # The last expected calls may turn out not to be needed, depending on times.
+    assert events[-1].total >= len(events)
+    assert events[-1].remaining < max(event.remaining for event in events[1:])
+
+
+def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
+    fewer(monkeypatch)
+    cores = sweep.os.cpu_count()
+    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: cores + 2.0)
+    page = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).summary_page
+    assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in page.warning
+    assert "The times are invalid" in page.warning and page.warning in page.render_html()
+    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: 1.0)
+    assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
+
+
+def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
+    fewer(monkeypatch)
+
+    def watch(event):
+        if event.case.startswith("timing"):
+            seen.append(event)  # before each timing
+            if len(seen) == 6:
+                raise KeyboardInterrupt
+
+    seen = []
+    found = tune(boxes(EARLY), worlds=2, steps=10, repeats=1, watch=watch)
+    assert found.stopped and len(found.measured) == 5 and not found.held
+    assert "Stopped before the end" in found.summary_page.render_html()
+    assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
+
+
+@pytest.mark.parametrize(
+    ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "horizon"), ({"repeats": 0}, "repeats")]
+)
+def test_bad_words_are_told(boxes, given, words):
+    with pytest.raises(lv.InputError, match=words):
+        tune(boxes(), **{"worlds": 2, "steps": 20} | given)
+
+
+def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeypatch):
+    fewer(monkeypatch)
+    run = Stage.run_stretches
+
+    def dies(self, model, states=None):
+        if model.opt.iterations == 25:
+            raise mj.FatalError("out of memory")
+        return run(self, model, states)
+
+    monkeypatch.setattr(Stage, "run_stretches", dies)
+    found = tune(boxes(), worlds=2, steps=10, repeats=1)
+    assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
+    monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
+    with pytest.raises(lv.InputError, match="diverge"):
+        tune(boxes(), worlds=2, steps=10, repeats=1)
+
+
+def test_settings_of_mujoco_warp_are_measured(boxes, monkeypatch):
+    pytest.importorskip("mujoco_warp")
+    from lavender.audit.tune.world_settings import WarpEngine
+
+    keep_values(monkeypatch, WarpEngine, "table", {1, 1e-2, 20}, {"Newton", ""})
+    found = tune(boxes(EARLY), engine="mujoco_warp", worlds=2, steps=10, repeats=1)
+    by = {m.setting.option_line: m for m in found.measured}
+    one, twenty = (by[f'<option solver="Newton" iterations="{n}"/>'] for n in (1, 20))
+    assert twenty.worst_error < 0.1 * one.worst_error
+    assert all(0.0 < m.mean_step_time < np.inf and len(m.error) == 10 for m in found.measured)
+
+
+def test_settings_of_kamino_are_measured(monkeypatch):
+    pytest.importorskip("newton")
+    from lavender.audit.tune.world_settings import KaminoEngine
+
+    keep_values(monkeypatch, KaminoEngine, "table", {1e-3, 10, 400}, {""})
+    found = tune("boxes_stacked_on_plane", engine="kamino", worlds=2, steps=10, repeats=1)
+    by = {m.setting.option_line: m for m in found.measured}
+    few, many = (by[f"config.padmm.max_iterations = {n}"] for n in (10, 400))
+    assert many.worst_error < 0.1 * few.worst_error and many.worst_motion < few.worst_motion
+    assert "config.padmm.rho_0 = 10.0" in by
+    with pytest.raises(lv.InputError, match="sets its own"):
+        tune("boxes_stacked_on_plane", engine="kamino", control="zero")

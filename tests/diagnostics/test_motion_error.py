@@ -1,0 +1,193 @@
+"""Motion errors: distances of velocities from those of a reference, in the units of the problem."""
+
+import re
+import warnings
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from random_problems import as_matrix, random_contact_problem, random_generalized_problem, random_lcp, seeds
+
+import lavender as lv
+
+
+def cone_problem(seed):
+    return random_contact_problem(seed, friction="cone", spin=True)
+
+
+@pytest.mark.parametrize("form", ["rows", "J and M"])
+@given(seed=seeds)
+def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_difference(form, seed):
+    p = random_contact_problem(seed, friction="cone") if form == "rows" else random_generalized_problem(seed)
+    x = np.random.default_rng(seed).normal(size=p.m)
+    e = lv.motion_error(p, x)
+    if e.rows is None:
+        return
+    delta = x - e.reference
+    if form == "rows":
+        dv = p.velocity(x) - p.velocity(e.reference)
+        mass, speeds = (
+            np.linalg.inv(p.rows.inverse_mass_matrix().toarray()),
+            np.linalg.norm(dv[:, :3], axis=1),
+        )
+        assert e.spin == pytest.approx(np.linalg.norm(dv[:, 3:], axis=1).max(), rel=1e-9)
+        assert e.body_name == f"body {speeds.argmax()}"
+    else:
+        dv, mass = p.generalized.change(delta), p.generalized.mass.toarray()
+        speeds = np.abs(dv)
+        assert e.spin is None and e.body_name == p.generalized.velocity_name(int(speeds.argmax()))
+    assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv.ravel() @ mass @ dv.ravel()), rel=1e-9)
+    assert e.speed == pytest.approx(speeds.max(), rel=1e-9)
+    assert e.rows == pytest.approx(np.abs(p.slack(x) - p.slack(e.reference)).max(), rel=1e-9)
+    assert e.energy == pytest.approx(np.sqrt(0.5 * delta @ p.dense() @ delta), rel=1e-9)
+    assert e.kinetic <= e.energy * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("problem", "none", "some", "word"),
+    [
+        (random_lcp(4), ("kinetic", "speed"), ("energy", "rows", "relative"), ""),
+        (
+            lv.Problem.lcp([[2.0, 0.5], [0.0, 2.0]], [1.0, -1.0]),
+            ("energy", "relative"),
+            ("rows",),
+            "symmetric",
+        ),
+        (lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, -1.0], 0.0, 1.0), ("energy",), ("rows",), "semidefinite"),
+        (lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ("energy", "rows"), (), "no estimate"),
+    ],
+    ids=["matrix", "asymmetric", "indefinite", "infeasible"],
+)
+def test_motion_error_without_a_number_is_none_and_says_why(problem, none, some, word):
+    e = lv.motion_error(problem, np.zeros(problem.m))
+    assert [getattr(e, name) for name in none] == [None] * len(none)
+    assert all(getattr(e, name) > 0.1 for name in some)
+    assert word in e.note and word in str(e)
+
+
+@pytest.mark.parametrize("light", [1.0, 1e16])
+def test_asymmetry_of_heavy_bodies_beside_lighter_ones_leaves_no_energy(light):
+    heavy = [[1.0, 0.9], [-0.9, 1.0]]
+    problem = lv.Problem.lcp(sp.block_diag([sp.coo_array([[light]]), heavy]).toarray(), [1.0, 1.0, -0.5])
+    assert not problem.is_symmetric and problem.asymmetry == pytest.approx(1.8)
+    assert lv.motion_error(problem, np.zeros(3)).energy is None
+
+
+def test_default_reference_of_a_convex_law_is_solved_once(monkeypatch):
+    module, p = import_module("lavender.diagnostics.motion_error"), cone_problem(5)
+    first = lv.motion_error(p, p.start())
+    assert first.relative == pytest.approx(1.0)
+    monkeypatch.setattr(module, "solve", None)
+    again = lv.motion_error(p, first.reference)
+    assert again.energy == 0.0 and again.reference.tobytes() == first.reference.tobytes()
+
+
+def test_default_reference_under_coulombs_law_starts_from_the_impulse():
+    problem = lv.suite.case("painleve").problem
+    sticks = np.linalg.solve(problem.dense(), problem.b)
+    assert lv.motion_error(problem, np.zeros(2)).rows == 0.0
+    assert lv.motion_error(problem, sticks).rows < 1e-9  # not the 3 m/s to the open contact
+    assert lv.motion_error(problem, sticks, reference=np.zeros(2)).rows == pytest.approx(3.0)
+
+
+def test_given_reference_is_an_impulse_or_a_solution_and_is_judged():
+    p = cone_problem(6)
+    own = lv.solve(p, "newton", tol=1e-12)
+    errors = [lv.motion_error(p, p.start(), reference=x) for x in (own, own.impulse)]
+    assert errors[0].energy == errors[1].energy > 0.0
+    rough = lv.motion_error(p, p.start(), reference=0.5 * own.impulse)
+    assert rough.energy is None and rough.reference_residual.relative > 0.1
+    with pytest.raises(lv.InputError, match="reference"):
+        lv.motion_error(p, p.start(), reference=[1.0])
+
+
+def test_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
+    module = import_module("lavender.diagnostics.motion_error")
+    p, real = cone_problem(8), module.solve
+
+    def interrupted(*args, **more):
+        return replace(real(*args, **more), impulse=p.start(), status=lv.Status.INTERRUPTED)
+
+    monkeypatch.setattr(module, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        lv.motion_error(p, p.start())
+    monkeypatch.undo()
+    assert lv.motion_error(p, p.start()).relative == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("form", ["matrix", "bodies"])
+def test_rows_of_friction_ellipses_are_the_problems_own(form):
+    p = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.005)], friction="cone")
+    if form == "bodies":
+        p = lv.Problem.from_jacobian(
+            np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone"
+        )
+    x = lv.solve(p, tol=1e-13).impulse
+    y = x.copy()
+    y[2] *= 0.5
+    e = lv.motion_error(p, y)
+    assert e.rows == pytest.approx(np.abs(p.slack(y) - p.slack(x)).max(), rel=1e-6)
+    assert (e.row, e.row_name) == (2, p.row_name(2))
+
+
+def forms(seed):
+    rows = random_contact_problem(seed)
+    return {
+        "lcp": random_lcp(seed),
+        "cone": rows.relaxed("cone"),
+        "cone, matrix": as_matrix(rows.relaxed("cone")),
+        "coulomb": rows,
+    }
+
+
+@pytest.mark.parametrize("form", forms(0))
+def test_motion_errors_of_huge_impulses_scale_with_them_or_are_none(form):
+    problem = forms(1)[form]
+    reference = lv.solve(problem, tol=1e-14).impulse
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        far, near = (lv.motion_error(problem, 2.0**k * np.ones(problem.m), reference) for k in (520, 400))
+    assert near.rows > 0.0
+    for name in ("kinetic", "energy", "speed", "spin", "rows"):
+        value = getattr(far, name)
+        if value is None:
+            assert name in far.note or getattr(near, name) is None
+        else:
+            assert value == pytest.approx(getattr(near, name) * 2.0**120, rel=1e-9)
+
+
+def test_empty_problem_has_no_error():
+    e = lv.motion_error(lv.Problem.lcp(np.zeros((0, 0)), []), [])
+    assert e.energy == 0.0 and e.row_name == ""
+
+
+def test_line_of_a_motion_error_has_names_and_units():
+    bodies = random_contact_problem(3, contacts=6)
+    error = lv.solve(bodies, "pgs", tol=0.0, max_iter=3).motion_error()
+    text = str(error)
+    for name, unit in (("relative", ""), ("kinetic", r" sqrt\(J\)"), ("speed", r" m/s \(body \d+\)"),
+                       ("spin", r" rad/s \(body \d+\)"), ("rows", r" (m|rad)/s \(.+\)")):  # fmt: skip
+        assert re.search(rf"\b{name} [\d.e-]+{unit}", text), text
+    row = bodies.jacobian[[error.row]].toarray().reshape(-1, 6)
+    assert (f"rows {error.rows:.2g} rad/s" in text) == (not row[:, :3].any())
+    general = str(lv.solve(random_generalized_problem(3), tol=1e-2).motion_error())
+    assert " m/s or rad/s (" in general and "reference: relative " in general
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_motion_of_an_engine_step_is_the_motion_error_of_its_problem(friction):
+    scene = lv.Scene("stack", friction=friction, solver_iterations=4, substeps=1, order="given")
+    sim = lv.Simulation(scene, report_motion=True)
+    for _ in range(20):
+        problem = sim.constraint_problem()
+        *_, info = sim.step()
+    impulse = lv.solve(problem, "sequential_impulses", tol=0, max_iter=4).impulse
+    error = lv.motion_error(problem, impulse)
+    # 1e-6: the references are two solves to the floor, of errors of 1e-2 of the motion.
+    for key in ("relative", "speed"):
+        assert info["motion"][key] == pytest.approx(getattr(error, key), rel=1e-6)
+    # The plane is body 0 of the scene and no body of the rows.
+    assert info["motion"]["body"] == sim.scene.bodies[1 + error.body].name

@@ -1,0 +1,249 @@
+"""`redundancy`: ranks known by hand, names, uniqueness."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from hypothesis import given
+from kkt_truth import eliminate
+from random_problems import as_matrix, random_contact_problem, seeds, touching
+
+import lavender as lv
+from lavender.diagnostics.redundancy import redundancy
+from lavender.problem import operators
+
+
+def box_on_corners(mu=None, points=4):
+    """A unit cube, 1 kg, on the corners of its base."""
+    xy = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])[:points]
+    arm = np.column_stack([xy, np.full(len(xy), -0.5)])
+    falls = [[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]]
+    rows = touching([[-1, 0]] * len(arm), inv_inertia=[6.0 * np.eye(3)], v_free=falls, arm_b=arm)
+    if mu is None:
+        return lv.Problem.from_rows(rows)
+    return lv.Problem.from_rows(rows, mu=mu, tangents=2, friction="cone")
+
+
+@pytest.mark.parametrize("as_given", [lambda p: p, as_matrix])
+def test_a_cube_on_four_points(as_given):
+    """Rank 3 of the normals; 6 with friction: a rigid body has six motions."""
+    found = redundancy(as_given(box_on_corners()))
+    assert found.rank == 3
+    assert found.row_names == ("contact 3, normal",)
+    assert found.block_names == ("contact 3",)
+    assert not found.impulse_is_unique.any(), "the four share the load in any balanced way"
+    assert found.unique == ("slack", "body velocities", "objective")
+    assert redundancy(as_given(box_on_corners(0.5))).rank == 6
+
+
+def test_the_second_of_two_equal_hinges_is_named():
+    rng = np.random.default_rng(3)
+    jac = rng.normal(size=(5, 12))
+    rows = lv.Rows(
+        inv_mass=[1.0, 0.5, 2.0], inv_inertia=np.tile(np.eye(3), (3, 1, 1)), v_free=rng.normal(size=(3, 6)),
+        jac=np.vstack([jac, jac, rng.normal(size=(2, 12))]), joint_ptr=[0, 5, 10, 12],
+        joint_body=[[0, 1], [0, 1], [1, 2]],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, names=["hinge", "spare hinge", "rod"])
+    found = redundancy(problem)
+    assert found.rank == 7
+    assert found.block_names == ("spare hinge",)
+    assert found.rows == (5, 6, 7, 8, 9)
+    assert found.impulse_is_unique.tolist() == 10 * [False] + 2 * [True]
+    assert "spare hinge" in str(found)
+
+
+def test_blocks_of_one_row_keep_their_whole_name():
+    """Of the edges of a pyramid the last repeats the others, not the contact."""
+    edges = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
+    names = [f"contact 0 (floor, box), edge {k}" for k in range(4)]
+    problem = lv.Problem(
+        np.zeros(4), lv.Cones.bounded(np.zeros(4), np.full(4, np.inf)), matrix=edges @ edges.T, names=names
+    )
+    assert redundancy(problem).block_names == (names[3],)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "rank"),
+    [
+        (np.zeros((0, 0)), [], 0),
+        ([[1.0, 1.0 - 1e-8], [1.0 - 1e-8, 1.0]], [1.0, 1.0], 2),  # 2e-8 of A_ii, far above tol
+        ([[1.0, 1.0 - 1e-8], [1.0 - 1e-8 + 1e-12, 1.0]], [1.0, 1.0], 2),
+        ([[1.0, 1e12], [1e12, 1e26]], [1.0, 1.0], 2),
+        ([[1.0, 2.0**43], [2.0**43, 2.0**86]], [1.0, 2.0**43], 1),
+    ],
+)
+def test_ranks_of_matrices_by_hand(a, b, rank):
+    assert redundancy(lv.Problem.linear(a, b)).rank == rank
+
+
+@pytest.mark.parametrize("kind", ["asymmetric", "indefinite"])
+def test_the_rank_of_a_matrix_is_that_of_exact_numbers_whatever_the_units_of_its_rows(kind):
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        m, r = rng.integers(1, 9, 2)
+        g = rng.integers(-3, 4, (m, r)).astype(float)
+        h = rng.integers(-2, 3, (r, m)) if kind == "asymmetric" else rng.choice([-1.0, 1.0], r)[:, None] * g.T
+        size = 2.0 ** rng.integers(-20, 21, m)
+        a = size[:, None] * (g @ h) * (1.0 if kind == "asymmetric" else size)
+        truth = len(eliminate([[Fraction(x) for x in row] for row in a.tolist()], m))
+        assert redundancy(lv.Problem.linear(a, np.zeros(m))).rank == truth, a
+
+
+@given(seed=seeds)
+def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
+    rng = np.random.default_rng(seed)
+    m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
+    g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
+    a = g * signs @ g.T
+    a = np.block(
+        [[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]]
+    )
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
+    found = redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))
+    assert found.unique == ()
+    kept = np.setdiff1d(np.arange(m + 2), found.rows)
+    assert np.linalg.matrix_rank(a[kept], tol=1e-9 * np.linalg.norm(a, 2)) == found.rank
+
+
+@given(seed=seeds)
+def test_without_the_redundant_rows_the_rank_is_the_same(seed):
+    problem = as_matrix(random_contact_problem(seed, tangents=0, spin=False, bodies=2, contacts=12))
+    a = problem.dense()
+    found = redundancy(lv.Problem.linear(a, problem.b))
+    kept = np.setdiff1d(np.arange(problem.m), found.rows)
+    assert len(kept) == found.rank
+    again = redundancy(lv.Problem.linear(a[np.ix_(kept, kept)], problem.b[kept]))
+    assert again.rows == ()
+
+
+@pytest.mark.parametrize("share", [1e-4, 1e-8, 1e-10])
+def test_a_row_that_is_new_by_more_than_tol_is_kept(share):
+    """`tol` is a share of directions: 1e-12 of squares called rows redundant that were 1e-8 apart."""
+    rng = np.random.default_rng(5)
+    jac = rng.normal(size=(4, 6))
+    jac /= np.linalg.norm(jac, axis=1)[:, None]
+    new = np.linalg.svd(jac[:3])[2][-1]
+    jac[3] = rng.normal(size=3) @ jac[:3]
+    jac[3] = jac[3] / np.linalg.norm(jac[3]) + share * new
+    problem = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), cones=lv.Cones.free(4))
+    kept, dropped = redundancy(problem), redundancy(problem, tol=10.0 * share)
+    assert (kept.rank, dropped.rank) == (4, 3)
+    assert kept.tol == 1e-12 and dropped.tol == 10.0 * share
+    assert redundancy(replace(problem, precision="float32")).rank == (4 if share > 1e-6 else 3)
+    matrix = redundancy(as_matrix(problem))  # A has the squares of shares
+    assert matrix.rank == (4 if share > 1e-6 else 3) and matrix.tol == 1e-6
+
+
+def test_island_above_the_limit_of_rows_raises():
+    m = 3001
+    chain = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
+    with pytest.raises(lv.CapabilityError, match="3001 rows are coupled; at most 3000"):
+        redundancy(lv.Problem.linear(chain, np.zeros(m)))
+
+
+def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
+    rng, m = np.random.default_rng(1), 300
+    jac = sp.csr_array(sp.random_array((m, 240), density=4.0 / 240, rng=rng))
+    jac = jac[np.diff(jac.indptr) > 0]
+    a = sp.csr_array(jac @ jac.T)
+    unit = sp.diags_array(1.0 / np.sqrt(a.diagonal()))
+    values = np.linalg.eigvalsh((unit @ a @ unit).toarray())
+    found = redundancy(lv.Problem.linear(a, np.zeros(a.shape[0])))
+    assert not ((values > 1e-13) & (values < 1e-7)).any()  # zeros are roundings, all others far above
+    assert found.rank == np.count_nonzero(values > 1e-7)
+    kept = np.delete(np.arange(a.shape[0]), found.rows)
+    np.linalg.cholesky((unit @ a @ unit).toarray()[np.ix_(kept, kept)])  # and they are independent
+
+
+def test_a_share_that_is_none_is_refused():
+    with pytest.raises(lv.InputError, match="tol"):
+        redundancy(box_on_corners(), tol=2.0)
+
+
+def test_no_velocities():
+    nothing_moves = lv.Problem.from_jacobian(np.zeros((2, 0)), np.zeros((0, 0)), [], cones=lv.Cones.free(2))
+    assert redundancy(nothing_moves).rows == (0, 1)
+
+
+# -- rows and bodies of very different size -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
+@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 96])  # A_ii up to 1e59, the door is at 1e60
+def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
+    """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
+    rng = np.random.default_rng(spread)
+    seen = set()
+    for _ in range(10):
+        m, n = rng.integers(2, 6, 2)
+        jac = rng.integers(-2, 3, (m, n)).astype(float)
+        if m > 2 and rng.random() < 0.5:
+            jac[-1] = jac[0] + jac[1]
+        if not jac.any(axis=1).all():
+            continue
+        truth = len(eliminate([[Fraction(x) for x in row] for row in jac.tolist()], n))
+        size = 2.0 ** (spread * rng.integers(0, 2, n if form == "masses" else m))
+        if form == "matrix":
+            jac = np.sqrt(2.0 ** (2 * (np.log2(size) // 2)))[:, None] * jac
+            problem = lv.Problem.linear(jac @ jac.T, np.zeros(m))
+        else:
+            mass = np.diag(size) if form == "masses" else np.eye(n)
+            jac = jac if form == "masses" else size[:, None] * jac
+            problem = lv.Problem.from_jacobian(jac, mass, np.zeros(n), cones=lv.Cones.free(m))
+        found = lv.redundancy(problem)
+        assert found.rank == truth, (jac, size, str(found))
+        assert len(found.rows) == m - truth
+        seen.add(m - truth)
+    assert len(seen) > 1
+
+
+@pytest.mark.parametrize("form", ["matrix", "J, M and compliance"])
+def test_tangents_of_unlike_units_that_share_a_d_are_two_rows(form):
+    """A_tt = diag(s^2, 1): the mean of both hid the smaller one, at s^2 = 2^48, and its row counted as redundant."""
+    size = np.array([1.0, 2.0**24, 1.0])
+    jac = size[:, None] * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, 0.5, 1.0]])
+    if form == "matrix":
+        problem = lv.Problem.contact(jac @ jac.T, np.ones(3), [0.5])
+    else:
+        problem = lv.Problem.from_jacobian(
+            jac, np.eye(3), np.ones(3), cones=lv.Cones.contacts([0.5]), compliance=2.0**-30
+        )
+    found = redundancy(problem)
+    assert found.rank == 3 and found.impulse_is_unique.all()
+
+
+def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
+    """Of 60 boxes side by side each is small; with the columns of all, memory and time grow as their square."""
+    seen, qr = [], scipy.linalg.qr
+    monkeypatch.setattr(scipy.linalg, "qr", lambda a, **more: (seen.append(a.shape), qr(a, **more))[1])
+    one = np.random.default_rng(2).normal(size=(9, 4))
+    many = lv.Problem.from_jacobian(
+        np.kron(np.eye(60), one), np.eye(240), np.ones(240), cones=lv.Cones.free(540)
+    )
+    assert lv.redundancy(many).rank == 240
+    assert max(seen)[0] <= 5
+
+
+def test_entries_of_a_are_counted_once(monkeypatch):
+    """Rows that share all velocities of a tree meet once, not once for each of them."""
+    rng = np.random.default_rng(5)
+    jac = np.zeros((40, 30))
+    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
+    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
+    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40 + 1)
+    free = lv.Cones.free(40)
+    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
+    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
+    assert lv.redundancy(problem).rank == 1
+    twins = lv.Problem.from_jacobian(
+        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
+    )
+    assert twins.metric.entries_of_matrix == 40 * 40  # rows on two trees, too
+    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40)
+    with pytest.raises(lv.InputError, match="J and M as they are"):
+        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -1,0 +1,374 @@
+"""A worker outlives the backends that mean it harm, and believes none of them."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from stacks import stack
+
+import lavender as lv
+from lavender import bench, registry
+from lavender.base.subprocesses import unpack_answer
+from lavender.report.bench import cases as bench_cases
+from lavender.report.bench import machine
+from lavender.report.bench.running import timing
+from lavender.report.bench.running import worker as bench_worker
+from lavender.report.bench.running.worker import DIED_MESSAGE, Worker, parse_outcome
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
+BACKENDS = """
+import json, os, pickle, signal, struct, sys, time
+import numpy as np
+import lavender as lv
+
+class Backend:
+    def __init__(self, what): self.what = what
+    def prepare(self, problem): return problem
+    def update(self, state, problem): return problem
+    def run(self, state, impulse, n, tol, time_limit=None):
+        note = os.environ.get("FAKE_NOTE", "")
+        if self.what == "hang":
+            while True: time.sleep(1)
+        if self.what == "segfault": os.kill(os.getpid(), signal.SIGSEGV)
+        if self.what == "leave": os._exit(3)
+        if self.what == "talk":
+            print("noise" * 10000, flush=True); os.write(1, b"more noise"); print("noise", file=sys.stderr)
+            impulse[:] = state.b / state.matrix.diagonal()
+        if self.what == "fork":
+            child = os.fork()
+            if child:
+                open(note, "w").write(f"{os.getpid()} {child}")
+            while True: time.sleep(1)
+        if self.what == "escape":
+            if os.fork() == 0:
+                os.setsid()
+                open(note, "w").write(str(os.getpid()))
+                time.sleep(600)
+                os._exit(0)
+            while True: time.sleep(1)
+        if self.what == "eat": self.all = [np.empty(4 * 10**7) for _ in range(1000)]
+        if self.what == "forge":
+            class Trap:
+                def __reduce__(self): return os.system, (f"touch {note}",)
+            data = pickle.dumps(Trap())
+            frames = [struct.pack("<Q", len(data)) + data, struct.pack("<QQ", len(data), 0) + data]
+            for fd in range(3, 20):
+                for frame in frames:
+                    try: os.write(fd, frame)
+                    except OSError: pass
+        if self.what == "flood":
+            for fd in range(3, 20):
+                try: os.write(fd, struct.pack("<QQ", 2**60, 2**60) + b"x" * 1000)
+                except OSError: pass
+        if self.what == "quit": raise KeyboardInterrupt
+        if self.what == "lie":
+            import ctypes  # read-only or not: the problem that it holds is its own, and convinces nobody
+            ctypes.memset(state.b.ctypes.data, 0, 8 * state.m)
+            impulse[:] = 0.0
+        return lv.Claim(lv.Status.CONVERGED, 1, {"calls": 1}, str(os.getpid()))
+
+def make(what):
+    def factory(): return Backend(what)
+    return factory
+
+for n in NAMES:
+    globals()[n] = make(n)
+    # As a name with what it requires, or as docs/plugin.md has it.
+    how = ("hostile_backends:" + n, ("hostile_backends",)) if n in NAMES[::2] else (globals()[n], ())
+    globals()[n.upper()] = lv.SolverSpec("x_" + n, how[0], laws={"linear", "lcp"}, summary="test",
+                                         resumable=False, requires=how[1])
+"""
+
+
+HARM = ("hang", "segfault", "leave", "talk", "fork", "escape", "eat", "forge", "flood", "lie", "quit")
+
+
+@pytest.fixture
+def hostile(tmp_path, monkeypatch):
+    """Backends of a plug-in that mean harm, and the file where they note what they did."""
+    folder = tmp_path / "site"
+    info = folder / "hostile_backends-1.0.dist-info"
+    info.mkdir(parents=True)
+    (folder / "hostile_backends.py").write_text(f"NAMES = {HARM}\n{BACKENDS}")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: hostile-backends\nVersion: 1.0\n")
+    points = [f"x_{n} = hostile_backends:{n.upper()}" for n in HARM]
+    (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(points) + "\n")
+    monkeypatch.setattr(registry, "registered", dict(registry.specs()))
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setenv("FAKE_NOTE", str(tmp_path / "note"))
+    registry.register_all_solvers.cache_clear()
+    yield tmp_path / "note"
+    registry.register_all_solvers.cache_clear()
+
+
+@pytest.fixture
+def watchdog():
+    """An exception after ten minutes, where something waits for ever."""
+
+    def bark(*_):
+        raise TimeoutError("it hangs")
+
+    before = signal.signal(signal.SIGALRM, bark)
+    signal.alarm(600)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def task(problem, solver, time_limit=100.0, **more):
+    # Minutes, for machines that are busy with something else; what hangs asks for less.
+    sha = bench_cases.hash_problem(problem)
+    return bench.Task("run", "case", sha, solver, "tol", 1e-6, 0, time_limit, **more)
+
+
+def wait_until(true):
+    """Whether it comes true, soon or on a busy machine some time later."""
+    until = time.monotonic() + 600.0
+    while time.monotonic() < until:
+        if true():
+            return True
+        time.sleep(0.02)
+    return bool(true())
+
+
+def runs(pid):
+    """A process that is more than a number that nobody has fetched."""
+    try:
+        with open(f"/proc/{pid}/stat") as f:
+            return f.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="processes are seen in Linux's /proc")
+
+
+@pytest.mark.slow
+@PROC
+@pytest.mark.parametrize("how", ["fork", pytest.param("escape", marks=pytest.mark.nightly)])
+def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
+    """Its child ends with it, or has left the group and keeps the pipe; `watchdog` ends a test that waits."""
+    monkeypatch.setattr(bench_worker, "GRACE_TIME", 0.5)
+    p = stack()
+    with Worker() as worker:
+        worker.measure_task(p, task(p, "pgs"))  # starts the process
+        assert worker.measure_task(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
+        pids = list(map(int, hostile.read_text().split()))
+        assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
+        assert worker.measure_task(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
+    if how == "escape":
+        os.kill(pids[0], signal.SIGKILL)
+
+
+HANGS = """
+import sys
+from lavender import bench
+from lavender.report.bench.running.worker import Worker
+sys.path[:0] = [sys.argv[1]]
+from test_hostile_backends import stack, task
+p = stack()
+Worker().measure_task(p, task(p, "x_fork", time_limit=600.0))
+"""
+
+
+def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
+    p = stack()
+    with Worker() as worker:
+        record, _ = worker.measure_task(p, task(p, "x_quit"))
+        assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
+        record, _ = worker.measure_task(p, task(p, "direct", options={"nonsense": 1}))
+    assert record.status == "ERROR" and record.message.startswith("UnknownName: unknown option 'nonsense'")
+
+
+@pytest.mark.slow
+@PROC
+def test_a_worker_ends_when_its_parent_is_killed(hostile):
+    root = os.path.dirname(__file__)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])}
+    parent = subprocess.Popen([sys.executable, "-c", HANGS, root], env=environment)
+    assert wait_until(lambda: hostile.exists() and len(hostile.read_text().split()) == 2)
+    pids = list(map(int, hostile.read_text().split()))
+    assert all(map(runs, pids))
+    parent.kill()
+    parent.wait()
+    assert wait_until(lambda: not any(map(runs, pids)))
+
+
+LONG = """
+import sys, numpy as np, lavender as lv
+from scipy.sparse import diags_array
+from lavender import bench
+def hard(i):
+    chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
+    return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
+plan = bench.CampaignPlan(tolerances=(1e-9,), budgets=(), cap=10_000_000)
+bench.run([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
+"""
+
+
+def children(pid):
+    try:
+        with open(f"/proc/{pid}/task/{pid}/children") as f:
+            found = list(map(int, f.read().split()))
+    except FileNotFoundError:
+        return []
+    return [c for child in found for c in (child, *children(child))]
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(
+    not os.path.exists(f"/proc/self/task/{os.getpid()}/children"), reason="children are seen in Linux's /proc"
+)
+def test_workers_of_a_campaign_end_when_it_is_killed():
+    parent = subprocess.Popen([sys.executable, "-c", LONG], stderr=subprocess.DEVNULL)
+
+    def busy():
+        return [p for p in children(parent.pid) if cpu(p) > 1.5]
+
+    def cpu(pid):
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/stat") as f:
+            words = f.read().rpartition(")")[2].split()
+            return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+        return 0.0
+
+    assert wait_until(lambda: len(busy()) >= 1)
+    family = children(parent.pid)
+    parent.kill()
+    parent.wait()
+    assert wait_until(lambda: not any(map(runs, family)))
+
+
+def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
+    monkeypatch.setattr("lavender.report.bench.running.worker.GRACE_TIME", 0.5)
+    plan = bench.Plan(
+        tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
+    )  # a hundred times what they take
+    records = bench.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan)
+    said = [r.status for r in records]
+    assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
+    assert (
+        records.records[0].claim_check == "contradicted"
+    )  # its diagonal step does not solve a stack, and it says so
+    assert int(records.records[0].message) != os.getpid()
+
+
+def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
+    died = ["CRASHED (exit status 3)", "CRASHED (SIGSEGV)", "CONVERGED"]
+    table = lv.cross_check(stack(4), ["x_leave", "x_segfault", "pgs"], "x_leave")
+    assert [row.status for row in table] == died
+    assert table["x_leave"].note == DIED_MESSAGE and table.reference_note.endswith(
+        f"(x_leave: TaskFailed: {died[0]}: {DIED_MESSAGE})"
+    )
+    monkeypatch.setattr("lavender.report.bench.running.worker.GRACE_TIME", 0.5)
+    (row,) = lv.cross_check(stack(4), "x_hang", time_limit=0.1)
+    assert row.status == "KILLED"
+
+
+def test_a_command_survives_what_ends_its_process(hostile, tmp_path, capsys):
+    cli = pytest.importorskip("lavender.cli", reason="the floor above is not here")
+    stack(4).save(tmp_path / "stack.npz")
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", str(tmp_path / "stack.npz"), "--solver", "x_leave"])
+    assert end.value.code == cli.EXIT_UNMET and "CRASHED (exit status 3)" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        cli.main(["check", str(tmp_path / "stack.npz"), "--solvers", "x_leave,pgs"])
+    assert end.value.code == cli.EXIT_UNMET and "CRASHED (exit status 3)" in capsys.readouterr().out
+
+
+def test_memory_is_limited_without_asking(hostile, watchdog):
+    p = stack()
+    with Worker() as worker:  # 320 GB, untouched: nothing but a limit refuses it
+        record, _ = worker.measure_task(p, task(p, "x_eat"))
+    assert record.status in ("ERROR", "NUMERICAL_ERROR")
+    assert "MemoryError" in record.message
+    assert worker.memory == machine.get_memory_per_process() == max(2**31, machine.get_total_memory() // 2)
+    assert machine.get_memory_per_process(10**9) == 2**31
+
+
+@POSIX
+@pytest.mark.parametrize("how", ["forge", "flood"])
+def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, monkeypatch, how):
+    monkeypatch.setattr(bench_worker, "GRACE_TIME", 1.0)
+    p = stack()
+    with Worker() as worker:
+        record, _ = worker.measure_task(p, task(p, f"x_{how}"))
+        assert record.status in ("CRASHED (no answer)", "KILLED")
+        assert worker.measure_task(p, task(p, "pgs"))[0].status == "CONVERGED"
+    assert not hostile.exists()
+
+
+def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backend_held(hostile, watchdog):
+    p = stack()
+    start = np.linspace(0.0, 1.0, p.m)
+    with Worker() as worker:
+        record, _ = worker.measure_task(p, task(p, "x_lie"))
+        assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
+        assert "says CONVERGED" in record.status_conflict
+        for solver, more in (("pgs", {}), ("direct", {}), ("pgs", {"start": "carried"})):
+            asked = task(p, solver, **more)
+            far, there = worker.measure_task(p, asked, start)
+            near, here = timing.measure_task(p, asked, start)
+            np.testing.assert_array_equal(here, there)
+            times = {
+                n: 0.0
+                for n in vars(near)
+                if n.startswith(("time_m", "setup_", "solve_", "calibration_time", "load"))
+            }
+            assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
+
+
+def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_process():
+    """Carrying impulses is timed here: on a loaded machine it took longer than the whole answer."""
+    p = stack()
+    lead = 100.0  # s
+    with Worker() as worker:
+        asked = task(p, "pgs", start="carried", timing_mode="call", repeats=2, lead=lead)
+        record, impulse = worker.measure_task(p, asked, np.zeros(p.m))
+        assert record.status == "CONVERGED" and impulse is not None
+        assert len(record.times) == 1 and lead <= record.times[0] < lead + 60.0
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},
+        {"status": "GREAT"},
+        {"iterations": -1},
+        {"iterations": True},
+        {"work": {"sweeps": "many"}},
+        {"message": 3},
+        {"setups": []},
+        {"setups": [0.0, 0.0]},
+        {"solves": [1e9]},
+        {"solves": [float("nan")]},
+        {"times": [1e9]},
+        {"times": [float("nan")]},
+        {"times": None},
+        {"calibration_time": "fast"},
+        {"sizes": [4, 4]},
+        {"sizes": [2, 2]},
+        {"sizes": [None, 4]},
+        {"sizes": [4]},
+        {"sizes": 4},
+    ],
+)
+def test_an_answer_that_is_none_is_refused(said):
+    good = {
+        "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
+        "setups": [0.01], "solves": [0.02], "times": [0.04], "calibration_time": 1e-4, "sizes": [4, None],
+    }  # fmt: skip
+    numbers = np.ones(4).tobytes()
+    assert parse_outcome(*unpack_answer(json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3
+    wrong = {} if not said else good | said
+    with pytest.raises(ValueError, match=r".+"):
+        parse_outcome(*unpack_answer(json.dumps(wrong).encode(), numbers), 4, 1.0)
+    with pytest.raises(ValueError, match=r".+"):
+        unpack_answer(pickle.dumps(good), numbers)

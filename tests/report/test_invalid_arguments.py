@@ -1,0 +1,145 @@
+"""Invalid and extreme input of what measures and examines problems: rejected by name, or measured by numbers."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from extreme_problems import build_problem, problem_data
+from hypothesis import assume, given, reject
+from invalid_values import Call, make_tests_of_calls
+from random_families import wild
+from random_problems import nearly_singular, random_contact_problem, seeds, warmed
+from worked import after
+
+import lavender as lv
+from lavender import bench, suite
+from lavender.suite import hard
+
+A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+LCP = lv.Problem.lcp(A, B)
+CONTACT = random_contact_problem(3)
+
+SLIDING = lv.Problem.from_jacobian(
+    np.eye(3)[[2, 0, 1]], np.eye(3), [0.5, 0.0, -1.0], cones=lv.Cones.contacts(0.2)
+)
+
+CALLS = {
+    "Solution.motion_error": Call(lv.solve(LCP, tol=1e-12).motion_error, {"reference": B}),
+    "cross_check": Call(
+        lv.cross_check,
+        {"problem": LCP, "solvers": ["pgs"], "reference": "direct", "tol": 1e-6, "max_iter": 100, "time_limit": 1.0},
+        {"reference": "solver"},
+    ),
+    "diagnose": Call(
+        lv.diagnose,
+        {"problem": CONTACT, "impulse": np.zeros(CONTACT.m), "velocity": CONTACT.rows.v_free,
+         "gap": np.zeros(len(CONTACT.rows.normal)), "dt": 0.01},
+    ),
+    "motion_error": Call(lv.motion_error, {"problem": LCP, "impulse": B, "reference": B}),
+    "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
+    "bench.Plan": Call(
+        bench.Plan,
+        {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
+         "orders": ("given",), "times": (), "warm": True, "campaign": True},
+    ),
+    "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
+    "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
+    "bench.resolve_sources": Call(
+        bench.resolve_sources, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
+        accepts={"sequences": ("None",)},
+    ),
+    "bench.resolve, a problem": Call(lambda case: bench.resolve_sources([case]), {"case": LCP}),
+    "bench.make_sequence": Call(bench.make_sequence, {"problems": [LCP], "name": "walk"}),
+    "bench.select_solver_names": Call(lambda solvers: bench.select_solver_names(solvers), {"solvers": ["pgs"]}),
+    "bench.carry_impulses": Call(
+        bench.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
+    ),
+    "bench.classify_structure": Call(bench.classify_structure, {"problem": LCP}),
+    "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
+    "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
+    "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),
+    "suite.get_case_names_of_set": Call(suite.get_case_names_of_set, {"text": "@hard"}, {"text": "set"}),
+    "explain_slip": Call(lv.explain_slip, {"problem": SLIDING, "impulse": np.zeros(3), "tol": 1e-9}),
+}  # fmt: skip
+
+#: Public calls that are not in the table, and why.
+NOT_CALLED = {
+    **dict.fromkeys(
+        ("CrossCheck", "MotionError", "SlipExplanation", "Redundancy", "Diagnostic"),
+        "a result: the package makes it",
+    ),
+    "CrossCheck.__getitem__": "a mapping by the names of solvers",
+}
+
+
+(
+    test_every_public_call_that_measures_is_in_the_table,
+    test_malformed_arguments_are_rejected_by_name,
+    test_arrays_in_any_memory_layout_give_the_same_result,
+) = make_tests_of_calls("measuring", CALLS, NOT_CALLED)
+
+
+# -- extreme numbers ------------------------------------------------------------------------------------------------
+
+MEASURES = ("kinetic", "energy", "speed", "spin", "rows")
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@given(data=problem_data(), exponent=st.integers(-1070, 1020))
+def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent):
+    """A motion error is finite, or its `note` says why there is none."""
+    try:
+        problem = build_problem(data)
+    except lv.InputError:
+        reject()
+    for impulse in (np.full(problem.m, 2.0**exponent), lv.solve(problem).impulse):
+        if not np.isfinite(impulse).all():
+            continue
+        error = lv.motion_error(problem, impulse)
+        values = {name: getattr(error, name) for name in MEASURES}
+        assert [name for name, value in values.items() if value is not None and not np.isfinite(value)] == []
+        assert error.relative is None or np.isfinite(error.relative) or error.note
+        assert str(error)
+    if problem.m and problem.is_symmetric:
+        result = lv.redundancy(problem)
+        assert 0 <= result.rank == problem.m - len(result.rows)
+
+
+#: Scenes and their parameters, of which one value each is drawn.
+SCENES = {
+    "stack": {"n": (3, 6, 10)}, "pyramid": {"base": (3, 4)}, "card_house": {"levels": (2, 3)}, "chain": {"n": (5, 20)},
+    "bridge": {"n": (6, 12)}, "heavy_on_light": {"ratio": (1.0, 10.0, 1e3)}, "table": {"legs": (3, 4, 9)},
+    "four_bar": {}, "ramp": {"angle": (0.1, 0.35, 0.6)}, "pile": {"n": (8, 16)},
+}  # fmt: skip
+
+
+@st.composite
+def slow_problems(draw):
+    """A problem on which sweeps creep, stop or diverge, and its name."""
+    source, seed = draw(st.sampled_from(("scene", "scene", "hard", "singular", "wild", "warm"))), draw(seeds)
+    if source == "scene":
+        name = draw(st.sampled_from(sorted(SCENES)))
+        parameters = {key: draw(st.sampled_from(values)) for key, values in SCENES[name].items()}
+        parameters["solver_iterations"] = draw(st.sampled_from((4, 8, 16, 32)))
+        return after(draw(st.integers(1, 120)), name, **parameters).constraint_problem()
+    if source == "hard":
+        return suite.case(draw(st.sampled_from(hard.SET))).problem
+    if source == "singular":
+        return nearly_singular(seed)
+    problem = wild(seed=seed % 10**6, rows=200).problem
+    return problem if source == "wild" else warmed(problem, seed) or problem
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@given(
+    problem=slow_problems(),
+    solver=st.sampled_from(lv.available(external=False, resumable=True)),
+    tol=st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12)),
+    max_iter=st.sampled_from((None, None, None, 200, 3000)),
+)
+def test_claims_of_iterative_solvers_that_make_little_progress_are_confirmed(problem, solver, tol, max_iter):
+    assume(0 < problem.m <= 700 and not lv.get(solver).refuses(problem))
+    solution = lv.solve(problem, solver, tol=tol, **({} if max_iter is None else {"max_iter": max_iter}))
+    assert solution.claim_check == "confirmed", solution.status_conflict
+    assert np.isnan(solution.sweeps_per_decade) or 0.0 < solution.sweeps_per_decade < np.inf
