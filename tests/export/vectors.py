@@ -33,9 +33,9 @@ ARRAYS: dict[str, Any] = {
 }
 #: Solvers by their numbers in the library.
 METHODS = {
-    name: parse_enum_constants(_HEADER)[f"LAV_{name.upper()}"]
+    name: number
     for name, spec in registry.specs().items()
-    if spec.builtin and not spec.external and not spec.delegates
+    if spec.builtin and (number := parse_enum_constants(_HEADER).get(f"LAV_{name.upper()}"))
 }
 #: Solvers with results in the library that differ in bits from the package: the package uses another factorisation, or
 #: the solver is a sequence of solvers.

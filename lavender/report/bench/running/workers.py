@@ -84,6 +84,7 @@ def _call_in_worker(parent: int, function: Callable[..., Any], call_arguments: t
     """Call the function in a worker, which ends when its parent does."""
     if parent and parent != os.getpid():
         _end_this_process_with_parent(parent)
+        warnings.filterwarnings("ignore", "solver plug-in")  # The parent has reported it.
     return function(*call_arguments)
 
 
