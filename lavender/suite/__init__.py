@@ -119,6 +119,13 @@ SETS: dict[str, tuple[str, ...]] = {
         "granular(n=4, friction=cone)",
     ),
     "hard": hard.SET,
+    # Coulomb's law on about 3,000 and 20,000 rows, at rest and sliding.
+    "large": (
+        *("granularF(n=6)", "granularF(n=6, sliding=0.5)", "granularF(n=6, sliding=2, seed=4)"),
+        *("wall(n=10)", "wall(n=10, sliding=0.5)", "pyramidF(k=16)", "pyramidF(k=16, sliding=0.5)"),
+        *("granularF(n=11)", "granularF(n=11, sliding=0.5)", "pyramidF(k=40)", "pyramidF(k=40, sliding=0.5)"),
+        *("wall(n=25)", "wall(n=25, sliding=0.1)", "wall(n=25, sliding=0.5)"),
+    ),
     "engine": tuple(
         f"engine_step(scene={scene}, at={at})"
         for scene in ("stack", "pyramid", "bridge", "four_bar", "heavy_on_light", "table")

@@ -26,12 +26,12 @@ def map_scalar(function: Callable[[float], float], x: Any) -> FloatArray:
 
 
 class Bodies:
-    """Bodies with isotropic inertia; v_free holds the velocity after one step of gravity."""
+    """Bodies whose inertia is isotropic or has 3 principal moments; v_free is the velocity after a step of gravity."""
 
-    def __init__(self, position: Any, mass: Any, inertia_per_mass: float) -> None:
+    def __init__(self, position: Any, mass: Any, inertia_per_mass: Any) -> None:
         self.position = np.asarray(position, float).reshape(-1, 3)  # (n, 3) m
         self.mass = np.broadcast_to(np.asarray(mass, float), (len(self.position),)).copy()  # (n,) kg
-        self.inertia = inertia_per_mass * self.mass  # (n,) kg m^2
+        self.inertia = np.multiply.outer(self.mass, inertia_per_mass)  # (n,) or (n, 3) kg m^2
         self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
         self.v_free[:, 2] = -FALL_SPEED
 
@@ -46,7 +46,7 @@ class Bodies:
             }
         inv_inertia = np.zeros((len(self.mass), 3, 3))
         inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (
-            (1.0 / self.inertia)[:, None] if np.all(self.inertia > 0.0) else 0.0
+            (1.0 / self.inertia).reshape(len(self.mass), -1) if np.all(self.inertia > 0.0) else 0.0
         )
         return Rows(1.0 / self.mass, inv_inertia, self.v_free, copy=False, **more)
 

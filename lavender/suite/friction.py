@@ -13,6 +13,7 @@ from lavender.suite.build import (
     FALL_SPEED,
     Bodies,
     Contacts,
+    add_horizontal_velocity,
     build_contact_problem,
     map_scalar,
     place_corner_contacts,
@@ -232,3 +233,40 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     a, b, point, normal = zip(*contacts, strict=True)
     problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
     return Draft(problem, "held by friction only, over several levels", expect=EXPECT_EXACT)
+
+
+@register_family()
+def wall(n: int = 10, sliding: float = 0.0, mu: float = 0.6) -> Draft:
+    """n courses of n bricks (2 m x 1 m x 1 m, 2 kg) in running bond: four points on each half and between the ends.
+
+    n = 10 and 25 have 3,252 and 21,612 rows.
+    """
+    check_min_sizes(1, n=n)
+    signs = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
+    position: list[list[float]] = []
+    contacts: list[tuple[int, int, list[float], list[float]]] = []
+
+    def lay(below: int, brick: int, x: float, z: float, half: float) -> None:
+        contacts.extend((below, brick, [x + half * s, 0.5 * t, z], [0.0, 0.0, 1.0]) for s, t in signs)
+
+    for course in range(n):
+        shift, first = course % 2, (course - 1) * n  # Number of the first brick below
+        for k in range(n):
+            x, z, brick = 2.0 * k + shift, float(course), course * n + k
+            position.append([x, 0.0, z + 0.5])
+            if course == 0:
+                lay(-1, brick, x, z, 1.0)
+            else:
+                for below in (k - 1 + shift, k + shift):
+                    if 0 <= below < n:
+                        lay(first + below, brick, x + below - k + 0.5 - shift, z, 0.5)
+            if k > 0:
+                contacts.extend(
+                    (brick - 1, brick, [x - 1.0, 0.5 * s, z + 0.5 + 0.5 * t], [1.0, 0.0, 0.0])
+                    for s, t in signs
+                )
+    bodies = Bodies(position, 2.0, np.array([2.0, 5.0, 5.0]) / 12.0)
+    add_horizontal_velocity(bodies, sliding)
+    a, b, point, normal = zip(*contacts, strict=True)
+    problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
+    return Draft(problem, "many redundant contacts in two directions, of any size")
