@@ -1,7 +1,8 @@
 """Cost of exact friction against the number of rows: `auto`, named solvers, mixes of them, another checkout, Siconos.
 
     python -m benchmarks scale [--structures NAMES] [--rows N ...] [--sliding V ...] [--spread S ...] [--seed 7]
-                               [--limit 20] [--base CHECKOUT ...] [--siconos PYTHON] [--out FILE] [--figure FILE]
+                               [--case NAME ...] [--limit 20] [--base CHECKOUT ...] [--siconos PYTHON] [--out FILE]
+                               [--from FILE ...] [--figure FILE]
 
 Every solve runs in a process of its own, which reads the problem from a file, solves a small problem first, and then
 solves to `TOL` without a start: CPU time of one thread, smallest of alternating runs if a run is short; increase of the
@@ -20,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ while best == float("inf") or (best < task["repeat"] and spent < 3.0 * best):
         solution = lv.solve(law_problem, solver, impulse=impulse, tol=task["tol"], time_limit=remaining,
                             **({"max_iter": count} if count else {}))
         impulse = solution.impulse
-        names += [stage.solver for stage in solution.stages] or [solver]
+        names += [stage.solver for stage in getattr(solution, "stages", ())] or [solver]
         for key, value in solution.work.items():
             work[key] = work.get(key, 0) + value
         if len(task["stages"]) > 1 and lv.residual(problem, impulse).relative <= task["tol"]:
@@ -185,8 +186,10 @@ def print_tables(lines: list[dict[str, Any]]) -> None:
     click.echo(markdown(
         ["structure", "sliding [m/s]", "mass spread", "seed", "rows", "auto [s]", "memory [MiB]", "factorisations",
          "best", "best [s]", "regret", *(f"{name} [s]" for name in extra)], rows))  # fmt: skip
-    for label, group in (("all", STRUCTURES), ("held out", HELD_OUT)):
-        regrets = [compute_regret(line)[0] for line in lines if line["structure"] in group]
+    for label in ("all", "held out"):
+        regrets = [
+            compute_regret(line)[0] for line in lines if label == "all" or line["structure"] in HELD_OUT
+        ]
         solved = [regret for regret in regrets if regret == regret]
         if solved:
             click.echo(f"\nregret, {label}: median {np.median(solved):.2f}, worst {max(solved):.2f}; "
@@ -215,31 +218,39 @@ def print_tables(lines: list[dict[str, Any]]) -> None:
 
 
 def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
-    """Draw the time of `auto` against the number of rows: one panel for bodies at rest, one for bodies that slide."""
+    """Draw the time of `auto` against rows for equal masses: bodies at rest, bodies that slide; crosses: not solved."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
-    for axis, title, moving in zip(axes, ("at rest", "sliding"), (False, True), strict=True):
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4.2), sharey=True, layout="constrained")
+    speeds = sorted({line["sliding"] for line in lines} - {0.0})[-1:]  # The largest speed of the measurements
+    for axis, speed in zip(axes, (0.0, *speeds), strict=False):
         for k, name in enumerate(STRUCTURES):
-            points = sorted((line["m"], line["runs"]["auto"]["time"]) for line in lines if line["structure"] == name
-                            and (line["sliding"] > 0.0) == moving and line["runs"]["auto"]["solved"])  # fmt: skip
-            if points:
-                axis.plot(
-                    *zip(*points, strict=True),
-                    "o-" if not moving else "o",
-                    color=f"C{k}",
-                    ms=4,
-                    lw=1,
-                    label=name,
-                )
-        axis.set(xscale="log", yscale="log", xlabel="rows", title=title)
+            chosen = sorted(
+                (line["m"], line["runs"]["auto"]["time"], line["runs"]["auto"]["solved"])
+                for line in lines
+                if (line["structure"], line["sliding"], line["spread"]) == (name, speed, 0.0)
+            )
+            for solved, style in ((True, "o-"), (False, "x")):
+                points = [(m, time) for m, time, reached in chosen if reached == solved and time == time]
+                if points:
+                    label = name if solved or not any(reached for *_, reached in chosen) else None
+                    axis.plot(*zip(*points, strict=True), style, color=f"C{k}", ms=4, lw=1, label=label)
+        axis.set(
+            xscale="log",
+            yscale="log",
+            xlabel="rows",
+            title=f"sliding at {speed:g} m/s" if speed else "at rest",
+        )
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("CPU time of auto to 1e-6 [s]")
+    start = np.array([3e3, 2e5])
+    axes[0].plot(start, 2e-6 * start, "k:", lw=1, label="proportional to rows")
+    axes[0].set_ylabel(f"CPU time of auto to {TOL:g} [s]")
     axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 @click.command("scale")
@@ -256,6 +267,7 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
     "--spread", multiple=True, type=float, default=(0.0, 1.0), show_default=True, help="Spread of log mass."
 )
 @click.option("--seed", multiple=True, type=int, default=(7,), show_default=True)
+@click.option("--case", "cases", multiple=True, help="A suite case instead of structures; several times.")
 @click.option(
     "--solvers", default=",".join(CONTESTANTS), help="Contestants, separated by commas; auto is always run."
 )
@@ -269,17 +281,21 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
 @out_option("Write every measurement to this JSON file, after each problem.")
 def command(
     structures: str, rows: tuple[int, ...], sliding: tuple[float, ...], spread: tuple[float, ...],
-    seed: tuple[int, ...], solvers: str, limit: float, bases: tuple[Path, ...], siconos: str, read: tuple[Path, ...],
-    figure: Path | None, out: Path | None,
+    seed: tuple[int, ...], cases: tuple[str, ...], solvers: str, limit: float, bases: tuple[Path, ...], siconos: str,
+    read: tuple[Path, ...], figure: Path | None, out: Path | None,
 ) -> None:  # fmt: skip
     """Measure the cost of exact friction against the number of rows."""
     names = ["auto", *(name for name in split_names(solvers, CONTESTANTS) if name != "auto")]
     if siconos:
         check_siconos(siconos)
     lines: list[dict[str, Any]] = [line for path in read for line in json.loads(path.read_text())["lines"]]
-    plan = () if read else product(split_names(structures, STRUCTURES), rows or SIZES, sliding, spread, seed)
-    for name, size, speed, deviation, draw in plan:
-        problem = build(name, size, speed, deviation, draw)
+    plan = product(split_names(structures, STRUCTURES), rows or SIZES, sliding, spread, seed)
+    problems = (
+        ((name, size, speed, deviation, draw), build(name, size, speed, deviation, draw))
+        for name, size, speed, deviation, draw in (() if read or cases else plan)
+    )
+    named = ((describe_case(case), case.problem) for case in map(lv.suite.case, cases))
+    for (name, size, speed, deviation, draw), problem in chain(problems, named):
         runs = measure(problem, names, [base.resolve() for base in bases], limit)
         if siconos and problem.m <= SICONOS_MAX_ROWS:
             runs |= dict(run_siconos(problem, siconos, limit))
@@ -293,6 +309,12 @@ def command(
     print_tables(lines)
     if figure is not None:
         draw_figure(lines, figure)
+
+
+def describe_case(case: lv.suite.Case) -> tuple[str, int, float, float, int]:
+    """Return structure, rows, sliding [m/s], spread and seed of a suite case; the structure is the case's name."""
+    values = case.parameters
+    return case.name, case.problem.m, values.get("sliding", 0.0), 0.0, values.get("seed", 0)
 
 
 def split_names(text: str, known: dict[str, Any]) -> list[str]:

@@ -47,25 +47,45 @@ def test_exponent_of_a_power_is_its_power():
     assert abs(fit_exponent(rows, 2e-6 * rows**1.25) - 1.25) < 1e-12  # rounding of logarithms
 
 
-def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(tmp_path):
+@pytest.mark.parametrize(
+    ("arguments", "structure"),
+    [
+        (["--structures", "pile", "--rows", "300", "--sliding", "0", "--spread", "0"], "pile"),
+        (["--case", "granularF(n=3, sliding=0.5)"], "granularF(n=3, sliding=0.5)"),
+    ],
+)
+def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(tmp_path, arguments, structure):
     out = tmp_path / "scale.json"
-    arguments = [
-        "--structures",
-        "pile",
-        "--rows",
-        "300",
-        "--sliding",
-        "0",
-        "--spread",
-        "0",
-        "--out",
-        str(out),
-    ]
-    done = CliRunner().invoke(command, [*arguments, "--solvers", "sweeps, relaxed then exact"])
+    mix = ["--solvers", "sweeps, relaxed then exact", "--out", str(out)]
+    done = CliRunner().invoke(command, [*arguments, *mix])
     assert done.exit_code == 0, done.output
     (line,) = json.loads(out.read_text())["lines"]
+    assert line["structure"] == structure
+    assert line["sliding"] == (0.5 if "sliding=0.5" in structure else 0.0)
     assert set(line["runs"]) == {"auto", "sweeps, relaxed then exact"}
     for found in line["runs"].values():
         assert found["solved"] == (found["residual"] <= 1e-6)
         assert found["time"] > 0.0
     assert line["runs"]["auto"]["solved"]
+
+
+def test_command_reads_measurements_prints_their_exponent_and_draws_them(tmp_path):
+    def line(m, sliding, time, solved):
+        auto = {
+            "time": time,
+            "memory": 1.0,
+            "residual": 1e-7 if solved else 1e-3,
+            "solved": solved,
+            "work": {},
+        }
+        runs = {"auto": auto, "newton": auto | {"time": 2.0 * time, "solved": True}}
+        return {"structure": "wall", "m": m, "sliding": sliding, "spread": 0.0, "seed": 7, "runs": runs}
+
+    written, figure = tmp_path / "scale.json", tmp_path / "scale.png"
+    rest = [line(m, 0.0, 1e-6 * m**1.5, True) for m in (3_000, 10_000, 30_000)]
+    written.write_text(json.dumps({"lines": [*rest, line(3_000, 0.5, 5.0, False)]}))
+    done = CliRunner().invoke(command, ["--from", str(written), "--figure", str(figure)])
+    assert done.exit_code == 0, done.output
+    assert "| wall | 0 | 3000 | 30000 | 1.50 | 0 |" in done.output
+    assert "median 0.50, worst 0.50; 1 of 4 problems not solved by auto" in done.output
+    assert figure.read_bytes().startswith(b"\x89PNG")
