@@ -20,10 +20,7 @@ from random_problems import (
 import lavender as lv
 
 # The largest number that a problem may have; the smallest mass or coefficient.
-LARGEST, SMALLEST = (
-    1e60,
-    1e-60,
-)
+LARGEST, SMALLEST = (1e60, 1e-60)
 SPECIAL = (
     0.0,
     5e-324,

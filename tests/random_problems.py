@@ -88,14 +88,7 @@ def touching(contact_body, **fields):
     return Rows(**defaults | fields)
 
 
-def random_contact_problem(
-    seed,
-    friction="coulomb",
-    tangents=None,
-    spin=True,
-    rolling=False,
-    **sizes,
-):
+def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, rolling=False, **sizes):
     """Draw a problem of bodies with free and bounded joint rows, and contacts.
 
     `tangents` is the number of tangents of each contact; None mixes 0, 1 and 2. `sizes` are the numbers of bodies,
@@ -163,11 +156,7 @@ def random_ellipse_friction_contacts(seed, friction="coulomb", **sizes):
 
 
 #: Name of each form of A -> function that converts a problem of bodies to this form.
-FORMS = {
-    "rows": lambda problem: problem,
-    "matrix": as_matrix,
-    "J and M": general,
-}
+FORMS = {"rows": lambda problem: problem, "matrix": as_matrix, "J and M": general}
 #: Kind of contact -> function (seed, friction, **sizes) that draws a problem of bodies with such contacts.
 CONTACTS = {
     "disks": partial(random_contact_problem, tangents=2, spin=False),
@@ -231,13 +220,7 @@ def ancestors(parent, i):
 
 
 def random_generalized_problem(
-    seed,
-    friction="cone",
-    n=14,
-    compliance=True,
-    contacts=5,
-    tangents=2,
-    spin=False,
+    seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False
 ):
     """Draw J and M of a random forest with free and bounded rows and contacts, each row on one or two chains."""
     rng = np.random.default_rng(seed)

@@ -22,13 +22,7 @@ from lavender import registry, suite
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 
-CASES = (
-    "two_particles",
-    "box_stack(n=2)",
-    "chain(n=4)",
-    "box_stack(n=2, friction=cone)",
-    "box_stackF(n=2)",
-)
+CASES = ("two_particles", "box_stack(n=2)", "chain(n=4)", "box_stack(n=2, friction=cone)", "box_stackF(n=2)")
 # The loosest third of the settings reach this residual on problems of a few rows.
 CLOSE = 1e-2
 

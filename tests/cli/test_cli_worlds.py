@@ -160,10 +160,7 @@ def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes
         ),
         (("record", "--out", "r", "--steps", 0), "lavender: --steps is 0;"),
         (("slip", "--steps", 0), "lavender: --steps is 0;"),
-        (
-            ("slip", "--contact", "wheel"),
-            "lavender: --contact names 'wheel', but no geom's name contains it",
-        ),
+        (("slip", "--contact", "wheel"), "lavender: --contact names 'wheel', but no geom's name contains it"),
     ],
 )
 def test_an_invalid_number_names_the_option_of_the_command(lavender, boxes, words, message):

@@ -155,11 +155,7 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
 
 MAGIC = b"LAVVEC3\0"
 # Counters of `work` that the library counts as iterations.
-ITERATION_COUNTS = (
-    "sweeps",
-    "factorisations",
-    "solves",
-)
+ITERATION_COUNTS = ("sweeps", "factorisations", "solves")
 
 
 @dataclass(frozen=True)

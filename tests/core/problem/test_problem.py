@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import (
-    FORMS,
-    arrays_of,
-    as_matrix,
-    random_contact_problem,
-    random_lcp,
-    seeds,
-    touching,
-)
+from random_problems import FORMS, arrays_of, as_matrix, random_contact_problem, random_lcp, seeds, touching
 from worked import python
 
 import lavender as lv
