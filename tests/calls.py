@@ -125,7 +125,7 @@ def robot(seed, m=12, n=10, soft=True, number=np.float64):
     )  # fmt: skip
 
 
-MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
+MORE, REACHED, CERTIFICATE = 0, 1, 4
 
 
 def driven(problem, tol=1e-9, budget=1500, work=10**6):

@@ -10,7 +10,6 @@ from mujoco_scene import mj, whole_mass
 
 import lavender as lv
 from lavender.audit import audit as module
-from lavender.audit import simulated_worlds
 from lavender.audit.audit import AUDIT_VERDICTS, audit
 from lavender.audit.simulated_worlds import Frame, Runs
 from lavender.io.efc import from_efc
@@ -368,15 +367,6 @@ def test_audit_refuses_wrong_arguments_by_name(boxes, tmp_path, monkeypatch, giv
         audit(boxes(), **{"worlds": 1, "steps": 2, "workers": 1} | given)
 
 
-def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypatch):
-    def ends(*_):
-        raise mj.FatalError("not supported")
-
-    monkeypatch.setattr(mj, "mj_forward", ends)
-    with pytest.raises(lv.InputError, match="state 0: MuJoCo raised an error, not supported"):
-        audit(boxes(), worlds=1, steps=12, workers=1)
-
-
 @pytest.mark.filterwarnings("ignore")
 def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
@@ -559,16 +549,3 @@ def test_audit_counts_each_verdict_once(boxes):
     assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
     assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
-
-
-def test_audit_of_a_model_that_an_engine_rejects_in_its_first_step_says_so(boxes, monkeypatch):
-    """MJX accepts a model with the integrator "discrete", and raises an error when it steps it."""
-
-    def reject(ctrl):
-        raise NotImplementedError("integrator 4 not implemented.")
-
-    monkeypatch.setattr(simulated_worlds, "WarpWorlds", lambda mj, model, arrays: reject)
-    with pytest.raises(
-        lv.InputError, match=r"'mujoco_warp' does not accept .*boxes.xml: integrator 4 not implemented"
-    ):
-        audit(boxes(), worlds=1, steps=2, engine="mujoco_warp")

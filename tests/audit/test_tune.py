@@ -11,7 +11,6 @@ import lavender as lv
 from lavender.audit.audit import audit
 from lavender.audit.simulated_worlds import Runs, StepSizes
 from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
-from lavender.audit.tune.measured import Schedule
 from lavender.audit.tune.mujoco_settings import MujocoSetting as Setting
 from lavender.audit.tune.mujoco_settings import MujocoStage as Stage
 from lavender.audit.tune.mujoco_settings import list_first_settings
@@ -50,26 +49,6 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
     same = stage.judge_setting(Setting.from_options(handle, made, **mujoco_settings.CONVERGED_OPTIONS))
     assert same.motion.max() == 0.0 and same.worst_error < 1e-9
-
-
-def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
-    runs = Runs(str(boxes()), 1, 40)
-    handle, made = runs.load_model()
-    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
-    found = [stage.judge_setting(s) for s in (Setting(), Setting((("iterations", 5),)))]
-    rng, now = np.random.default_rng(1), 0.0
-
-    def busy():
-        nonlocal now
-        now += 1e-6 + (rng.random() < 0.05)  # one time in twenty somebody else has a second
-        return now
-
-    monkeypatch.setattr(mujoco_settings, "perf_counter", busy)
-    stage.time_settings(found, 6, Schedule(None))
-    for m in found:
-        assert m.mean_step_time == pytest.approx(
-            1e-6, abs=1e-9
-        )  # the clock itself rounds to 1e-14 of its 30 s
 
 
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
@@ -177,20 +156,6 @@ def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
     assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
 
 
-def test_the_terminal_shows_the_front_beyond_the_present_time():
-    now = measured(10.0, 0.4)
-    loose = [measured(float(t), 1.0 / t, iterations=t) for t in (2, 4, 6, 8)]
-    slow = [measured(10.0 + k, 10.0 ** -(k + 2), tolerance=10.0**-k) for k in range(1, 8)]
-    shown = chosen(now, *loose, *slow).terminal_settings
-    assert shown[:3] == [now, loose[0], loose[-1]]
-    assert shown[3:] == [slow[0], slow[2], slow[4], slow[6]]
-    assert chosen(now).terminal_settings == [now]
-    # An error that is hardly smaller is not worth a row.
-    assert len(chosen(now, slow[0], measured(12.0, 0.95e-3, tolerance=1e-3)).terminal_settings) == 2
-    texts = [row[0] for row in chosen(now, *loose, *slow).terminal_table.cell_texts]
-    assert texts[:2] == ["model's own setting", "iterations=2"] and texts[-1] == "tolerance=1e-07"
-
-
 def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
     now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
     found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
@@ -206,14 +171,6 @@ def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
     assert chosen(now, astray).faster is None
 
 
-def test_both_sides_of_the_choice_are_printed():
-    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
-    held = [measured(10.0, 2e-3), measured(11.0, 3e-3, iterations=9)]
-    lines = chosen(now, quick, held=held).lines
-    assert "0.80 of the time, error 1.0e-3" in lines[1]
-    assert "1.10 of the time, error 3.0e-3 m/s instead of 2.0e-3" in lines[2]
-
-
 def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
     now, quick, exact = (
         measured(10.0, 1e-3),
@@ -226,19 +183,6 @@ def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
         lines = [line for line in chosen(now, quick, exact, held=held).lines if "<option" in line]
         assert len(lines) == 2
         assert all(("not on the worlds held back" in line) == refuted for line in lines)
-
-
-def test_the_largest_error_held_back_is_told_with_the_probability_of_a_larger_one(boxes, monkeypatch):
-    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
-    held = [measured(10.0, 2e-3), measured(8.0, 2e-3, iterations=9)]
-    held[1].error[7] = 0.5
-    found = replace(chosen(now, quick, held=held), n_held_worlds=8)
-    assert found.lines[2].endswith("instead of 2.0e-3 (at most 0.5 in 100 steps)")
-    assert "8 worlds and not a bound" in found.summary_page.render_html()
-    assert "probability of up to 1/9" in found.summary_page.render_html()
-    assert "1/9" not in replace(found, held=[]).summary_page.render_html()
-    fewer(monkeypatch)
-    assert tune(boxes(EARLY), worlds=5, steps=10, repeats=1).n_held_worlds == 2
 
 
 @pytest.mark.parametrize("how", [{"stopped": True}, {"busy": "The machine was busy: load 9.0"}])
@@ -262,22 +206,6 @@ def test_a_line_after_the_model_s_own_option_wins_and_before_it_does_not():
     assert mj.MjModel.from_xml_string(after).opt.iterations == 50
     assert mj.MjModel.from_xml_string(before).opt.iterations == 7
     assert "after the model's own <option>" in mujoco_settings.MERGE_NOTE
-
-
-def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
-    fewer(monkeypatch)
-    events = []
-    tune(boxes(EARLY), worlds=2, steps=10, repeats=2, watch=events.append)
-    texts = [event.case for event in events]
-    assert texts[0] == "judging: the model's own setting"
-    assert any(text.startswith("judging: <option ") for text in texts)
-    assert "timing: round 2 of 2, the model's own setting" in texts
-    assert any(text.startswith("timing: round 1 of 2, <option ") for text in texts)
-    assert [event.done for event in events] == list(range(len(events)))
-    assert events[0].remaining is None and all(event.remaining >= 0.0 for event in events[1:])
-    # The last expected calls may turn out not to be needed, depending on times.
-    assert events[-1].total >= len(events)
-    assert events[-1].remaining < max(event.remaining for event in events[1:])
 
 
 def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):

@@ -191,15 +191,6 @@ def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
     assert len(said) == 1 or said[0].startswith("Usage: "), err
 
 
-def test_the_time_of_a_solve_holds_no_loading_of_modules():
-    code = (
-        "import sys, lavender; s = sys.modules['lavender.solving.solve']; real = s.solve\n"
-        "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
-        "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
-    )
-    assert python("-c", code).stdout.startswith("True\n")
-
-
 def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_told(lavender, tmp_path):
     model, folder = tmp_path / "model.xml", tmp_path / "reported"
     model.write_text("<mujoco/>")

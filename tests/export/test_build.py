@@ -19,7 +19,6 @@ from tower import self_test_problem
 import lavender as lv
 from lavender import export as export
 from lavender.base.errors import LavenderError
-from lavender.sim.web import extract_c
 
 CHECK = Path(__file__).parent / "parity" / "check.c"
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
@@ -191,25 +190,6 @@ def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_pat
     said = []
     exec(python, {"print": said.append})
     np.testing.assert_allclose(said[0], [0.5, 0.0], atol=1e-15)
-
-
-KERNEL = """
-#ifndef Py_PYTHON_H
-#error no
-#else
-static PyObject *__pyx_d = 0;
-void lav_bad(void) { Py_INCREF(__pyx_d); }
-double lav_pong(double x);
-double lav_round(double x) { return lav_pong(x); }
-double lav_pong(double x) { return lav_round(x); }
-#endif
-"""
-
-
-@pytest.mark.parametrize("used, sign", [("k_bad()", "the Python part"), ("k_round(1)", "is a cycle")])
-def test_a_cut_that_needs_python_or_itself_is_refused(used, sign):
-    with pytest.raises(extract_c.ExtractionError, match=sign):
-        extract_c.extract_c([("a", KERNEL)], f"double lav_use(double x) {{ {used}; return x; }}")
 
 
 @pytest.mark.slow

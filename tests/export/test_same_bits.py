@@ -9,7 +9,7 @@ import pytest
 import random_problems as rp
 from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
-from vectors import OTHER_BITS, NotSupported, is_accepted_by_library, make_test_vector, run_compiled_newton
+from vectors import OTHER_BITS, NotSupported, is_accepted_by_library, run_compiled_newton
 
 import lavender as lv
 
@@ -194,15 +194,6 @@ def test_vectors_are_of_methods_that_the_library_takes(library):
     assert len(looked) > len(METHODS)
 
 
-def test_no_vector_of_sweeps_over_a_matrix_that_the_library_does_not_form():
-    rng = np.random.default_rng(0)
-    given = lv.Problem.from_jacobian(
-        rng.normal(size=(9, 12)), np.eye(12) + 0.1, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3)
-    )
-    with pytest.raises(NotSupported, match="formed A"):
-        make_test_vector(given, "pgs", 0.0, 5, {})
-
-
 @pytest.mark.parametrize(
     ("method", "asked", "words"),
     [
@@ -274,14 +265,6 @@ def test_velocities_are_those_of_the_problem(library):
     out = np.zeros(18)
     assert library.c.lav_velocity(solver.at, out.ctypes.data, 18) == 0
     np.testing.assert_allclose(out.reshape(3, 6), given.velocity(solver.impulse()), rtol=0.0, atol=1e-14)
-
-
-def test_islands_are_what_shares_no_body(library):
-    given = rp.random_contact_problem(3)
-    solver = library.open(library.problem(given), library.options("block_gauss_seidel"))
-    label = np.full(given.n_blocks, -1, np.int32)
-    count = library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
-    assert count >= 1 and sorted(set(label.tolist())) == list(range(count))
 
 
 def count_islands(library, given, **arrays):
@@ -438,35 +421,6 @@ def motion(library, solver, impulse, reference):
     at = [ct.c_void_p(x.ctypes.data) for x in (impulse, reference)]
     assert library.c.lav_motion_error(solver.at, *at, len(impulse), ct.byref(out)) == 0
     return out
-
-
-def test_a_motion_beside_which_compliance_stores_much_more_is_measured(library):
-    # 1/2 x.A x = 1e-18 / 2 + 1 / 2: as a difference the motion's share of it would be 0.
-    rows = lv.Rows(
-        [1e-18],
-        np.zeros((1, 3, 3)),
-        [-np.eye(6)[0]],
-        jac=[np.eye(12)[6]],
-        joint_body=[[-1, 0]],
-        joint_ptr=[0, 1],
-    )
-    given = lv.Problem.from_rows(rows, compliance=[1.0])
-    solver = library.open(library.problem(given), library.options("sequential_impulses"))
-    impulse, reference = np.array([2.0]), np.array([1.0])
-    found, wanted = (motion(library, solver, impulse, reference), lv.motion_error(given, impulse, reference))
-    assert found.kinetic == pytest.approx(wanted.kinetic, rel=1e-12) and wanted.kinetic > 0.0
-    assert found.relative == pytest.approx(1.0, rel=1e-12)
-    found = motion(library, solver, np.array([1e200]), np.array([1.0]))  # whose energy float64 does not hold
-    assert found.energy == found.relative == np.inf
-    found = motion(library, solver, np.array([1.0]), np.array([0.0]))
-    assert found.kinetic > 0.0 and found.relative == np.inf  # the reference moves nothing
-
-
-def test_the_motion_of_no_rows_is_none(library):
-    given = lv.Problem.from_rows(lv.Rows(np.ones(1), np.eye(3)[None], np.zeros((1, 6))))
-    solver = library.open(library.problem(given), library.options("newton"))
-    found = motion(library, solver, np.zeros(0), np.zeros(0))
-    assert (found.kinetic, found.energy, found.relative, found.row, found.body) == (0.0, 0.0, 0.0, -1, -1)
 
 
 def test_frames_of_float32_are_made_whole_as_the_package_does(library):

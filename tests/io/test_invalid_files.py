@@ -15,12 +15,10 @@ import scipy.sparse as sp
 from hypothesis import given
 from invalid_values import Call, check_float32, make_tests_of_calls, public_calls
 from random_problems import random_contact_problem
-from scipy.sparse.csgraph import connected_components
 
 import lavender as lv
 from lavender import io
 from lavender.io import fclib
-from lavender.io.condensed import bound_condensed_entries
 
 h5py = pytest.importorskip("h5py")
 resource = pytest.importorskip("resource")
@@ -306,20 +304,6 @@ def contents(mass, h):
     )
 
 
-def test_a_condensed_matrix_is_at_most_as_large_as_predicted():
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        n, m = int(rng.integers(1, 30)), 3 * int(rng.integers(1, 12))
-        h = np.where(rng.random((n, m)) < 0.15, rng.standard_normal((n, m)), 0.0)
-        mass = np.diag(rng.uniform(1.0, 2.0, n))
-        for _ in range(int(rng.integers(0, n))):
-            i, j = rng.integers(0, n, 2)
-            mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
-        file = contents(mass, h)
-        label = connected_components(file.M, directed=False)[1]
-        assert file.build_problem().csr.nnz <= bound_condensed_entries(label, file.H)
-
-
 def test_dense_factors_are_rejected_and_banded_ones_are_not():
     n = 1200
     rng = np.random.default_rng(2)
@@ -495,84 +479,3 @@ def test_a_damaged_file_is_rejected_by_its_path_or_holds_a_valid_problem(data, t
     for solver in ("auto", "pgs") if problem.m <= 200 else ():
         if lv.get(solver).refuses(problem) is None:
             lv.solve(problem, solver, max_iter=20)
-
-
-# -- memory of MuJoCo that was overwritten ----------------------------------------------------------------------------
-
-INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
-           "M_rownnz")  # fmt: skip
-NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
-           "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qvel", "M")  # fmt: skip
-COUNTS = ("nefc", "ncon", "nJ")
-OPTIONS = ("jacobian", "cone", "timestep", "integrator", "noslip_iterations", *COUNTS)
-WHOLE = (-1, -2, 0, 1, 2, 3, 5, 7, 100, 2**15, 2**20, 2**30, 2**31 - 1, -(2**31))
-REAL = (0.0, -0.0, 1.0, -1.0, 1e300, -1e300, 1e-300, np.nan, np.inf, -np.inf)
-
-
-def overwrite(model, data, name, places, value):
-    """Write a value at some places (shares of the length); what MuJoCo does not let be written stays."""
-    with contextlib.suppress(TypeError, ValueError, OverflowError, AttributeError):
-        if name in OPTIONS:
-            home = data if name in COUNTS else model.opt
-            setattr(home, name, type(getattr(home, name))(value))
-            return
-        home = model if name.startswith("M_") else data.contact if name in ("dim", "geom") else data
-        array = np.asarray(getattr(home, name)).reshape(-1)
-        for place in places if array.size else ():
-            array[place * array.size // 1000] = value
-
-
-def may_change_the_problem(edit):
-    """Whether an edit may make another valid problem: an option, a bound, or a number of something that exists.
-
-    An entry of M or J that nothing moves or pushes has no effect to which it could be compared.
-    """
-    name, _, value = edit
-    exists = name in ("efc_id", "efc_type", "dim") and 0 <= value < 100
-    return name in OPTIONS or name in ("efc_frictionloss", "efc_J", "M") or exists
-
-
-def assert_same_problem(problem, other):
-    """Require the same problem but for rounding."""
-    assert problem.cones == other.cones
-    for numbers in (
-        lambda p: p.b, lambda p: p.compliance, lambda p: p.generalized.v_free, lambda p: p.jacobian.toarray(),
-        lambda p: p.generalized.mass.toarray(),
-    ):  # fmt: skip
-        np.testing.assert_allclose(numbers(problem), numbers(other), rtol=1e-5, atol=1e-6)
-
-
-def edits_of(names, values):
-    """Edits of arrays with these names."""
-    places = st.lists(st.integers(0, 999), min_size=1, max_size=20)
-    return st.tuples(st.sampled_from(names), places, st.sampled_from(values))
-
-
-@pytest.mark.fuzz
-@pytest.mark.filterwarnings("error")
-@given(
-    cone=st.sampled_from(("elliptic", "pyramidal")),
-    condim=st.sampled_from((1, 3, 4, 6)),
-    jacobian=st.sampled_from(("dense", "sparse")),
-    edits=st.lists(
-        edits_of(INDICES, WHOLE) | edits_of(NUMBERS, REAL) | edits_of(OPTIONS, WHOLE + REAL), min_size=1, max_size=3
-    ),
-)  # fmt: skip
-def test_overwritten_memory_of_mujoco_is_rejected_or_a_finite_problem(cone, condim, jacobian, edits):
-    pytest.importorskip("mujoco")
-    from mujoco_scene import state
-
-    model, data = state(cone, condim=condim, jacobian=jacobian)
-    expected = io.from_mujoco(model, data)
-    for edit in sorted(edits, key=lambda edit: edit[0] in COUNTS):  # Nothing is written behind those.
-        overwrite(model, data, *edit)
-    readers = (io.from_mujoco, io.mujoco.jacobian, io.mujoco.scaling, io.mujoco.impulse)
-    for read in (*readers, lambda model, data: list(io.from_mujoco(model, data).names)):
-        try:
-            result = read(model, data)
-        except lv.LavenderError:
-            continue
-        if isinstance(result, lv.Problem):
-            assert np.isfinite(result.b).all()
-            if not any(map(may_change_the_problem, edits)):
-                assert_same_problem(result, expected)

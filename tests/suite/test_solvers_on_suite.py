@@ -10,7 +10,6 @@ from scipy.linalg import block_diag
 
 import lavender as lv
 from lavender import suite
-from lavender.solvers.auto import Auto
 
 
 @pytest.mark.parametrize("form", GIVEN)
@@ -97,23 +96,6 @@ def test_what_a_callback_raises_comes_through():
 
     with pytest.raises(Enough):
         lv.solve(suite.stack(64).problem, "pgs", callback=callback)
-
-
-def test_a_set_up_that_was_stopped_begins_again(monkeypatch):
-    prepared = lv.prepare(suite.case("pyramidF(k=6)").problem, "auto")
-    prepare, calls = Auto.prepare, []
-
-    def stopped(self, problem):
-        calls.append(problem)
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-        return prepare(self, problem)
-
-    monkeypatch.setattr(Auto, "prepare", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        prepared.solve(max_iter=50)
-    assert prepared.solve(max_iter=50).iterations > 0
-    assert len(calls) == 2
 
 
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "nncg", "anderson"])

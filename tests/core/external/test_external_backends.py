@@ -4,7 +4,6 @@ import itertools
 import os
 import signal
 import sys
-import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,8 +17,8 @@ from worked import python
 import lavender as lv
 from lavender import registry
 from lavender.external import as_qp, backends, qp_solver
-from lavender.external.as_qp import build_program, choose_program_form, compute_backend_tolerance
-from lavender.external.running import Answer, capture_backend_output
+from lavender.external.as_qp import build_program, compute_backend_tolerance
+from lavender.external.running import Answer
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
 
@@ -90,38 +89,6 @@ def test_highs_takes_standard_output_from_the_process_for_its_greeting_alone(mon
         patch.setattr(os, "dup2", None)
         again = lv.solve(problem, "highs")
     assert again.success, again
-
-
-def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_several(capfd):
-    """The second enters while the first is inside, and leaves last: each hears itself, and a third is not silenced."""
-    before = sys.stdout, sys.stderr, warnings.filters.copy(), warnings.showwarning
-    gate = threading.Barrier(3, timeout=600)
-
-    def run(mine, first):
-        if not first:
-            gate.wait()
-        with capture_backend_output(noisy=True) as said:
-            if first:
-                gate.wait()
-            gate.wait()  # both are inside
-            print("a backend's word")
-            warnings.warn(mine, stacklevel=1)
-            if not first:
-                gate.wait()  # the first has left
-        if first:
-            gate.wait()
-        return said
-
-    with ThreadPoolExecutor(2) as pool:
-        heard = [pool.submit(run, mine, mine == "one") for mine in ("one", "two")]
-        gate.wait()
-        gate.wait()
-        sys.stdout.write("this thread's word")
-        gate.wait()
-        assert [future.result() for future in heard] == [["one"], ["two"]]
-    assert (sys.stdout, sys.stderr, warnings.filters, warnings.showwarning) == before
-    os.write(1, b", and the process's")
-    assert capfd.readouterr() == ("this thread's word, and the process's", "")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
@@ -546,25 +513,3 @@ def test_units_do_not_reach_the_backend():
         assert (one.P != two.P).nnz == 0 and (one.A != two.A).nnz == 0
         # A residual is relative to speeds.
         assert compute_backend_tolerance(one, 1e-6) == compute_backend_tolerance(two, 1e-6)
-
-
-def test_auto_takes_the_form_by_size_mass_ratio_and_backend():
-    rng = np.random.default_rng(4)
-    rows = random_bodies_and_contacts(rng, bodies=5, joints=0, contacts=8)
-    small = lv.Problem.from_rows(rows)
-    assert choose_program_form(small, "auto") == "impulse"  # 8 rows, 30 velocities
-    assert choose_program_form(small, "auto", definite=True) == "velocity"
-    assert choose_program_form(as_matrix(small), "auto", definite=True) == "impulse"
-    many = lv.Problem.from_rows(random_bodies_and_contacts(rng, bodies=2, joints=0, contacts=13))
-    assert choose_program_form(many, "auto") == "velocity"  # 13 rows, 12 velocities
-    inv_mass = rows.inv_mass.copy()
-    inv_mass[0] /= 1e4
-    heavy = lv.Rows(
-        inv_mass, rows.inv_inertia, rows.v_free, normal=rows.normal, tangent=rows.tangent,
-        arm_a=rows.arm_a, arm_b=rows.arm_b, contact_body=rows.contact_body,
-    )  # fmt: skip
-    assert choose_program_form(lv.Problem.from_rows(heavy), "auto") == "velocity"
-    with pytest.raises(lv.CapabilityError, match="needs a problem with bodies"):
-        choose_program_form(as_matrix(small), "velocity")
-    with pytest.raises(lv.InputError, match="'impulse' or 'velocity' or 'program' or 'auto'"):
-        choose_program_form(small, "dual")

@@ -85,22 +85,6 @@ def test_what_is_not_asked_for_need_not_exist():
     twice(by_mu)
 
 
-def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compiled():
-    given, contacts = GIVEN[0], lv.Cones.contacts
-    made = make_step(given, None, "coulomb", "auto", 1e-10)
-    assert make_step(given, contacts(0.7, 2, count=2), "coulomb", "auto", 1e-10) is made  # mu is an array's
-    for cones, *others in (
-        (None, "cone", "auto", 1e-10),
-        (None, "coulomb", "newton", 1e-10),
-        (None, "coulomb", "auto", 1e-9),
-        (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]), "coulomb", "auto", 1e-10),
-        (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 2.0]), "coulomb", "auto", 1e-10),
-    ):
-        other = make_step(given, cones, *others)
-        assert other is not made and other is make_step(given, cones, *others)
-        made = other
-
-
 @pytest.mark.parametrize("name", ["torch", "jax"])
 def test_a_missing_package_is_named(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)

@@ -9,7 +9,6 @@ from scipy.optimize import linprog
 
 import lavender as lv
 from lavender import registry
-from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import prove_infeasibility
 
 OURS = lv.available(external=False)
@@ -51,18 +50,6 @@ def test_what_is_proved_is_said(name):
         )  # the sum of (2 / eps + 1, 2 / eps)
         assert words in solution.message
     assert lv.solve(opposed(1.0), name).impulse_bound is None
-
-
-def test_a_direction_is_not_polished_where_that_ends_after_the_deadline():
-    problem, y = opposed(0.0), np.array([1.0, 1.0 + 1e-9])
-    late = prove_infeasibility(problem, y, 1e-6, Deadline(1e-12))
-    assert late.reason and late.skipped_time > 0.0
-    assert (
-        prove_infeasibility(problem, y, 1e-6) is late
-    )  # whoever checks the claim takes no time for it either
-    assert prove_infeasibility(problem, y, 1e-6, Deadline(1e-12)) is late
-    assert not prove_infeasibility(problem, y, 1e-6, NEVER).reason  # one who has it does
-    assert not prove_infeasibility(problem, y, 1e-6).reason
 
 
 def held(law, soft, form):

@@ -5,7 +5,6 @@ import pytest
 from random_problems import random_contact_problem, random_lcp, without_solution
 
 import lavender as lv
-from lavender.judge.residuals import combine_best_islands
 from lavender.solvers.islands import find_islands
 
 DT = 1.0 / 60.0
@@ -85,19 +84,6 @@ def test_sweeps_asymmetric_matrix_with_motor_holds_the_free_rows():
     solution = lv.solve(given, "pgs", max_iter=10)
     slack = given.csr @ solution.impulse - given.b
     assert abs(solution.impulse).max() > 0.0 and abs(np.delete(slack, 2)).max() < 1e-2
-
-
-def test_combine_best_islands_selects_each_island_by_its_own_objective():
-    first, second = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([[1.0]])
-    a = np.block([[first, np.zeros((2, 1))], [np.zeros((1, 2)), second]])
-    problem = lv.Problem.lcp(a, [1.0, 0.3, 2.0])
-    assert find_islands(problem)[0] == 2
-    one, other = np.array([0.5, 0.0, 0.1]), np.array([0.1, 0.0, 1.9])
-    best = combine_best_islands(problem, (np.zeros(3),), (one, other), 1e-9)
-    np.testing.assert_array_equal(best, [0.5, 0.0, 1.9])
-    outside = np.array([0.6, -0.1, 1.9])  # a lower objective than any impulse inside its bounds
-    best = combine_best_islands(problem, (one,), (outside,), 1e-9)
-    np.testing.assert_array_equal(best[:2], one[:2])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import assume, example, given
+from hypothesis import assume, given
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
@@ -13,10 +13,7 @@ from lavender.base.lu import factor_sparse_lu
 from lavender.judge.certificates import check_certificate
 from lavender.solvers import pivoting
 from lavender.solvers.costs import estimate_result_cost
-from lavender.solvers.direct import Direct
-from lavender.solvers.pivoting import DenseFactor, PivotState
-from lavender_ext.pivot import direct, principal
-from lavender_ext.pivot.principal import SMALL_PIVOT
+from lavender_ext.pivot import direct
 
 
 def spd(rng, m, spread=2.0):
@@ -74,28 +71,6 @@ def test_every_factorisation_reaches_rounding(case):
     assert solution.claim_check == "confirmed"
     assert good(solution), solution
     assert solution.work["factorisations"] >= 1
-
-
-@example(seed=0, m=6, band=0, bound=63)  # at a bound every row: its zeros would be pivots at rounding
-@example(seed=0, m=6, band=1, bound=63)
-@given(seed=seeds, m=st.integers(1, 9), band=st.integers(0, 3), bound=st.integers(0, 511))
-def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
-    rng = np.random.default_rng(seed)
-    lower = sum((np.diag(rng.normal(size=m - k), -k) for k in range(min(band, m - 1) + 1)), np.zeros((m, m)))
-    a = lower @ lower.T + np.eye(m)
-    free = np.array([not bound >> i & 1 for i in range(m)])
-    wide = np.where(free, np.inf, 0.0)
-    problem = lv.Problem.lcp(a, rng.normal(size=m), -wide, wide)
-    lv.residual(problem, np.zeros(m))  # the error of doing nothing, which what is found is measured against
-    order = rng.permutation(m).astype(np.int32)
-    for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
-        rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
-        rows.set_start(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
-        assert rows.advance(1) == principal.SOLVED
-        expected = np.zeros(m)
-        expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
-        # Condition of 1 + L L^T with |L| of a few: far below 1e4.
-        np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("a", [tridiagonal(400), sp.csr_array(tridiagonal(400) @ tridiagonal(400))])
@@ -250,17 +225,6 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
             assert lv.solve(lv.Problem.linear(full, b), solver).claim_check == "confirmed"
 
 
-@pytest.mark.parametrize("m", [4, 70])
-def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
-    a = np.eye(m)
-    a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10,
-    a[2:4, 2:4] = 1.0  # and without one
-    state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
-    state.rows.set_start(np.zeros(m), 1e-13, 0)
-    assert [state.rows.advance(4) for _ in range(2)] == [SMALL_PIVOT, SMALL_PIVOT]
-    assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
-
-
 @pytest.mark.parametrize("share", [0.3, 1.5, 2.5, 4.0, 20.0])
 def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeypatch):
     """All were one turn: 4.2 ms under a limit of 1 ms."""
@@ -286,42 +250,6 @@ def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeyp
         assert found.success and found.impulse.tobytes() == free.impulse.tobytes()
     else:
         assert found.status is lv.Status.TIME_LIMIT and (found.iterations > 0) == (share > 1.0)
-
-
-@given(seed=seeds, m=st.integers(2, 40), part=st.integers(1, 9))
-def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, max(1, m // 2))) * 10.0 ** rng.uniform(-2, 2, size=(m, 1))
-    problem = lv.Problem.lcp(g @ g.T, rng.normal(size=m), upper=rng.uniform(0.1, 2.0, size=m))
-    solver, claims = Direct(), []
-    whole = solver.run(solver.prepare(problem), np.zeros(m), 1000, 1e-9)
-    state, impulse = solver.prepare(problem), np.zeros(m)
-    while not claims or claims[-1].status is lv.Status.MAX_ITERATIONS:
-        claims.append(solver.run(state, impulse, part, 1e-9))
-        assert claims[-1].iterations <= part and len(claims) <= 1000
-    assert claims[-1].status is whole.status
-    rows = state.pivot.rows
-    assert sum(claim.iterations for claim in claims) == rows.n_rounds
-    assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
-
-
-def test_ctrl_c_between_two_rounds_gives_the_best_of_them(monkeypatch):
-    rng, m = np.random.default_rng(1), 150
-    g = rng.normal(size=(m, m // 2))
-    b, low, high = rng.normal(size=m), -np.abs(rng.normal(size=m)), np.abs(rng.normal(size=m))
-    problem = lv.Problem.lcp(g @ g.T, b, low, high)
-    factor, calls = DenseFactor.factor, []
-
-    def interrupted(self, *given):
-        calls.append(self)
-        if len(calls) == 90:
-            raise KeyboardInterrupt
-        return factor(self, *given)
-
-    monkeypatch.setattr(DenseFactor, "factor", interrupted)
-    solution = lv.solve(problem, "direct", tol=1e-14, impulse=10.0 * np.ones(m))
-    assert solution.status is lv.Status.INTERRUPTED and len(calls) == 90
-    assert solution.residual.relative < 0.1  # of the zero impulse 1, of the start 885
 
 
 def test_a_panel_that_lost_a_pivot_is_counted_and_named():

@@ -463,24 +463,6 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
 
 
-def test_threads_take_worlds_as_they_come(monkeypatch):
-    """The first world lasts until all others are done, by the other thread."""
-    jac, mass, free = worlds(40)
-    over, done, solve = threading.Event(), [], many_module.solve
-
-    def first_waits(problem, *args, **options):
-        if not done:
-            done.append(None)
-            assert over.wait(30.0)
-        done.append(problem)
-        if len(done) == 40:
-            over.set()
-        return solve(problem, *args, **options)
-
-    monkeypatch.setattr(many_module, "solve", first_waits)
-    assert lv.solve_many(lv.Batch(jac, mass, free, cones=DISKS), "pgs", threads=2, max_iter=5).impulse.any()
-
-
 def test_what_goes_wrong_on_another_thread_is_raised():
     both, seen = threading.Barrier(2, timeout=10.0), set()
 

@@ -1,7 +1,6 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -10,18 +9,15 @@ import scipy.sparse as sp
 from ball_pile import Pile
 from calls import block_diagonal, dense_h, system_in
 from hypothesis import given
-from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
+from random_problems import FORMS, good, random_contact_problem, seeds
 from stacks import bricks
-from worked import python
 
 import lavender as lv
-from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
-from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems import systems
-from lavender.solvers.newton_systems.systems import find_bodies, make_system
+from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
-from lavender_ext.newton.solve import PHASES, Layout, Solve
+from lavender_ext.newton.solve import Layout, Solve
 
 
 @pytest.mark.parametrize("friction", [False, True])
@@ -93,50 +89,6 @@ def test_a_path_runs_through_its_folds():
     assert paths
 
 
-@pytest.mark.parametrize("noise", [1e-3, 5e-3, 2e-2])
-def test_a_path_begins_where_a_tower_carries_more_than_its_right_hand_side_says(noise):
-    """z is some hundred times g there: paths that only began at the size of g gave up, and 120 factors were in vain."""
-    problem = bricks(8, noise)
-    system = make_system(problem, "velocity")
-    system.solve.disabled_phases = sum(
-        bit for name, bit in PHASES.items() if name not in ("path", "damped Newton")
-    )
-    impulse = problem.start().copy()
-    claim = Newton().run(NewtonState(problem, system), impulse, 250, 1e-6)
-    assert claim.status is Status.CONVERGED, str(claim)
-    assert lv.residual(problem, impulse).relative <= 1e-6
-
-
-@pytest.mark.parametrize("spins", [False, True])
-@given(seed=seeds)
-def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
-    """J and M of bodies, as engines give them: H of the system over bodies is D^-1/2 A D^-1/2."""
-    p = random_contact_problem(seed, bodies=8, joints=3, contacts=25, tangents=2, spin=spins)
-    problem = FORMS["J and M"](p)
-    bodies = find_bodies(problem)
-    assert bodies is not None and bodies.n <= p.rows.n_bodies
-    both = np.sort(p.rows.block_bodies, axis=1)
-    for i, pair in enumerate(bodies.pair):  # blocks between the same two are between the same two
-        same = (both == both[i]).all(axis=1)
-        assert (np.sort(bodies.pair[same], axis=1) == np.sort(pair)).all()
-    solve = make_system(problem, "velocity").solve
-    x = np.random.default_rng(seed).normal(size=solve.m)
-    whole = solve.scale[:, None] * problem.dense()[solve.keep][:, solve.keep] * solve.scale
-    np.testing.assert_allclose(
-        solve.multiply_matrix(x), whole @ x, atol=1e-12 * np.abs(whole).sum(axis=1).max()
-    )
-
-
-@given(seed=seeds)
-def test_no_bodies_are_told_where_three_meet(seed):
-    rng = np.random.default_rng(seed)
-    jac = np.zeros((3, 18))
-    jac[:, [0, 7, 14]] = rng.normal(size=(3, 3))
-    jac[0] += rng.normal(size=18)
-    problem = lv.Problem.from_jacobian(jac, np.eye(18), rng.normal(size=18), cones=lv.Cones.contacts(0.5))
-    assert find_bodies(problem) is None and find_bodies(as_matrix(problem)) is None
-
-
 @pytest.mark.parametrize("compliance", [1e-6, 1e-4, 1e-2])
 def test_a_compliance_costs_interior_points_no_more_steps(compliance):
     """V = (W + theta)^-1 = B B^T on soft contacts, too: without B they stalled, and took three times as many."""
@@ -144,43 +96,6 @@ def test_a_compliance_costs_interior_points_no_more_steps(compliance):
     soft = replace(rigid, compliance=compliance * rigid.d)
     steps = [lv.solve(p, "newton").work["factorisations"] for p in (rigid, soft)]
     assert steps[1] <= 2 * steps[0]
-
-
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
-@given(seed=seeds)
-def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_judges_errors(form, seed):
-    problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
-    system = system_in(problem, form)
-    solve = sc = system.solve
-    solve.begin_interior(1e-10)
-    # V holds theta, the compliance, where H is K K^T + theta.
-    h = dense_h(problem)[np.ix_(sc.keep, sc.keep)] - np.diag(sc.theta)
-    for _ in range(4):
-        solve.scale_interior(1e-6)
-        solve.factor("barrier")
-        r = np.random.default_rng(seed).normal(size=sc.m)
-        x = solve.solve("barrier", r)
-        v = block_diagonal(system, solve.v)
-        expected = np.linalg.solve(np.eye(sc.m) + v @ h, v @ r)
-        # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
-        np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-        went, _, _, energy, velocity = solve.step_interior()
-        assert went
-        row = np.diff(sc.part) == 0
-        whole = solve.point[0]
-        lam = sc.fixed.copy()
-        lam[sc.keep] = whole * sc.scale
-        truth = lv.residual(problem, lam)
-        # The running slack against one computed afresh; fixed rows are right by construction.
-        assert energy == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_at_zero)
-        assert velocity == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_at_zero)
-        z = whole[sc.ptr[:-1]]
-        assert np.all(z[row] > sc.lower[sc.ptr[:-1]][row])
-        assert np.all(z[row] < sc.upper[sc.ptr[:-1]][row])
-        for i in np.flatnonzero(~row):
-            parts = sc.part[i + 1] - sc.part[i]
-            t = whole[sc.ptr[i] + 1 : sc.ptr[i + 1] - (parts == 2)]
-            assert np.linalg.norm(t) <= sc.reach[sc.part[i]] * z[i] * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("n", [1, 7, 48, 49, 150])
@@ -273,18 +188,6 @@ def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, n, m):
         assert len(outs) == 1
 
 
-def test_a_chain_of_bodies_does_not_fill_in():
-    rng = np.random.default_rng(5)
-    n = 2000
-    low = rng.integers(0, n - 1, 4000)
-    body = np.stack([low, low + 1], axis=1)
-    body[::2] = body[::2, ::-1]
-    body[3::9, 1] = -1
-    body[5::9, 0] = -1
-    layout = Layout(np.ascontiguousarray(body, np.int32), n, 1)
-    assert layout.lptr[n] == layout.nptr[n] - n
-
-
 def sparse_rows(seed, m=500, even=True, near=3):
     """Bounded rows of a matrix with few entries, some of them in one row alone where it is not even."""
     rng = np.random.default_rng(seed)
@@ -315,34 +218,6 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     np.testing.assert_allclose(
         system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
     )
-
-
-class NoPivot(systems.LinearSystem):
-    """A system whose own factorisation loses every pivot."""
-
-    def factor_rows_of_kernel(self, data, _tiny):
-        super().factor_rows_of_kernel(data, 1e300)
-
-
-def test_superlu_factors_if_pivots_are_lost(monkeypatch):
-    problem, used = sparse_rows(2), []
-    expected = lv.solve(problem, "newton", tol=1e-10)
-    assert expected.success
-    splu = systems.splu
-    monkeypatch.setattr(systems, "LinearSystem", NoPivot)
-    monkeypatch.setattr(systems, "splu", lambda system: used.append(system.n) or splu(system))
-    solution = lv.solve(problem, "newton", tol=1e-10)
-    assert solution.success and used
-    np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
-
-
-def test_ctrl_c_within_the_fallback_is_reported_and_no_other_error(monkeypatch):
-    def stop(_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(systems, "LinearSystem", NoPivot)
-    monkeypatch.setattr(systems, "splu", stop)
-    assert lv.solve(sparse_rows(2), "newton", tol=1e-10).status is lv.Status.INTERRUPTED
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -397,36 +272,6 @@ def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
     w[normal] = rng.uniform(0.0, 2.0, 8) + np.hypot(w[normal + 1], w[normal + 2]) * mu
     problem = FORMS[form](replace(p, b=p.dense() @ lam - w))
     assert lv.solve(problem, "newton", max_iter=300).status is not lv.Status.INFEASIBLE
-
-
-@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="the kernel of Linux alone tells")
-def test_large_memory_asks_for_no_huge_pages():
-    """Each of them may wait for the kernel to make room: repeated solves took three times the first.
-
-    In a process of its own: memory that an array had asked huge pages for may be given out again.
-    """
-    flags = python("-c", WHERE).stdout.split()
-    assert flags and "hg" not in flags
-
-
-WHERE = """
-import lavender as lv
-from pathlib import Path
-from benchmarks.core_problems import lattice_pile
-from lavender_ext.newton.solve import Solve
-
-problem = lattice_pile(3000)
-lv.residual(problem, problem.start())
-solve = Solve(problem.metric)
-at, inside = solve.scale.ctypes.data, False
-for line in Path("/proc/self/smaps").read_text().splitlines():
-    word = line.split()[0]
-    if "-" in word:
-        low, high = (int(x, 16) for x in word.split("-"))
-        inside = low <= at < high
-    elif inside and word == "VmFlags:":
-        print(line)
-"""
 
 
 @pytest.mark.parametrize("law", ["lcp", "cone"])

@@ -14,7 +14,7 @@ import lavender as lv
 from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
-from lavender.sim.web import extract_c, pages
+from lavender.sim.web import pages
 from lavender.sim.web.scenes import collect_page_data, describe_snapshot
 
 HERE = Path(__file__).resolve().parent
@@ -154,15 +154,6 @@ def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, mo
     )
     (tmp_path / "lavender.wasm").write_bytes(fresh)
     assert pages.get_or_build_module() == fresh
-
-
-def test_hash_covers_what_is_cimported():
-    # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
-    with_rows = wasm.hash_sources(ROOT, ["judge.measure"])
-    assert with_rows != wasm.hash_sources(ROOT, ["sweep.serial"]) != wasm.hash_sources(ROOT)
-    assert extract_c.CIMPORT.findall(
-        "from lavender_ext.core.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
-    ) == ["core.rows"]
 
 
 # -- Node ------------------------------------------------------------------------------------------------------
