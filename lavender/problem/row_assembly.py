@@ -1,4 +1,4 @@
-"""Bodies, checked arguments, keys and rows that `RowBuilder` adds joints and contacts with."""
+"""Bodies of `RowBuilder`, and the checks of the arguments of its blocks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import Parameter, signature
 from math import hypot, inf
-from typing import Any, NamedTuple, NoReturn, ParamSpec, TypeVar
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     as_array,
+    as_names,
     check_float,
     check_int,
     check_nonnegative_magnitudes,
@@ -21,35 +22,38 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.problem.rows import check_and_symmetrise_inertia
-from lavender.problem.vectors import (
-    X_AXIS,
-    Y_AXIS,
-    Z_AXIS,
-    ZERO,
-    Vector,
-    complete_orthonormal_frame,
-    cross,
-    dot,
-    normalise,
-    scale,
-    subtract,
-)
-from lavender_ext.core.checks import MIN_MAGNITUDE
+from lavender_ext.core.checks import MIN_MAGNITUDE, find_body_fault
+from lavender_ext.core.row_blocks import BLOCK_TYPES, RowBlocks
 
-#: Order of the bits of a key, highest first: block type (4), body a + 1 (22), body b + 1 (22), feature (16).
-BLOCK_TYPES = (
-    "hinge", "ball", "weld", "slider", "distance", "motor", "limit", "spring", "gear", "contact",
-)  # fmt: skip
+#: Numbers of the types of blocks; a key has the type (4 bits), body a + 1 (22), body b + 1 (22), and the feature (16).
+BLOCK_NUMBERS = {name: number for number, name in enumerate(BLOCK_TYPES)}
 MAX_KEYED_BODIES = 2**22 - 1  # More bodies do not fit into the 22 bits of a key.
 MAX_FEATURE = 2**16 - 1  # Larger features do not fit into the 16 bits of a key.
 # [-] A normal is rejected if its length differs from 1 by more; float32 causes 1e-7.
 NORMAL_LENGTH_TOLERANCE = 1e-5
 # Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
-PLANAR_VELOCITIES = (
-    0,
-    1,
-    5,
-)
+PLANAR_VELOCITIES = (0, 1, 5)
+#: Arguments of each type of block in the order of `RowBlocks.add`: vectors, then numbers. Those with "?" may be None.
+ARGUMENTS = {
+    "hinge": ("anchor", "anchor_b?", "axis", "axis_b?"),
+    "ball": ("anchor", "anchor_b?"),
+    "weld": ("anchor", "anchor_b?", "angle_error"),
+    "slider": ("anchor", "anchor_b?", "axis", "angle_error"),
+    "distance": ("anchor_a", "anchor_b", "length?"),
+    "motor": ("axis?", "anchor?", "speed", "max_torque?", "max_force?"),
+    "limit": ("axis?", "anchor?", "value", "lower", "upper"),
+    "spring": ("anchor_a", "anchor_b", "length", "stiffness", "damping"),
+    "gear": ("axis_a", "axis_b?", "ratio", "angle_error"),
+    "contact": ("point", "normal", "tangent?", "gap", "mu", "restitution", "restitution_threshold"),
+}
+#: Ranges of numbers that may not be negative.
+RANGES: dict[str, dict[str, float]] = {
+    name: {"low": 0.0}
+    for name in (
+        "length", "max_torque", "max_force", "stiffness", "damping", "mu", "restitution", "restitution_threshold",
+    )
+}  # fmt: skip
+RANGES["restitution"]["high"] = 1.0
 
 
 Arguments = ParamSpec("Arguments")
@@ -105,39 +109,11 @@ def _list(names: Iterable[str]) -> str:
     return ", ".join(f"{name}=" for name in names)
 
 
-class Row(NamedTuple):
-    """One row of a joint: Jacobian (12,), target [m/s or rad/s], bounds [N s or N m s], compliance."""
-
-    jac: list[float]
-    target: float
-    lower: float = -inf
-    upper: float = inf
-    compliance: float = 0.0
-
-
-class Block(NamedTuple):
-    """A joint with its rows."""
-
-    name: str
-    key: int
-    bodies: tuple[int, int]
-    rows: list[Row]
-
-
-class Contact(NamedTuple):
-    """A contact with its frame, arms, coefficients and the target of its normal row without restitution [m/s]."""
-
-    name: str
-    key: int
-    bodies: tuple[int, int]
-    normal: Vector
-    tangent: Vector
-    arm_a: Vector
-    arm_b: Vector
-    mu: float
-    target: float
-    restitution: float
-    threshold: float
+def name_block(key: int) -> str:
+    """Return the default name of a block, such as "hinge 0 of world and body 3", from its key."""
+    bodies = ((key >> shift & MAX_KEYED_BODIES) - 1 for shift in (38, 16))
+    places = " and ".join("world" if body < 0 else f"body {body}" for body in bodies)
+    return f"{BLOCK_TYPES[key >> 60]} {key & MAX_FEATURE} of {places}"
 
 
 def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], inertia: tuple[int, ...]) -> None:
@@ -174,9 +150,10 @@ def _as_inverses(name: str, value: ArrayLike, n: int, unit: str) -> FloatArray:
 
 
 class RowAssembly:
-    """Bodies, blocks and keys of a step; the notes of `RowBuilder` define equations (1) to (5).
+    """Bodies and blocks of a step; `RowBuilder` describes the arguments.
 
-    `RowBuilder` describes the arguments.
+    `lavender_ext/core/row_blocks.pyx` checks the usual types of arguments and makes the rows. The methods of this class
+    convert other types, and word the messages.
     """
 
     @check_arguments
@@ -198,7 +175,6 @@ class RowAssembly:
             raise InputError(f"position has {n} bodies; at most {MAX_KEYED_BODIES} are needed for keys")
         self._position = np.zeros((n, 3))
         self._position[:, : shape[1]] = as_array("position", position, (n, shape[1]), unit="m")
-        self._centres: list[Vector] = [(x, y, z) for x, y, z in self._position.tolist()]
         self._inv_mass = _as_inverses("inv_mass", inv_mass, n, "1/kg")
         if self._is_planar:
             self._inv_inertia = np.zeros((n, 3, 3))
@@ -207,15 +183,18 @@ class RowAssembly:
             self._velocity[:, PLANAR_VELOCITIES] = as_array("velocity", velocity, (n, 3), unit="m/s, rad/s")
         else:
             tensors = as_array("inv_inertia", inv_inertia, (n, 3, 3), unit="1/(kg m^2)")
-            self._inv_inertia = check_and_symmetrise_inertia("inv_inertia", tensors)
+            none, empty = np.zeros((0, 2), np.int32), np.zeros((0, 3))
+            if find_body_fault(self._inv_mass, tensors, none, none, empty, empty, True)[0]:
+                tensors = check_and_symmetrise_inertia("inv_inertia", tensors)
+            self._inv_inertia = tensors
             self._velocity = as_array("velocity", velocity, (n, 6), unit="m/s, rad/s")
         self._dt = check_float("dt", dt, above=0.0)
         self._baumgarte = check_float("baumgarte", baumgarte, low=0.0, high=1.0)
         self._slop = check_float("slop", slop, low=0.0)
-        self._joint_blocks: list[Block] = []
-        self._contact_blocks: list[Contact] = []
-        self._keys: set[int] = set()
-        self._next_feature: dict[tuple[str, int, int], int] = {}
+        self._blocks = RowBlocks(
+            self._position, self._velocity, self._dimensions, self._dt, self._baumgarte, self._slop
+        )
+        self._names: dict[int, str] = {}  # Names of blocks that were given, by key.
 
     # -- arguments -----------------------------------------------------------------------------------------------
 
@@ -225,7 +204,7 @@ class RowAssembly:
 
     def _check_pair(self, a: int | None, b: int | None) -> tuple[int, int]:
         """Return the numbers of two different bodies, at most one of them the static world (-1)."""
-        found, n = [], len(self._centres)
+        found, n = [], len(self._position)
         for name, body in (("a", a), ("b", b)):
             try:
                 found.append(-1 if body is None else check_int(name, body, -1, n - 1))
@@ -239,185 +218,212 @@ class RowAssembly:
             raise InputError(f"a and b are both {same}; two bodies are needed, at most one of them static")
         return found[0], found[1]
 
-    def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> Vector:
-        """Return a vector of the builder's dimension with three components."""
+    def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> list[float]:
+        """Return a vector of the builder's dimension."""
         if get_shape(name, value) == ():  # Reject a scalar here, as `as_array` would repeat it.
             raise InputError(f"{name} is {value!r:.60}; a vector ({self._dimensions},) is needed")
-        x = as_array(name, value, (self._dimensions,), unit=unit).tolist()
-        return x[0], x[1], x[2] if len(x) == 3 else 0.0
+        vector: list[float] = as_array(name, value, (self._dimensions,), unit=unit).tolist()
+        return vector
 
-    def _check_direction(self, name: str, value: ArrayLike) -> Vector:
-        """Return a vector divided by its length."""
-        return normalise(name, self._check_vector(name, value))
+    def _check_direction(self, name: str, value: ArrayLike) -> list[float]:
+        """Return a vector that is not 0."""
+        vector = self._check_vector(name, value)
+        if hypot(*vector) < MIN_MAGNITUDE:
+            raise InputError(f"{name} has length {hypot(*vector):g}; a direction is needed")
+        return vector
 
-    def _check_rotation_axis(self, name: str, value: ArrayLike | None) -> Vector:
-        """Return the unit vector of an axis of rotation: z in two dimensions, which need no axis."""
+    def _check_rotation_axis(self, name: str, value: ArrayLike | None) -> list[float] | None:
+        """Return an axis of rotation; None in two dimensions."""
         if self._is_planar:
             if value is not None:
                 raise InputError(
                     f"{name} is {value!r:.60}; in two dimensions all rotation is about z: leave it out"
                 )
-            return Z_AXIS
+            return None
         if value is None:
             raise InputError(
                 f"{name} is None; a vector (3,) in world coordinates is needed in three dimensions"
             )
         return self._check_direction(name, value)
 
-    def _get_anchors(self, anchor: ArrayLike, anchor_b: ArrayLike | None) -> tuple[Vector, Vector]:
-        """Return the anchor points on a and on b."""
-        point = self._check_vector("anchor", anchor, "m")
-        return point, point if anchor_b is None else self._check_vector("anchor_b", anchor_b, "m")
-
-    def _compute_line_between_anchors(
-        self, anchor_a: ArrayLike, anchor_b: ArrayLike
-    ) -> tuple[Vector, float, Vector, Vector]:
-        """Return unit vector, distance and both ends of the line between two anchors."""
-        point_a, point_b = (
-            self._check_vector("anchor_a", anchor_a, "m"),
-            self._check_vector("anchor_b", anchor_b, "m"),
-        )
-        offset = subtract(point_b, point_a)
-        size = hypot(*offset)
-        if size > MIN_MAGNITUDE:
-            return scale(1.0 / size, offset), size, point_a, point_b
-        return (Y_AXIS if self._is_planar else Z_AXIS), size, point_a, point_b
-
-    def _choose_tangent(self, normal: Vector, tangent: ArrayLike | None) -> Vector:
-        """Return the unit vector of the first tangent."""
-        if self._is_planar:
-            if tangent is not None:
+    def _check_motor_axis(self, x: dict[str, Any], is_linear: bool) -> None:
+        """Check axis and anchor of a motor or limit: of travel at the anchor, or of rotation."""
+        if not is_linear:
+            if x["anchor"] is not None:
                 raise InputError(
-                    f"tangent is {tangent!r:.60}; in two dimensions it follows from the normal: leave it out"
+                    "anchor is given with max_torque, which acts everywhere on the body: leave anchor out, "
+                    "or give max_force"
                 )
-            return cross(Z_AXIS, normal)
-        if tangent is None:
-            return complete_orthonormal_frame(normal)[0]
-        along = self._check_direction("tangent", tangent)
-        across = subtract(along, scale(dot(along, normal), normal))
-        if hypot(*across) < NORMAL_LENGTH_TOLERANCE:
+            x["axis"] = self._check_rotation_axis("axis", x["axis"])
+        elif x["anchor"] is None:
+            raise InputError("anchor is None; a motor with max_force needs the point at which the force acts")
+        elif x["axis"] is None:
+            raise InputError(f"axis is None; the direction of travel ({self._dimensions},) is needed")
+        else:
+            x["axis"] = self._check_direction("axis", x["axis"])
+
+    def _check_frame(self, x: dict[str, Any]) -> None:
+        """Check normal and tangent of a contact."""
+        normal = x["normal"] = self._check_vector("normal", x["normal"])
+        size = hypot(*normal)
+        if abs(size - 1.0) > NORMAL_LENGTH_TOLERANCE:
+            raise InputError(f"normal has length {size:g}; a unit vector from a to b is needed")
+        if x["tangent"] is None:
+            return
+        if self._is_planar:
             raise InputError(
-                f"tangent is {tangent!r:.60}, which is parallel to the normal; another direction is needed, "
+                f"tangent is {x['tangent']!r:.60}; in two dimensions it follows from the normal: leave it out"
+            )
+        tangent = self._check_direction("tangent", x["tangent"])
+        sine = np.linalg.norm(np.cross(tangent, normal)) / (hypot(*tangent) * size)
+        if sine < 2.0 * NORMAL_LENGTH_TOLERANCE:
+            raise InputError(
+                f"tangent is {x['tangent']!r:.60}, which is parallel to the normal; another direction is needed, "
                 "or None"
             )
-        return normalise("tangent", across)
+        x["tangent"] = tangent
 
-    def _reserve_key(
-        self, block_type: str, pair: tuple[int, int], feature: int | None, name: str
-    ) -> tuple[int, str]:
-        """Return the key and the name of a new block, and reserve the key."""
-        if not isinstance(name, str):
-            raise InputError(f"name is {name!r:.60}; a text is needed")
+    def _check_number(self, block_type: str, name: str, value: Any) -> Any:
+        """Return a number of a block, or the error of an orientation."""
+        if name == "angle_error" and block_type != "gear" and not self._is_planar:
+            return as_array("angle_error", value, (3,), unit="rad").tolist()
+        unlimited = {"lower": -inf, "upper": inf}.get(name)
+        if isinstance(value, (float, np.floating)) and float(value) == unlimited:
+            return unlimited
+        return check_float(name, value, **RANGES.get(name, {}))
+
+    def _check_values(self, block_type: str, values: Iterable[Any]) -> tuple[Any, ...]:
+        """Return the arguments of one block as lists and floats.
+
+        Raises
+        ------
+        InputError
+            An argument is invalid; the message names it.
+        """
+        x: dict[str, Any] = {}
+        for name, value in zip(ARGUMENTS[block_type], values, strict=True):
+            word = name.rstrip("?")
+            if (value is None and word != name) or word.startswith("axis") or word in ("normal", "tangent"):
+                x[word] = value
+            elif word.startswith(("anchor", "point")):
+                x[word] = self._check_vector(word, value, "m")
+            else:
+                x[word] = self._check_number(block_type, word, value)
+        if block_type == "contact":
+            self._check_frame(x)
+        elif block_type == "slider":
+            x["axis"] = self._check_direction("axis", x["axis"])
+        elif block_type == "spring":
+            k, c = x["stiffness"], x["damping"]
+            if self._dt * (c + self._dt * k) < MIN_MAGNITUDE:
+                raise InputError(
+                    f"stiffness is {k:g} N/m and damping is {c:g} N s/m; at least one must be positive, so that "
+                    f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}"
+                )
+        elif block_type == "motor":
+            if (x["max_torque"] is None) == (x["max_force"] is None):
+                state = "neither is given" if x["max_torque"] is None else "both are given"
+                raise InputError(
+                    f"of max_torque and max_force {state}; exactly one of the two is needed: max_torque for "
+                    "rotation, max_force for travel"
+                )
+            self._check_motor_axis(x, x["max_force"] is not None)
+        elif block_type == "limit":
+            low, high = x["lower"], x["upper"]
+            if low > high or (low == -inf and high == inf):
+                wanted = "lower must not exceed upper" if low > high else "at least one must be finite"
+                raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}: change one of the two")
+            self._check_motor_axis(x, x["anchor"] is not None)
+        elif block_type in ("hinge", "gear"):
+            first, second = ("axis", "axis_b") if block_type == "hinge" else ("axis_a", "axis_b")
+            x[first] = self._check_rotation_axis(first, x[first])
+            if x[second] is not None:
+                x[second] = self._check_rotation_axis(second, x[second])
+            if x.get("ratio") == 0.0:
+                raise InputError("ratio is 0; a nonzero number is needed: 0 would stop a and leave b free")
+        return tuple(x.values())
+
+    def _check_feature(self, block_type: str, pair: tuple[int, int], feature: int | None) -> int:
+        """Return the feature of a new block."""
+        key = BLOCK_TYPES.index(block_type) << 60 | pair[0] + 1 << 38 | pair[1] + 1 << 16
         if feature is None:
-            number = self._next_feature.get((block_type, *pair), 0)
+            number: int = self._blocks.next_feature.get(key, 0)
             if number > MAX_FEATURE:
                 raise InputError(
                     f"feature is None; after {number} blocks of one pair of bodies it must be given"
                 )
         else:
             number = check_int("feature", feature, high=MAX_FEATURE)
-        key = BLOCK_TYPES.index(block_type) << 60 | pair[0] + 1 << 38 | pair[1] + 1 << 16 | number
-        bodies = " and ".join("world" if body < 0 else f"body {body}" for body in pair)
-        if key in self._keys:
+        if key | number in self._blocks.keys:
+            bodies = " and ".join("world" if body < 0 else f"body {body}" for body in pair)
             raise InputError(
                 f"feature is {number}, which another {block_type} of {bodies} already has; a number that no "
                 f"other {block_type} of them has is needed"
             )
-        self._keys.add(key)
-        self._next_feature[(block_type, *pair)] = number + 1
-        return key, name or f"{block_type} {number} of {bodies}"
+        return number
 
-    def _add_joint(
-        self, block_type: str, pair: tuple[int, int], rows: list[Row], feature: int | None, name: str
+    # -- blocks --------------------------------------------------------------------------------------------------
+
+    def _add(
+        self, block_type: str, a: int | None, b: int | None, feature: int | None, name: str, *values: Any
     ) -> int:
-        """Add a joint and return its key."""
-        key, label = self._reserve_key(block_type, pair, feature, name)
-        self._joint_blocks.append(Block(label, key, pair, rows))
+        """Add a block and return its key; `values` are its ARGUMENTS."""
+        if not isinstance(name, str):
+            raise InputError(f"name is {name!r:.60}; a text is needed")
+        number = BLOCK_NUMBERS[block_type]
+        key: int | None = self._blocks.add(number, a, b, feature, values)
+        if key is None:  # An argument is invalid, or needs a conversion.
+            pair, values = self._check_pair(a, b), self._check_values(block_type, values)
+            key = self._blocks.add(number, *pair, self._check_feature(block_type, pair, feature), values)
+            assert key is not None, "the checks of row_blocks.pyx differ from those of this file"
+        if name:
+            self._names[key] = name
         return key
 
-    # -- rows ----------------------------------------------------------------------------------------------------
-
-    def _compute_arm(self, body: int, point: Vector) -> Vector:
-        """Return a point minus the centre of a body; 0 for the static world."""
-        return ZERO if body < 0 else subtract(point, self._centres[body])
-
-    def _make_rigid_row(
-        self, pair: tuple[int, int], on_a: tuple[float, ...], on_b: tuple[float, ...], error: float
-    ) -> Row:
-        """Return a rigid row (eq. 1) from its Jacobian on a and on b; columns of the static world are 0."""
-        jac = [0.0] * 12
-        if pair[0] >= 0:
-            jac[:6] = on_a
-        if pair[1] >= 0:
-            jac[6:] = on_b
-        return Row(jac, -self._baumgarte * error / self._dt)
-
-    def _make_linear_row(
-        self, pair: tuple[int, int], axis: Vector, point_a: Vector, point_b: Vector, error: float
-    ) -> Row:
-        """Return the row axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a); its error is a distance [m]."""
-        moment_a = cross(self._compute_arm(pair[0], point_a), axis)
-        moment_b = cross(self._compute_arm(pair[1], point_b), axis)
-        return self._make_rigid_row(pair, scale(-1.0, axis) + scale(-1.0, moment_a), axis + moment_b, error)
-
-    def _make_angular_row(self, pair: tuple[int, int], axis_a: Vector, axis_b: Vector, error: float) -> Row:
-        """Return the row axis_b.omega_b - axis_a.omega_a; its error is an angle [rad]."""
-        return self._make_rigid_row(pair, ZERO + scale(-1.0, axis_a), ZERO + axis_b, error)
-
-    def _make_point_rows(self, pair: tuple[int, int], point_a: Vector, point_b: Vector) -> list[Row]:
-        """Return the rows of a ball joint (two in 2-D), which hold a point of body b at a point of body a."""
-        offset = subtract(point_b, point_a)
-        return [
-            self._make_linear_row(pair, axis, point_a, point_b, offset[i])
-            for i, axis in enumerate((X_AXIS, Y_AXIS, Z_AXIS)[: self._dimensions])
+    def _add_many(
+        self, block_type: str, bodies: ArrayLike, feature: ArrayLike | None, names: Any, values: Iterable[Any]
+    ) -> np.ndarray:
+        """Add n blocks and return their keys (n,); `values` are arrays of their ARGUMENTS."""
+        pairs = as_array("bodies", bodies, (None, 2), dtype=np.int32)
+        n = len(pairs)
+        numbers = None if feature is None else as_array("feature", feature, (n,), dtype=np.int32)
+        labels = None if names is None else as_names("names", names, n)
+        arrays = [
+            None if value is None else self._as_values(block_type, name.rstrip("?"), value, n)
+            for name, value in zip(ARGUMENTS[block_type], values, strict=True)
         ]
+        keys = np.empty(n, np.uint64)
+        i = self._blocks.add_many(BLOCK_NUMBERS[block_type], pairs, numbers, tuple(arrays), keys)
+        if i >= 0:
+            try:
+                pair = self._check_pair(*pairs[i].tolist())
+                single: list[Any] = [x if x is None else x[i].tolist() for x in arrays]
+                if self._is_planar and block_type in ("weld", "slider"):
+                    single[-1] = single[-1][2]  # The angle of the orientation error.
+                self._check_values(block_type, single)
+                self._check_feature(block_type, pair, None if numbers is None else int(numbers[i]))
+            except InputError as error:
+                raise InputError(f"{block_type} {i}: {error}") from None
+            raise InputError(
+                f"{block_type} {i}: an earlier one of the same bodies has its feature, or they are more than "
+                f"{MAX_FEATURE + 1}; different features up to {MAX_FEATURE} are needed"
+            )
+        if labels is not None:
+            self._names.update(zip(keys.tolist(), labels, strict=True))
+        return keys
 
-    def _make_orientation_rows(self, pair: tuple[int, int], angle_error: ArrayLike) -> list[Row]:
-        """Return the rows that hold the relative orientation."""
-        if self._is_planar:
-            error: list[float] = [check_float("angle_error", angle_error)]
-            axes: tuple[Vector, ...] = (Z_AXIS,)
-        else:
-            error = as_array("angle_error", angle_error, (3,), unit="rad").tolist()
-            axes = (X_AXIS, Y_AXIS, Z_AXIS)
-        return [self._make_angular_row(pair, axis, axis, x) for axis, x in zip(axes, error, strict=True)]
-
-    def _make_motor_or_limit_row(
-        self, pair: tuple[int, int], axis: ArrayLike | None, anchor: ArrayLike | None, is_linear: bool
-    ) -> Row:
-        """Return the row of a motor or limit: of travel at the anchor, or of rotation."""
-        if not is_linear:
-            if anchor is not None:
-                raise InputError(
-                    "anchor is given with max_torque, which acts everywhere on the body: leave anchor out, "
-                    "or give max_force"
-                )
-            direction = self._check_rotation_axis("axis", axis)
-            return self._make_angular_row(pair, direction, direction, 0.0)
-        if anchor is None:
-            raise InputError("anchor is None; a motor with max_force needs the point at which the force acts")
-        if axis is None:
-            raise InputError(f"axis is None; the direction of travel ({self._dimensions},) is needed")
-        point = self._check_vector("anchor", anchor, "m")
-        return self._make_linear_row(pair, self._check_direction("axis", axis), point, point, 0.0)
-
-    def _compute_stop_velocity(self, travel: float) -> float:
-        """Return the smallest velocity away from a limit [m/s or rad/s] if `travel` remains up to it (eq. 4)."""
-        return (-travel if travel > 0.0 else -self._baumgarte * travel) / self._dt
-
-    def _compute_normal_target(self, contact: Contact) -> float:
-        """Return the target of a contact's normal row, with restitution if the bodies approach fast enough (eq. 5)."""
-        approach = 0.0
-        for sign, body, arm in (
-            (-1.0, contact.bodies[0], contact.arm_a),
-            (1.0, contact.bodies[1], contact.arm_b),
-        ):
-            if body >= 0 and contact.restitution > 0.0:
-                v = self._velocity[body].tolist()
-                moment = cross(arm, contact.normal)
-                approach += sign * (dot(v[:3], contact.normal) + dot(v[3:], moment))
-        # The contact bounces only if the bodies touch within the step.
-        reaches = contact.target >= 0.0 or approach < contact.target
-        if approach < -contact.threshold and reaches:
-            return max(contact.target, -contact.restitution * approach)
-        return contact.target
+    def _as_values(self, block_type: str, name: str, value: ArrayLike, n: int) -> FloatArray:
+        """Convert an argument of n blocks to an array; one vector or number is repeated."""
+        is_vector = name.startswith(("anchor", "point", "axis")) or name in ("normal", "tangent")
+        width = self._dimensions
+        if name == "angle_error" and block_type != "gear":
+            is_vector, width = not self._is_planar, 3
+        if not is_vector:
+            array = as_array(name, value, (n,), finite=block_type != "limit" or name == "value")
+            return array if width == self._dimensions else np.outer(array, (0.0, 0.0, 1.0))
+        if get_shape(name, value) in ((), (width,)):
+            vector = (
+                as_array(name, value, (width,)) if name == "angle_error" else self._check_vector(name, value)
+            )
+            return np.tile(vector, (n, 1))
+        return as_array(name, value, (n, width))

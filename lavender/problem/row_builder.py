@@ -5,34 +5,36 @@ The notes of `RowBuilder` have the equations of the rows.
 
 from __future__ import annotations
 
-from math import hypot, inf
+from collections.abc import Sequence
+from inspect import signature
+from math import inf
 from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, check_float, check_int
-from lavender.base.errors import InputError
+from lavender.base.arrays import ArrayLike, FloatArray, check_int
+from lavender.base.errors import InputError, check_name
+from lavender.problem.data import Names
 from lavender.problem.problem import Problem
 from lavender.problem.row_assembly import (
-    NORMAL_LENGTH_TOLERANCE,
+    ARGUMENTS,
     PLANAR_VELOCITIES,
-    Block,
-    Contact,
     RowAssembly,
     check_arguments,
+    name_block,
+    reject_call,
 )
 from lavender.problem.rows import Rows
-from lavender.problem.vectors import Z_AXIS, complete_orthonormal_frame, cross, dot, scale, subtract
-from lavender_ext.core.checks import MIN_MAGNITUDE
 
 
 class RowBuilder(RowAssembly):
     """Build the problem of a step from bodies, joints and contacts in world coordinates, in two or three dimensions.
 
     The methods `hinge`, `ball`, `weld`, `slider`, `distance`, `motor`, `limit`, `spring`, `gear` and `contact` add one
-    block each and return its key. `problem` returns the `Problem`: its joints in the order of the calls, followed by
-    its contacts. Bodies are numbered from 0; -1 or None is the static world. `a` and `b` are the bodies of a block: a
-    positive impulse along an axis or a normal pushes b forward and a backward. Make a new builder in each step.
+    block each and return its key; `joints` and `contacts` add arrays of blocks. `problem` returns the `Problem`: its
+    joints in the order of the calls, followed by its contacts. Bodies are numbered from 0; -1 or None is the static
+    world. `a` and `b` are the bodies of a block: a positive impulse along an axis or a normal pushes b forward and a
+    backward. Make a new builder in each step.
 
     In two dimensions bodies move in the xy plane and rotate about z: vectors have two components, there are no axes of
     rotation, and a contact with friction has one tangent (`tangents=1`).
@@ -135,9 +137,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block: the same in every step with the same method, bodies and feature.
         """
-        pair = self._check_pair(a, b)
-        rows = self._make_point_rows(pair, *self._get_anchors(anchor, anchor_b))
-        return self._add_joint("ball", pair, rows, feature, name)
+        return self._add("ball", a, b, feature, name, anchor, anchor_b)
 
     @check_arguments
     def hinge(
@@ -164,15 +164,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        rows = self._make_point_rows(pair, *self._get_anchors(anchor, anchor_b))
-        axis_on_a = self._check_rotation_axis("axis", axis)
-        axis_on_b = axis_on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
-        if not self._is_planar:
-            error = cross(axis_on_a, axis_on_b)
-            for side in complete_orthonormal_frame(axis_on_a):
-                rows.append(self._make_angular_row(pair, side, side, dot(side, error)))
-        return self._add_joint("hinge", pair, rows, feature, name)
+        return self._add("hinge", a, b, feature, name, anchor, anchor_b, axis, axis_b)
 
     @check_arguments
     def weld(
@@ -194,11 +186,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        rows = self._make_point_rows(
-            pair, *self._get_anchors(anchor, anchor_b)
-        ) + self._make_orientation_rows(pair, angle_error)
-        return self._add_joint("weld", pair, rows, feature, name)
+        return self._add("weld", a, b, feature, name, anchor, anchor_b, angle_error)
 
     @check_arguments
     def slider(
@@ -224,15 +212,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        point_a, point_b = self._get_anchors(anchor, anchor_b)
-        direction, offset = self._check_direction("axis", axis), subtract(point_b, point_a)
-        sides = [cross(Z_AXIS, direction)] if self._is_planar else complete_orthonormal_frame(direction)
-        # The line is fixed to a: use the velocity of the point of a that coincides with point_b.
-        rows = [self._make_linear_row(pair, side, point_b, point_b, dot(side, offset)) for side in sides]
-        return self._add_joint(
-            "slider", pair, rows + self._make_orientation_rows(pair, angle_error), feature, name
-        )
+        return self._add("slider", a, b, feature, name, anchor, anchor_b, axis, angle_error)
 
     @check_arguments
     def distance(
@@ -255,11 +235,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        direction, present, point_a, point_b = self._compute_line_between_anchors(anchor_a, anchor_b)
-        wanted = present if length is None else check_float("length", length, low=0.0)
-        row = self._make_linear_row(pair, direction, point_a, point_b, present - wanted)
-        return self._add_joint("distance", pair, [row], feature, name)
+        return self._add("distance", a, b, feature, name, anchor_a, anchor_b, length)
 
     @check_arguments
     def spring(
@@ -286,20 +262,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        direction, present, point_a, point_b = self._compute_line_between_anchors(anchor_a, anchor_b)
-        rest = check_float("length", length, low=0.0)
-        k, c = check_float("stiffness", stiffness, low=0.0), check_float("damping", damping, low=0.0)
-        resistance = c + self._dt * k
-        if self._dt * resistance < MIN_MAGNITUDE:
-            raise InputError(
-                f"stiffness is {k:g} N/m and damping is {c:g} N s/m; at least one must be positive, so that "
-                f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}"
-            )
-        row = self._make_linear_row(pair, direction, point_a, point_b, 0.0)._replace(
-            target=-k * (present - rest) / resistance, compliance=1.0 / (self._dt * resistance)
-        )
-        return self._add_joint("spring", pair, [row], feature, name)
+        return self._add("spring", a, b, feature, name, anchor_a, anchor_b, length, stiffness, damping)
 
     @check_arguments
     def motor(
@@ -331,21 +294,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        wanted = check_float("speed", speed)
-        if (max_torque is None) == (max_force is None):
-            state = "neither is given" if max_torque is None else "both are given"
-            raise InputError(
-                f"of max_torque and max_force {state}; exactly one of the two is needed: max_torque for "
-                "rotation, max_force for travel"
-            )
-        if max_force is None:
-            bound = self._dt * check_float("max_torque", max_torque, low=0.0)
-        else:
-            bound = self._dt * check_float("max_force", max_force, low=0.0)
-        row = self._make_motor_or_limit_row(pair, axis, anchor, max_force is not None)
-        row = row._replace(target=wanted, lower=-bound, upper=bound)
-        return self._add_joint("motor", pair, [row], feature, name)
+        return self._add("motor", a, b, feature, name, axis, anchor, speed, max_torque, max_force)
 
     @check_arguments
     def limit(
@@ -373,21 +322,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block. Both rows have impulses of at least 0: first the lower limit, then the upper.
         """
-        pair, present = self._check_pair(a, b), check_float("value", value)
-        low = -inf if _is_float(lower) and lower == -inf else check_float("lower", lower)
-        high = inf if _is_float(upper) and upper == inf else check_float("upper", upper)
-        if low > high or (low == -inf and high == inf):
-            wanted = "lower must not exceed upper" if low > high else "at least one must be finite"
-            raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}: change one of the two")
-        row, rows = self._make_motor_or_limit_row(pair, axis, anchor, anchor is not None), []
-        if low > -inf:
-            rows.append(row._replace(target=self._compute_stop_velocity(present - low), lower=0.0))
-        if high < inf:
-            opposite = [-x for x in row.jac]
-            rows.append(
-                row._replace(jac=opposite, target=self._compute_stop_velocity(high - present), lower=0.0)
-            )
-        return self._add_joint("limit", pair, rows, feature, name)
+        return self._add("limit", a, b, feature, name, axis, anchor, value, lower, upper)
 
     @check_arguments
     def gear(
@@ -413,15 +348,7 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair = self._check_pair(a, b)
-        on_a = self._check_rotation_axis("axis_a", axis_a)
-        on_b = on_a if axis_b is None else self._check_rotation_axis("axis_b", axis_b)
-        factor = check_float("ratio", ratio)
-        if factor == 0.0:
-            raise InputError("ratio is 0; a nonzero number is needed: 0 would stop a and leave b free")
-        error = check_float("angle_error", angle_error)
-        row = self._make_angular_row(pair, scale(-1.0, on_a), scale(factor, on_b), error)
-        return self._add_joint("gear", pair, [row], feature, name)
+        return self._add("gear", a, b, feature, name, axis_a, axis_b, ratio, angle_error)
 
     # -- contacts ------------------------------------------------------------------------------------------------
 
@@ -463,37 +390,99 @@ class RowBuilder(RowAssembly):
         int
             Key of the block.
         """
-        pair, at = self._check_pair(a, b), self._check_vector("point", point, "m")
-        along, size = self._check_vector("normal", normal), hypot(*self._check_vector("normal", normal))
-        if abs(size - 1.0) > NORMAL_LENGTH_TOLERANCE:
-            raise InputError(f"normal has length {size:g}; a unit vector from a to b is needed")
-        along = scale(1.0 / size, along)
-        distance, friction = check_float("gap", gap), check_float("mu", mu, low=0.0)
-        bounce = check_float("restitution", restitution, low=0.0, high=1.0)
-        threshold = check_float("restitution_threshold", restitution_threshold, low=0.0)
-        if distance > 0.0:
-            target = -distance / self._dt
-        else:
-            target = self._baumgarte * max(0.0, -distance - self._slop) / self._dt
-        side = self._choose_tangent(along, tangent)
-        arm_a, arm_b = self._compute_arm(pair[0], at), self._compute_arm(pair[1], at)
-        key, label = self._reserve_key("contact", pair, feature, name)
-        self._contact_blocks.append(
-            Contact(
-                name=label,
-                key=key,
-                bodies=pair,
-                normal=along,
-                tangent=side,
-                arm_a=arm_a,
-                arm_b=arm_b,
-                mu=friction,
-                target=target,
-                restitution=bounce,
-                threshold=threshold,
-            )
+        return self._add(
+            "contact",
+            a,
+            b,
+            feature,
+            name,
+            point,
+            normal,
+            tangent,
+            gap,
+            mu,
+            restitution,
+            restitution_threshold,
         )
-        return key
+
+    # -- arrays of blocks ----------------------------------------------------------------------------------------
+
+    @check_arguments
+    def contacts(
+        self, bodies: ArrayLike, points: ArrayLike, normals: ArrayLike, *, gap: ArrayLike = 0.0, mu: ArrayLike = 0.0,
+        restitution: ArrayLike = 0.0, restitution_threshold: ArrayLike = 1.0, tangents: ArrayLike | None = None,
+        feature: ArrayLike | None = None, names: Sequence[str] | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Add n contacts: the same as n calls of `contact`, in less time.
+
+        Parameters
+        ----------
+        bodies : array-like (n, 2) of int
+            Bodies a and b of each contact; -1 is the static world.
+        points : array-like (n, 2) or (n, 3), m
+            Contact points in world coordinates.
+        normals : array-like (n, 2) or (n, 3), or one vector
+            Unit vectors from a to b.
+        gap, mu, restitution, restitution_threshold : scalar or (n,)
+            As in `contact`.
+        tangents : array-like (n, 3), or one vector, optional
+            As `tangent` of `contact`.
+        feature : array-like (n,) of int, optional
+            As in `contact`.
+        names : sequence of str (n,), optional
+            Names of the contacts in reports.
+
+        Returns
+        -------
+        ndarray (n,) of uint64
+            Keys of the contacts.
+
+        Raises
+        ------
+        InputError
+            An argument is invalid; the message has the number of the first invalid contact. No contact is added.
+        """
+        values = (points, normals, tangents, gap, mu, restitution, restitution_threshold)
+        return self._add_many("contact", bodies, feature, names, values)
+
+    @check_arguments
+    def joints(
+        self, block_type: str, bodies: ArrayLike, *, feature: ArrayLike | None = None,
+        names: Sequence[str] | None = None, **arguments: Any,
+    ) -> np.ndarray:  # fmt: skip
+        """Add n joints of one type: the same as n calls of the method with this name.
+
+        Parameters
+        ----------
+        block_type : str
+            Name of the method: "hinge", "ball", "weld", "slider", "distance", "motor", "limit", "spring" or "gear".
+        bodies : array-like (n, 2) of int
+            Bodies a and b of each joint; -1 is the static world.
+        feature, names
+            As in `contacts`.
+        **arguments
+            Arguments of the method. Vectors are arrays (n, 2) or (n, 3), or one vector for all joints; numbers are (n,)
+            or scalars.
+
+        Returns
+        -------
+        ndarray (n,) of uint64
+            Keys of the joints.
+
+        Raises
+        ------
+        InputError
+            An argument is invalid; the message has the number of the first invalid joint. No joint is added.
+        """
+        check_name("block_type", block_type, [name for name in ARGUMENTS if name != "contact"])
+        method = getattr(type(self), block_type)
+        try:
+            bound = signature(method).bind(self, None, None, **arguments)
+        except TypeError:
+            reject_call(method, (self, None, None), arguments)
+        bound.apply_defaults()
+        values = [bound.arguments[name.rstrip("?")] for name in ARGUMENTS[block_type]]
+        return self._add_many(block_type, bodies, feature, names, values)
 
     # -- results -------------------------------------------------------------------------------------------------
 
@@ -515,40 +504,39 @@ class RowBuilder(RowAssembly):
         Problem
             `lv.solve(problem, impulse=problem.carry(previous))` starts from the solution of the step before.
         """
-        joints, contacts = self._joint_blocks, self._contact_blocks
-        rows = [row for block in joints for row in block.rows]
-        tangents = np.array([self._dimensions - 1 if x.mu > 0.0 else 0 for x in contacts], np.int32)
+        rows, joints, contacts = self._blocks.export()
+        tangents = np.where(contacts["mu"] > 0.0, np.int32(self._dimensions - 1), np.int32(0))
         data = Rows(
             inv_mass=self._inv_mass,
             inv_inertia=self._inv_inertia,
             v_free=self._velocity,
-            jac=[row.jac for row in rows],
-            joint_ptr=np.cumsum([0, *(len(block.rows) for block in joints)]),
-            joint_body=[block.bodies for block in joints],
-            normal=[x.normal for x in contacts],
-            tangent=[x.tangent for x in contacts],
-            arm_a=[x.arm_a for x in contacts],
-            arm_b=[x.arm_b for x in contacts],
-            contact_body=[x.bodies for x in contacts],
+            jac=np.ascontiguousarray(rows["jac"]),
+            joint_ptr=np.append(np.int32(0), np.cumsum(joints["n_rows"], dtype=np.int32)),
+            joint_body=np.ascontiguousarray(joints["body"]),
+            contact_body=np.ascontiguousarray(contacts["body"]),
+            **{
+                name: np.ascontiguousarray(contacts[name]) for name in ("normal", "tangent", "arm_a", "arm_b")
+            },
+            copy=False,
         )
-        first = len(rows) + np.cumsum([0, *(1 + tangents)])
+        first = len(rows) + np.append(0, np.cumsum(1 + tangents))
         target, compliance = np.zeros(first[-1]), np.zeros(first[-1])
-        target[: len(rows)] = [row.target for row in rows]
-        compliance[: len(rows)] = [row.compliance for row in rows]
-        target[first[:-1]] = [self._compute_normal_target(x) for x in contacts]
-        blocks: list[Block | Contact] = [*joints, *contacts]
+        target[: len(rows)], compliance[: len(rows)] = rows["target"], rows["compliance"]
+        target[first[:-1]] = contacts["target"]
+        keys = np.append(joints["key"], contacts["key"])
+        given = dict(self._names)
         return Problem.from_rows(
             data,
             target,
-            lower=[row.lower for row in rows],
-            upper=[row.upper for row in rows],
-            mu=[x.mu for x in contacts],
+            lower=rows["lower"],
+            upper=rows["upper"],
+            mu=contacts["mu"],
             tangents=tangents,
             shape=shape,
             friction=friction,
             compliance=compliance,
-            key=np.array([block.key for block in blocks], np.uint64),
-            names=[block.name for block in blocks],
+            key=keys,
+            names=Names(len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]),
             name=name,
         )
 
@@ -565,17 +553,11 @@ class RowBuilder(RowAssembly):
             `solution.impulse[builder.rows_of(key)]` are the impulses of the block [N s]; in a contact the normal
             impulse is followed by the tangential ones. Call it after all blocks were added: contacts follow joints.
         """
-        wanted, start = check_int("key", key, high=2**64 - 1), 0
-        for joint in self._joint_blocks:
-            if joint.key == wanted:
-                return slice(start, start + len(joint.rows))
-            start += len(joint.rows)
-        for contact in self._contact_blocks:
-            size = self._dimensions if contact.mu > 0.0 else 1
-            if contact.key == wanted:
-                return slice(start, start + size)
-            start += size
-        raise InputError(f"key is {wanted}; a key that a method of this builder returned is needed")
+        wanted = check_int("key", key, high=2**64 - 1)
+        found = self._blocks.find_rows(wanted)
+        if found is None:
+            raise InputError(f"key is {wanted}; a key that a method of this builder returned is needed")
+        return slice(found[0], found[0] + found[1])
 
     @check_arguments
     def velocity_after(self, problem: Problem, impulse: ArrayLike) -> FloatArray:
@@ -593,12 +575,8 @@ class RowBuilder(RowAssembly):
         ndarray (n, 3) or (n, 6), m/s and rad/s
             In the layout of `velocity`.
         """
-        n = len(self._centres)
+        n = len(self._position)
         if not isinstance(problem, Problem) or problem.rows is None or problem.rows.n_bodies != n:
             raise InputError(f"problem is {problem!r:.60}; the result of RowBuilder.problem() is needed")
         after = problem.velocity(impulse)
         return np.ascontiguousarray(after[:, PLANAR_VELOCITIES]) if self._is_planar else after
-
-
-def _is_float(value: Any) -> bool:
-    return isinstance(value, (float, np.floating))

@@ -231,6 +231,18 @@ CALLS = {
            ("contact", {"point": AT, "normal": AXIS, "gap": 0.1, "mu": 0.5, "restitution": 0.5,
                         "restitution_threshold": 0.1, "tangent": np.array([1.0, 0.0, 0.0])}, {}),
        )},
+    "RowBuilder.contacts": Call(
+        partial(call_builder, "contacts"),
+        {"bodies": [(-1, 0), (0, 1)], "points": PLACES, "normals": np.tile(AXIS, (2, 1)), "gap": 0.1 * ONES,
+         "mu": ONES, "restitution": 0.5 * ONES, "restitution_threshold": ONES, "tangents": np.eye(2, 3),
+         "feature": [1, 2], "names": ["one", "two"]},
+        {"points": "point", "normals": "normal", "tangents": "tangent"},
+    ),
+    "RowBuilder.joints": Call(
+        partial(call_builder, "joints"),
+        {"block_type": "hinge", "bodies": [(-1, 0), (0, 1)], "anchor": PLACES, "axis": np.tile(AXIS, (2, 1)),
+         "feature": [1, 2], "names": ["one", "two"]},
+    ),
     "RowBuilder.motor, linear": Call(
         partial(call_builder, "motor"), PAIR | {"axis": AXIS, "speed": 1.0, "max_force": 2.0, "anchor": AT}
     ),

@@ -4,6 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from random_problems import seeds
 
 import lavender as lv
 
@@ -318,3 +320,114 @@ def test_a_tangent_can_be_chosen():
     builder.contact(-1, 0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), mu=1.0, tangent=(3.0, 3.0, 1.0))
     expected = [np.sqrt(0.5), np.sqrt(0.5), 0.0]
     np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
+
+
+#: Arguments of array calls in three dimensions by type of block; "point" and "axis" are random vectors.
+ARRAYS = {
+    "ball": {"anchor": "point"},
+    "hinge": {"anchor": "point", "axis": "axis", "anchor_b": "point", "axis_b": "axis"},
+    "weld": {"anchor": "point", "anchor_b": "point", "angle_error": "axis"},
+    "slider": {"anchor": "point", "axis": "axis", "angle_error": "axis"},
+    "distance": {"anchor_a": "point", "anchor_b": "point", "length": "number"},
+    "spring": {"anchor_a": "point", "anchor_b": "point", "length": "number", "stiffness": "number"},
+    "motor": {"axis": "axis", "speed": "number", "max_torque": "number"},
+    "limit": {"axis": "axis", "value": "number", "upper": "number", "anchor": "point"},
+    "gear": {"axis_a": "axis", "axis_b": "axis", "ratio": "number", "angle_error": "number"},
+    "contact": {"point": "point", "normal": "unit", "gap": "number", "mu": "number", "restitution": "number"},
+}
+
+
+def draw_arguments(rng, block_type, n, dimensions):
+    """Return random arguments of n blocks by name."""
+    values = {}
+    for name, kind in ARRAYS[block_type].items():
+        if kind == "axis" and dimensions == 2 and (block_type != "slider" or name != "axis"):
+            if name == "angle_error":
+                values[name] = rng.normal(size=n)
+            elif block_type == "limit":
+                values[name] = rng.normal(size=(n, 2))
+            continue  # In two dimensions, axes of rotation are not given.
+        values[name] = rng.uniform(0.1, 0.9, size=n) if kind == "number" else rng.normal(size=(n, dimensions))
+        if kind == "unit":
+            values[name] /= np.linalg.norm(values[name], axis=1)[:, None]
+    return values
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@given(seed=seeds)
+def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
+    rng, n = np.random.default_rng(seed), 4
+    inertia = np.full(3, 2.0) if dimensions == 2 else np.tile(2.0 * np.eye(3), (3, 1, 1))
+    bodies = (
+        np.ones(3),
+        inertia,
+        rng.normal(size=(3, 3 * dimensions - 3)),
+        DT,
+        rng.normal(size=(3, dimensions)),
+    )
+    single, arrays = lv.RowBuilder(*bodies), lv.RowBuilder(*bodies)
+    single_keys, array_keys = [], []
+    for block_type in rng.permutation(list(ARRAYS)):
+        pairs = [(-1, 0), (0, 1), (0, 1), (2, -1)]
+        values = draw_arguments(rng, block_type, n, dimensions)
+        for i, (a, b) in enumerate(pairs):
+            one = {name: x[i].tolist() for name, x in values.items()}
+            single_keys.append(getattr(single, block_type)(a, b, **one))
+        if block_type == "contact":
+            points, normals = values.pop("point"), values.pop("normal")
+            array_keys += arrays.contacts(pairs, points, normals, **values).tolist()
+        else:
+            array_keys += arrays.joints(block_type, pairs, **values).tolist()
+    assert array_keys == single_keys
+    first, second = single.problem(), arrays.problem()
+    assert first == second and first.b.tobytes() == second.b.tobytes()
+    assert [first.names[0], *first.names] == [second.names[0], *second.names]
+
+
+def test_array_calls_repeat_one_vector_and_one_number():
+    builder, pairs = spatial(np.zeros((2, 6)), np.eye(2, 3)), [(-1, 0), (-1, 1)]
+    builder.contacts(pairs, np.eye(2, 3), (0.0, 0.0, 1.0), mu=0.5, names=["left", "right"])
+    builder.joints("hinge", pairs, anchor=np.zeros((2, 3)), axis=[0.0, 0.0, 1.0], feature=[3, 4])
+    problem = builder.problem()
+    assert problem.names == ("hinge 3 of world and body 0", "hinge 4 of world and body 1", "left", "right")
+    assert problem.cones.mu[2:].tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bodies": [(-1, 0), (1, 1)]}, "contact 1: a and b are both body 1"),
+        ({"bodies": [(-1, 0), (1, 2)]}, "contact 1: b is 2; the number of one of the 2 bodies"),
+        ({"normals": [(0.0, 0.0, 1.0), (0.0, 0.0, 2.0)]}, "contact 1: normal has length 2"),
+        ({"mu": [0.5, -0.5]}, "contact 1: mu is -0.5"),
+        ({"restitution": 2.0}, "contact 0: restitution is 2; 0 to 1 is needed"),
+        ({"tangents": (0.0, 0.0, 3.0)}, "contact 0: tangent .* parallel to the normal"),
+        ({"feature": [70_000, 1]}, "contact 0: feature is 70000"),
+        ({"bodies": [(-1, 0), (-1, 0)], "feature": [1, 1]}, "contact 1: an earlier one of the same bodies"),
+        ({"points": np.zeros((3, 3))}, r"point has shape \(3, 3\)"),
+        ({"names": ["one"]}, "names has 1 entries for 2"),
+        ({"gaps": 0.1}, r"RowBuilder.contacts has no argument gaps="),
+    ],
+)
+def test_invalid_arrays_are_rejected_and_add_nothing(change, message):
+    builder = spatial(np.zeros((2, 6)), np.eye(2, 3))
+    arguments = {"bodies": [(-1, 0), (-1, 1)], "points": np.eye(2, 3), "normals": (0.0, 0.0, 1.0)}
+    with pytest.raises(lv.InputError, match=message):
+        builder.contacts(**arguments | change)
+    assert builder.problem().m == 0
+    keys = builder.contacts(**arguments)
+    assert [builder.rows_of(int(key)) for key in keys] == [slice(0, 1), slice(1, 2)]
+
+
+def test_joints_reject_arguments_that_their_method_does_not_have():
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
+    with pytest.raises(
+        lv.InputError, match=r"RowBuilder.ball has no argument axis=; it takes a=, b=, anchor="
+    ):
+        builder.joints("ball", [(-1, 0)], anchor=np.zeros(3), axis=np.zeros(3))
+    with pytest.raises(lv.InputError, match=r"RowBuilder.hinge lacks anchor="):
+        builder.joints("hinge", [(-1, 0)], axis=np.ones(3))
+    with pytest.raises(lv.InputError, match="hinge 0: axis is None"):
+        builder.joints("hinge", [(-1, 0)], anchor=np.zeros(3))
+    with pytest.raises(lv.UnknownName, match="unknown block_type 'contact'"):
+        builder.joints("contact", [(-1, 0)])
