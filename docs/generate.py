@@ -2,7 +2,7 @@
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
     python docs/generate.py --pages    rewrite docs/solvers.md and docs/scenes.md, which are checked in (seconds)
-    python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md and docs/index.md, and the
+    python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
 docs/generated/ is not checked in, and no page links to it: links work in a checkout and on a forge. The benchmark keeps
@@ -54,8 +54,6 @@ ROOT = Path(__file__).resolve().parent.parent
 # Examples whose figures pages show.
 FIGURES = (
     "planned_push",
-    "recorded_slide",
-    "which_contact",
     "residual_or_motion",
     "motion_over_a_run",
 )
@@ -687,8 +685,7 @@ def main():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of backends
             tables = measured_tables(measure(here / "_build"))
-        for name in ("choose.md", "index.md"):
-            replace_tables(here / name, tables)
+        replace_tables(here / "choose.md", tables)
         write_figures(here / "static" / "examples")
     if not (chosen.pages or chosen.tables):
         write(here, here / "_build")

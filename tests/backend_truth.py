@@ -98,7 +98,7 @@ def compute_kkt_error(program, x, y=None, z=None, z_box=None):
         A, G = (program.get(name, np.zeros((0, n))) for name in "AG")
         if len(y) < len(A) or len(z) < len(G):
             return np.inf
-        y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero if there are no rows.
+        y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero without rows.
         b, h, low, high = (
             [mpmath.mpf(float(v)) for v in program.get(name, missing)]
             for name, missing in (

@@ -112,7 +112,7 @@ def sweep_packed(problem, counts, name="sequential_impulses", **options):
 
 
 def robot(seed, m=12, n=10, soft=True, number=np.float64):
-    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
+    """Bounded rows on a random forest, as soft as in engines (2 to 20 % of the diagonal of A)."""
     rng = np.random.default_rng(seed)
     mass = tree_mass(rng, random_tree_parents(rng, n))
     jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
@@ -188,13 +188,13 @@ def newton_without(*phases):
 
 
 def keep_values(monkeypatch, module, name, values, solvers):
-    """Let a table of settings try only some values, beside some solvers or none."""
+    """Let a table of settings try only some values, with some solvers or none."""
     lines = [f for f in getattr(module, name) if f.fixed.get("solver", "") in solvers]
     kept = [f._replace(values=tuple(x for x in f.values if x in values)) for f in lines]
     monkeypatch.setattr(module, name, tuple(f for f in kept if f.values))
 
 
-#: QP backends of other packages that are here, and those of all that need a definite A.
+#: QP backends of other packages that are here, and the backends of all that need a definite A.
 BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
 DEFINITE = {"quadprog", "ecos", "pyqpmad"}
 

@@ -97,7 +97,7 @@ def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
 
 
 def make_frames(change):
-    """Return frames of another engine: those of MuJoCo, with `change(arrays of one world, step)` instead of them."""
+    """Return frames of MuJoCo as frames of another engine, with `change(arrays of one world, step)` instead of them."""
     names = ("qpos", "qvel", "qacc", "qacc_smooth", "qfrc_smooth", "efc_D", "efc_aref", "efc_force")
 
     def frames(engine, runs):
@@ -391,7 +391,7 @@ def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, t
     assert not audit(boxes(), worlds=1, steps=5, workers=1).engine_warnings
 
 
-def test_a_file_that_is_no_model_is_told(tmp_path):
+def test_audit_of_a_file_without_a_model_names_the_file(tmp_path):
     (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
     with pytest.raises(lv.InputError, match=r"torn\.xml"):
         audit(tmp_path / "torn.xml", worlds=1, steps=2)

@@ -1,4 +1,4 @@
-"""Settings of MuJoCo beside each other: what is measured, what is chosen, and the line to copy."""
+"""Settings of MuJoCo: what is measured, what is chosen, and the line to copy."""
 
 from dataclasses import replace
 

@@ -32,7 +32,7 @@ def test_folder_of_an_audit_is_read_as_its_worst_problems(lavender, tmp_path):
         recorder.add(*make_step())
     for name in ("records.npz", "states.npz"):
         np.savez(tmp_path / name, velocity=np.zeros(3))
-    assert lavender("check", tmp_path)[0] != 0  # Not the folder of an audit: these files are no problems.
+    assert lavender("check", tmp_path)[0] != 0  # Not the folder of an audit: these files are not problems.
     (tmp_path / "numbers.json").write_text("{}")
     code, printed, err = lavender("check", tmp_path)
     assert code == 0, printed + err

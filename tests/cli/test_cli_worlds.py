@@ -42,7 +42,7 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     code, out, _ = lavender("audit", boxes(), *words)
     assert code == 0 and "none of 40 steps judged in 2 worlds stopped before convergence" in out
     assert "None of 40 steps judged have an error above 0.001 m/s" in " ".join(out.split())
-    assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # those of another run are gone
+    assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # files of another run are gone
 
 
 def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypatch):

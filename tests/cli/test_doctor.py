@@ -79,7 +79,7 @@ def test_the_compiler_is_read_from_the_module(library, found):
 
 @pytest.mark.skipif(os.name != "posix", reason="a script in place of git")
 def test_a_refusal_of_git_is_no_error_in_whatever_letters(tmp_path, monkeypatch):
-    """It names the checkout, whose folders may be in other letters than those of the locale."""
+    """It names the checkout, whose folders may be in other letters than the locale has."""
     (tmp_path / ".git").mkdir()
     (tmp_path / "git").write_bytes(b"#!/bin/sh\necho 'dubious ownership in \xff' >&2\nexit 128\n")
     (tmp_path / "git").chmod(0o755)

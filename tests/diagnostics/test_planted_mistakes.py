@@ -56,7 +56,7 @@ class Step:
 
     @property
     def state(self):
-        """The arguments of `diagnose` besides the problem."""
+        """The arguments of `diagnose` except the problem."""
         velocity = self.before if self.rows is None else self.before.reshape(-1, 6)
         return {"velocity": velocity, "gap": self.gap, "dt": self.dt}
 

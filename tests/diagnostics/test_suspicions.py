@@ -375,7 +375,7 @@ def test_diagnose_impulse_far_above_momentum_is_reported(as_bodies):
 
 
 def test_diagnose_light_body_thrown_away_is_reported():
-    """The impulse is small against the momentum of the heavy body beside the light one."""
+    """The impulse is small against the momentum of the heavy body next to the light one."""
     problem = lv.Problem.from_jacobian(
         [[1e-6, 0.0], [0.0, 1.0]], np.diag([1e-6, 1e6]), [-1.0, -1.0], target=[0.1, 0.0],
         cones=lv.Cones.contacts(0.0, count=2, tangents=0),

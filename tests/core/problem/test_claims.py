@@ -340,7 +340,7 @@ def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register
     assert lv.solve(random_lcp(15), "few").iterations > 0
 
 
-# -- the floor is no excuse for an impulse that ran away ------------------------------------------------
+# -- the floor does not excuse an impulse that ran away ------------------------------------------------
 
 
 HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range

@@ -101,7 +101,7 @@ def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind,
     # The residual of a solved problem is rounding, which the order of additions changes: as much as its floor.
     slack = ROUNDING * worst + 4.0 * max(r.roundoff_floor for r in alone)
     assert abs(found.relative - worst) <= slack
-    if kind != "ellipses":  # whose numbers are those of stretched rows
+    if kind != "ellipses":  # whose rows are stretched
         count = sum(find_islands(p)[0] for p in (first, second))
         assert len(found.islands.relative) == find_islands(both)[0] == count
         np.testing.assert_allclose(

@@ -660,7 +660,7 @@ def test_found_means_to_the_error_that_was_asked_for():
             for tol in (1e-2, 1e-5, 1e-9):
                 answer = lv.solve_qp(problem, tol=tol)
                 assert answer.found and answer.error <= tol
-            # The same answer beside another demand: the impulses alone are asked for 1e-6.
+            # Another demand on the same answer: its impulses alone have the default of 1e-6.
             rough = problem.qp.solution((1.0 + 1e-4) * answer.impulse)
             assert rough.found == (rough.error <= 1e-6)
             strict = lv.solve_qp(problem, tol=0.0)

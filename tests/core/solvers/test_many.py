@@ -421,7 +421,7 @@ def test_balls_in_arrays_have_the_impulse_and_velocity_of_the_formula():
 )
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 def test_bodies_in_arrays_have_the_bits_of_single_solves(mu, friction, monkeypatch):
-    """Boxes of two on each other; what is wrong with one, or a little off, is no matter of the others."""
+    """Boxes of two on each other; what is wrong with one, or a little off, does not matter to the others."""
     rng = np.random.default_rng(5)
     corners, up = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), np.array([0.0, 0.0, 0.5])
     fields = {
