@@ -132,8 +132,9 @@ def clock(monkeypatch):
 
     made = Clock()
     monkeypatch.setattr(deadline, "perf_counter", made)
-    for name in ("solve", "prepared", "compiled_call"):
-        monkeypatch.setattr(sys.modules[f"lavender.solving.{name}"], "perf_counter", made)
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("lavender.solving.", "lavender.solvers.")) and hasattr(module, "perf_counter"):
+            monkeypatch.setattr(module, "perf_counter", made)
     return made
 
 

@@ -25,9 +25,10 @@ from lavender.solvers.costs import RATES, estimate_judge_setup_cost, estimate_pa
 from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.compiled_call import COST_PER_SECOND, NO_STAGE_MESSAGE, compute_postponed_fields
-from lavender.solving.limits import check_accepted, check_budget, check_time_limit
-from lavender.solving.outcome import create_unjudged, keep_unjudged_start
-from lavender.solving.solve import solve, solve_prepared
+from lavender.solving.finish import create_unjudged, keep_unjudged_start
+from lavender.solving.limits import check_time_limit
+from lavender.solving.prepared import Prepared, check_accepted, check_arguments
+from lavender.solving.solve import solve
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite
@@ -375,7 +376,7 @@ def solve_many(
     if velocity_tol is not None:
         tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)
     deadline = NEVER if limit == np.inf else Deadline(limit)
-    check_budget(spec, tol, max_iter)
+    check_arguments(spec, None, tol, max_iter)
     starts, invalid_starts = _convert_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
@@ -425,9 +426,10 @@ def solve_many(
                 solutions.store_late_solution(i, unsolved)
                 return
         if has_failed:
-            own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT))
+            own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
             counts = solutions._get_counts(problem, i)
-            solution = solve_prepared(problem, spec, named, start, tol, max_iter, own, failed_call=counts)
+            arguments = check_arguments(spec, start, tol, max_iter, own, failed_call=counts)
+            solution = Prepared(problem, spec, named, False, own)._solve(arguments, problem)
         else:
             left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
             # Even the choice between start and zero impulse would take time from later worlds.

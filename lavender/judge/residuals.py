@@ -391,12 +391,12 @@ def reuse_or_judge_impulse(
 ) -> measure.Judged:
     """Return `judged` if it belongs to this problem and impulse, bit for bit; else judge a copy of the impulse."""
     if (
-        judged is None
-        or judged.data is not problem.metric
-        or not measure.are_bit_identical(judged.impulse, impulse)
+        judged is not None
+        and judged.data is problem.metric
+        and measure.are_bit_identical(judged.impulse, impulse)
     ):
-        return judge_impulse(problem, impulse.copy())
-    return judged
+        return judged
+    return judge_impulse(problem, impulse.copy())
 
 
 def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None:
@@ -546,6 +546,9 @@ def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Res
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
     """Build a `Residual` from a raw judge pass."""
     residual: Residual = object.__new__(Residual)
+    error, slack = judgement.error, judgement.slack
+    error.setflags(write=False)
+    slack.setflags(write=False)
     state = {
         "relative": judgement.relative,
         "energy": judgement.energy,
@@ -557,8 +560,8 @@ def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
         "worst_row": judgement.worst,
         "energy_at_zero": problem.metric.reference_energy,
         "velocity_at_zero": problem.metric.reference_velocity,
-        "error": mark_read_only(judgement.error),
-        "slack": mark_read_only(judgement.slack),
+        "error": error,
+        "slack": slack,
         "_problem": problem,
         "_impulse": judgement.impulse,
         "precision": "float64",

@@ -171,6 +171,7 @@ class ProblemData:
         if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
             put(self, "names", as_names("blocks", self.names, k))
         put(self, "name", str(self.name))
+        self.law  # noqa: B018 - computed with the checks, because every solve reads it
         put(
             self, "copy", True
         )  # `copy` applies to this call only: problems derived from this one copy by default.
@@ -252,9 +253,8 @@ class ProblemData:
     @cached_property
     def law(self) -> str:
         """Problem class, determined by the blocks: "linear", "lcp", "coulomb" or "cone"."""
-        if self.cones.is_free:
-            return "linear"
-        return "lcp" if self.cones.is_bounded_rows else self.friction
+        blocks = self.cones._blocks
+        return "linear" if blocks.is_free else "lcp" if blocks.is_bounded_rows else self.friction
 
     def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
         """Return a writable copy of `impulse` (m,) [N s]; raise InputError if it has a wrong shape or is not finite."""

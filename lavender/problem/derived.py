@@ -75,23 +75,22 @@ class cached_property(Generic[T]):
     def __get__(self, instance: object, owner: type) -> T: ...
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        return self if instance is None else self._compute(instance)
-
-    def _compute(self, instance: Any) -> T:
-        value: T = instance.__dict__.setdefault(self.name, self.function(instance))
-        return value
+        if instance is None:
+            return self
+        return instance.__dict__.setdefault(self.name, self.function(instance))
 
 
 class computed_once(cached_property[T]):
     """A `cached_property` of an object with `derived`, which one thread computes while others wait."""
 
-    def _compute(self, instance: Any) -> T:
+    def __get__(self, instance: Any, owner: type) -> Any:
         """Compute the property under the lock of the object, unless another thread has done so."""
+        if instance is None:
+            return self
         attributes, derived = instance.__dict__, instance.derived
         if derived.process is not _process:
             derived.lock, derived.process = RLock(), _process
         with derived.lock:
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
-            value: T = attributes[self.name]
-            return value
+            return attributes[self.name]

@@ -109,12 +109,12 @@ class Operators(ProblemData):
     @cached_property
     def _matrix_asymmetry(self) -> float:
         """Value of `asymmetry` of a matrix."""
-        return float(sparse.measure_asymmetry(*self._compressed, self.d))
+        return float(sparse.measure_asymmetry(*self._compressed, self.metric.d))
 
     @property
     def is_symmetric(self) -> bool:
         """Whether A = A^T up to rounding of its entries (1e-14 of the largest, and 1e-10 of sqrt(d_i d_j))."""
-        return self.asymmetry <= 1e-14
+        return self.matrix is None or self._matrix_asymmetry <= 1e-14
 
     @cached_property
     def is_semidefinite(self) -> bool:

@@ -26,8 +26,8 @@ from lavender.problem.generalized import Generalized
 from lavender.problem.program import QuadraticProgram
 from lavender.solvers.registry import get
 from lavender.solvers.small import describe_stages
+from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.limits import check_time_limit
-from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
@@ -236,7 +236,11 @@ def _solve_by_backend(
         stages=solution.stages,
     )
     impulse = qp.select_row_multipliers(answer.impulse).copy()
-    judged = finish(problem, get(solver), options or {}, impulse, claim, tol, solution.setup_time, 0.0, None)
+    judged = finish(
+        FinishedRun(
+            problem, get(solver), options or {}, impulse, claim, tol=tol, setup_time=solution.setup_time
+        )
+    )
     return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
 
 

@@ -31,7 +31,8 @@ from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, 
 from lavender.problem import Problem, check_problem
 from lavender.report.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
-from lavender.solving.limits import check_budget, check_time_limit
+from lavender.solving.limits import check_time_limit
+from lavender.solving.prepared import check_arguments
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
@@ -261,7 +262,7 @@ def cross_check(
         `tol` or a limit is invalid.
     """
     check_problem(problem)
-    check_budget(specs()["auto"], tol, max_iter)
+    check_arguments(specs()["auto"], None, tol, max_iter)
     check_time_limit(time_limit)
     if problem.guess is not None:  # All solvers start from the zero impulse.
         problem = replace(problem, guess=None, copy=False)

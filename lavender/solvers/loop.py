@@ -6,15 +6,16 @@ of iterations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import inf
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
+from lavender.base.deadline import CHUNK_TIME, Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
     Residual,
@@ -65,7 +66,7 @@ class Loop:
     impulse : (m,) N s
         Start; replaced by the result in place.
     tol : float, -
-    deadline : Deadline
+    deadline : Deadline, optional
     callback : callable, optional
     records : list, optional
         List to which the records of the history are appended.
@@ -94,14 +95,14 @@ class Loop:
     state: Any
     impulse: FloatArray
     tol: float
-    deadline: Deadline
+    deadline: Deadline | None = None
     callback: Callback | None = None
     records: list[Record] | None = None
     record_solvers: list[str] = field(default_factory=list)
     time: float = 0.0
     recording_time: float = 0.0
     done: int = 0
-    work: dict[str, int] = field(default_factory=dict)
+    work: Mapping[str, int] = field(default_factory=dict)
     broken: bool = False
     next_record: int = 0
     pace: float = inf
@@ -110,12 +111,14 @@ class Loop:
     def run_in_one_call(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""
         start_point = self.impulse.copy()
-        watch = Stopwatch()
+        deadline, begin = self.deadline, perf_counter()
         try:
             try:
-                claim = self.call_solver(max_iter, self.deadline.get_remaining_seconds(MIN_TIME_LIMIT))
+                claim = self.call_solver(
+                    max_iter, None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT)
+                )
             finally:
-                self.time = watch.elapsed_seconds - self.recording_time
+                self.time = perf_counter() - begin - self.recording_time
             self.done = claim.iterations
             if not self.broken:
                 return claim
@@ -138,7 +141,8 @@ class Loop:
     def run(self, max_iter: int) -> Claim:
         """Run in chunks; the result is the best of the iterates that the solver has checked."""
         claim = self.run_chunks(max_iter)
-        self._keep_best()
+        if self.tol != 0.0:  # With tol = 0, the result is the last iterate.
+            self._keep_best()
         return claim
 
     def run_chunks(self, max_iter: int) -> Claim:
@@ -147,26 +151,26 @@ class Loop:
         # measured.
         chunk = min(FIRST_CHUNK_ITERATIONS, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
-        claim = EMPTY_CLAIM
-        if self.deadline.is_set:
+        claim, deadline = EMPTY_CLAIM, self.deadline
+        if deadline is not None:
             chunk = max(1, min(chunk, int(self._choose_chunk_time() / self.pace)))
         try:
-            if self.deadline.is_set:
-                watch = Stopwatch()
-                self.solver.set_deadline(self.state, self.deadline)
-                self.time += watch.elapsed_seconds
+            if deadline is not None:
+                begin = perf_counter()
+                self.solver.set_deadline(self.state, deadline)
+                self.time += perf_counter() - begin
             if records and self._record_residual():
                 return self._add_to_total_work(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
             while self.done < max_iter:
                 n = min(chunk, max_iter - self.done)
                 if records:
                     n = min(n, self.next_record - self.done)
-                watch = Stopwatch()
+                begin = perf_counter()
                 claim = self.call_solver(n, None)
-                elapsed = watch.elapsed_seconds
+                elapsed = perf_counter() - begin
                 self.time += elapsed
                 self.done += claim.iterations
-                self.work = sum_work_counts((self.work, claim.work))
+                self.work = sum_work_counts((self.work, claim.work)) if self.work else claim.work
                 stopped = records and self.done == self.next_record and self._record_residual()
                 if claim.status is not MAX_ITERATIONS:
                     break
@@ -177,13 +181,15 @@ class Loop:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
                 # Do not start an iteration if less than half of its time remains.
-                if self.deadline.has_passed(0.5 * elapsed / claim.iterations):
+                if deadline is not None and deadline.has_passed(0.5 * elapsed / claim.iterations):
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
                     chunk = self._choose_chunk_size(n, elapsed)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
+        if claim.iterations == self.done and claim.work == self.work:
+            return claim  # The claim of a single chunk needs no addition.
         return self._add_to_total_work(claim)
 
     def _choose_chunk_size(self, n: int, elapsed: float) -> int:
@@ -191,7 +197,7 @@ class Loop:
 
     def _choose_chunk_time(self) -> float:
         """Return the intended time of the next chunk [s]."""
-        left = self.deadline.get_remaining_seconds()
+        left = None if self.deadline is None else self.deadline.get_remaining_seconds()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
 
     def replace_by_best_impulse(self, start: FloatArray, or_zero: bool = True) -> None:
@@ -207,9 +213,7 @@ class Loop:
         self.impulse[:] = result.impulse
 
     def _keep_best(self) -> None:
-        """Replace the last iterate by the best checked iterate. With tol = 0, keep the last iterate."""
-        if self.tol == 0.0:
-            return
+        """Replace the last iterate by the best checked iterate."""
         state: State = self.state
         watch = getattr(state, "watch", None)
         if isinstance(watch, StoppingTest):
@@ -225,18 +229,16 @@ class Loop:
 
     def _record_residual(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
-        watch = Stopwatch()
+        begin = perf_counter()
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self.recording_time += watch.elapsed_seconds
+        self.recording_time += perf_counter() - begin
         # Record at 1, 2, ... 16 iterations, then after each eighth more.
         self.next_record = self.done + max(1, self.done >> 3)
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
     def _add_to_total_work(self, claim: Claim) -> Claim:
-        if claim.iterations == self.done and claim.work == self.work:
-            return claim  # The claim of a single chunk needs no addition.
         return replace(claim, iterations=self.done, work=self.work)
 
     def get_history(self) -> History | None:

@@ -33,12 +33,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.deadline import Deadline, Stopwatch, TooLate
+from lavender.base.deadline import Deadline, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual, judge_impulse
@@ -71,6 +72,8 @@ VELOCITY_MAX_COST_RATIO = 10.0
 MAX_FORMED_ROWS = 3000
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
+# Texts of each count of the kernel: "1 exchange" and " exchanges".
+COUNT_TEXTS = tuple((format_work_count(1, kind), format_work_count(2, kind)[1:]) for kind in COUNTED)
 _ENDS = {
     OUTCOMES["reached"]: Status.CONVERGED,
     OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
@@ -180,7 +183,6 @@ class Newton(Solver):
         """Build the linear system of a problem, or the driver over its velocities."""
         return self._choose_form_and_build_state(problem, None)
 
-    @np.errstate(all="ignore")  # Results that overflow are judged.
     def _choose_form_and_build_state(self, problem: Problem, like: System | None) -> NewtonState:
         """Choose the form and build the state; `like` is a system whose layout may be reused.
 
@@ -191,13 +193,14 @@ class Newton(Solver):
         CapabilityError
             The matrix over the velocities is too large for form="velocity" or for round cones.
         """
-        check_choice("form", self.form, FORMS)
+        if self.form not in FORMS:
+            check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
                 "form='velocity' needs J and M, and this problem was given as a matrix A: build it with "
                 "Problem.from_rows or Problem.from_jacobian, or give form='impulse'"
             )
-        if problem.m == 0:
+        if not len(problem.b):
             return NewtonState(problem, None)
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
@@ -219,7 +222,7 @@ class Newton(Solver):
                 "over the velocities of an island (dense, or with the fill of its factor), and this "
                 "problem needs more: give form='impulse', or use a sweep solver"
             )
-        if problem.cones.has_round:
+        if problem.cones._blocks.has_round:
             raise CapabilityError(
                 "round cones of more than two tangents need form='velocity', which accepts at most "
                 f"{general.MAX_MATRIX_ENTRIES:.1e} values in the matrix of an island; this problem needs "
@@ -233,7 +236,6 @@ class Newton(Solver):
         """Build the state for new numbers; the elimination order is reused between the same bodies."""
         return self._choose_form_and_build_state(problem, state.system)
 
-    @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
         self,
         state: NewtonState,
@@ -243,11 +245,14 @@ class Newton(Solver):
         time_limit: float | None = None,
     ) -> Claim:
         problem, system = state.problem, state.system
-        if problem.m == 0:
+        if not len(problem.b):
             return Claim(Status.CONVERGED, 0)
-        if state.general is not None:
-            return self._run_over_velocities(state, impulse, max_iter, tol, time_limit)
-        return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
+        if system is not None and system.dense:
+            return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
+        with np.errstate(all="ignore"):  # Results that overflow are judged.
+            if state.general is not None:
+                return self._run_over_velocities(state, impulse, max_iter, tol, time_limit)
+            return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def advance(
@@ -355,7 +360,11 @@ class Newton(Solver):
         solve = system.solve
         factorisations = warm_factorisations + solve.done - before
         message = ", ".join(
-            format_work_count(count, kind) for count, kind in zip(solve.counts, COUNTED, strict=True) if count
+            [
+                one if n == 1 else f"{n}{many}"
+                for n, (one, many) in zip(solve.counts, COUNT_TEXTS, strict=True)
+                if n
+            ]
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
@@ -395,10 +404,9 @@ def _run_stages(
     (m,) array or None
         A certificate, or a direction that gives a lower bound of every solution's impulse.
     """
-    deadline = Deadline(time_limit)
+    deadline = system.deadline = None if time_limit is None else Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
-    system.set_deadline(deadline)
     last = max_iter + (solve.done if is_continued else 0)
     if not is_continued:
         solve.start(impulse, tol, SPEC.max_iter if max_total else max_iter)
@@ -408,8 +416,9 @@ def _run_stages(
         while True:
             before = solve.done
             steps = INTERRUPT_CHECK_INTERVAL / max(system.expected_factor_seconds, 1e-6)
-            time_left, watch = deadline.get_remaining_seconds(), Stopwatch()
-            if time_left is not None:
+            begin = perf_counter()
+            if deadline is not None:
+                time_left = deadline.get_remaining_seconds() or 0.0
                 # Run a single factorisation first, because its time is only estimated.
                 steps = (
                     min(steps, STAGE_TIME_FRACTION * time_left / max(system.expected_factor_seconds, 1e-9))
@@ -425,10 +434,11 @@ def _run_stages(
                 late, end = True, OUTCOMES["spent"]
                 solve.request_stop()
             if solve.done > before:
-                system.record_factor_time(watch.elapsed_seconds / (solve.done - before))
+                system.record_factor_time((perf_counter() - begin) / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
-                proven = check_certificate(problem, certificate, tol, deadline) is None
+                with np.errstate(all="ignore"):
+                    proven = check_certificate(problem, certificate, tol, deadline) is None
                 if proven:
                     solve.confirm_certificate()
             elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
@@ -452,7 +462,7 @@ def _run_stages(
 
 def _get_refusal_reason(problem: Problem) -> str | None:
     """Return a reason not to accept round cones without J and M, else None."""
-    if problem.cones.has_round and problem.generalized is None:
+    if problem.cones._blocks.has_round and problem.generalized is None:
         return "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
     return None
 

@@ -58,6 +58,9 @@ class SolverOptions(TypedDict, total=False):
 class SmallCall(Protocol):
     """Compiled call that solves a small problem with the same bits as `run`, or returns None to leave it to `run`."""
 
+    pivots: bool
+    hands_over: bool
+
     @property
     def limits(self) -> Any:
         """Limits of the call's cost in generalised coordinates; None if the call does not accept this form."""
@@ -321,6 +324,15 @@ class SolverSpec:
             return None
         return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
 
+    def _tries_compiled_call(self, problem: Problem) -> bool:
+        """Return whether the compiled call for small problems accepts problems of this form and law."""
+        small = self.small
+        if small is None or not self.builtin or type(problem) is not Problem:
+            return False
+        if problem.generalized is not None:
+            return small.limits is not None
+        return small.pivots if problem.law in ("linear", "lcp") else small.hands_over
+
     @cached_property
     def takes_all(self) -> bool:
         """Whether the solver accepts every problem."""
@@ -337,17 +349,16 @@ class SolverSpec:
             Whether to compare only the kind of the problem with the spec, without computing anything from its data and
             without calling `refusal`.
         """
-        if not self.singular_programs and getattr(problem, "has_singular_program", False):
+        if not isinstance(problem, Problem):
+            check_problem(problem)
+        if not self.singular_programs and problem.qp is not None and problem.qp.is_singular:
             return (
                 "needs a positive definite P, and P of this program is singular: use auto, or "
                 f"{_list_program_solvers()}"
             )
         if self.takes_all:
             return None
-        check_problem(problem)
-        law, operator = problem.law, problem.operator
-        if operator == "rows" and problem.cones.has_ellipse:
-            operator = "matrix"  # Solvers get `problem.disk`, which has the form of a matrix here.
+        law, blocks = problem.law, problem.cones._blocks
         if (
             law in self.laws
             and law not in ("linear", "lcp", *self.box_friction_laws)
@@ -363,6 +374,9 @@ class SolverSpec:
             if law == "coulomb" and "cone" in self.box_friction_laws and problem.cones.is_polyhedral:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
             return f"takes laws {takes}, not {law!r}{self.bounded_hint or way}"
+        operator = "matrix" if problem.matrix is not None else problem.operator
+        if operator == "rows" and blocks.has_ellipse:
+            operator = "matrix"  # Solvers get `problem.disk`, which has the form of a matrix here.
         if "matrix" not in self.operators and operator not in self.operators:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
@@ -370,12 +384,12 @@ class SolverSpec:
             if problem.operator != operator:
                 given = f"by its {problem.operator} form with ellipses, which becomes a matrix (problem.disk)"
             return f"needs a problem with {needs}; this one was given {given}"
-        if problem.cones.has_round and not self.round_cones:
+        if blocks.has_round and not self.round_cones:
             return (
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
             )
-        if problem.cones.has_more_components and not self.supports_rolling:
+        if blocks.has_rolling and not self.supports_rolling:
             return (
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
@@ -383,7 +397,7 @@ class SolverSpec:
         if self.refusal is None or kind_alone:
             return None
         try:
-            return self.refusal(problem.disk) or None
+            return self.refusal(problem.disk if blocks.has_ellipse else problem) or None
         except Exception as error:
             if self.builtin:
                 raise

@@ -221,8 +221,6 @@ class SmallCall:
         if not tol > 0.0 or not len(problem.b):
             return None, ()
         if problem.generalized is not None:
-            if self.limits is None:
-                return None, ()
             result: tuple[Any, Any] = solve_new_generalized_problem(
                 problem.derived.view, impulse, tol, self.limits, max_cost
             )
@@ -230,7 +228,7 @@ class SmallCall:
         small = problem.derived.cache.get(COMPILED_CALL_KEY)
         if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
             small = get_small_call(problem)
-        if not small or not (self.pivots if call_uses_pivots(problem) else self.hands_over):
+        if not small:
             return None, ()
         result = small.run(impulse, tol, self.rules, max_cost)
         return result

@@ -183,7 +183,8 @@ class Iterations(Step):
             self.prepare_and_set_start()
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
-            deadline=log.deadline if left is None or self.time_fraction == 1.0 else Deadline(self.time_fraction * left),
+            deadline=None if left is None else log.deadline if self.time_fraction == 1.0
+            else Deadline(self.time_fraction * left),
             pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
             records=None if log.recorder is None else [],
         )  # fmt: skip

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.ordering import Order, compute_block_order
+from lavender.problem.ordering import GIVEN, Order, compute_block_order
 from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_order_cost
 from lavender.solvers.registry import Solver
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
@@ -46,7 +48,8 @@ class SweepState:
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
         # `plan` is the order in terms of the problem's blocks; `order` may be replaced.
         self.order = self.plan = order
-        get_zero_impulse_reference(problem)
+        if problem.metric.reference_energy < 0.0:
+            get_zero_impulse_reference(problem)
         data.share_reference(problem.metric)  # Make residuals over `data` relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)
         # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
@@ -131,7 +134,15 @@ class Sweeping(SweepSolver):
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
-        order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
+        is_default = type(self.order) is str and self.order == "given" and self.ground is None
+        if (
+            is_default and type(self.seed) is int and self.seed == 0
+        ):  # As `compute_block_order`, in half the time.
+            blocks = np.arange(problem.cones._blocks.n_blocks, dtype=np.int32)
+            split = 0 if problem.rows is None else problem.rows.n_joints
+            order = Order(blocks, split, GIVEN, np.zeros(1, np.uint64), is_given=True)
+        else:
+            order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return self._build_state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:

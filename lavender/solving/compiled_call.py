@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from time import perf_counter
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import refine_residual
-from lavender.judge.solution import CONFIRMED, CONVERGED, TIME_LIMIT, Claim, Solution, SolverRun, Status
+from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
 from lavender.problem import Problem
 from lavender.solvers.loop import select_best_impulse
 from lavender.solvers.registry import SMALL_ROWS, SolverSpec
 from lavender.solvers.small import get_call_time_fraction
+from lavender.solving.finish import FinishedRun, make_fields
 from lavender_ext.judge.measure import all_finite
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def solve_small(
     tol: float,
     limit: float = math.inf,
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
-    """Solve and judge a small problem by one compiled call.
+    """Solve and judge a small problem, which `spec._tries_compiled_call`, by one compiled call.
 
     A call ends when its estimated cost reaches the time limit [s]. It then returns the better of its iterate and the
     start if the problem has at most SMALL_ROWS rows, and otherwise None, because time may remain for other solvers. The
@@ -47,9 +46,12 @@ def solve_small(
         made; empty if the time limit leaves no time for a call.
     """
     small = spec.small
-    if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):
-        return None, None
-    if not 0.0 < tol < math.inf or problem.has_singular_program:
+    if (
+        small is None
+        or not isinstance(tol, float)
+        or not 0.0 < tol < math.inf
+        or (problem.qp is not None and problem.qp.is_singular)
+    ):
         return None, None
     if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
         # Islands may take long, so `Prepared` solves them between checks of the clock.
@@ -104,18 +106,5 @@ def compute_postponed_fields(
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
-    return {
-        "residual": refine_residual(problem, judged, math.inf),
-        "iterations": claim.iterations,
-        "work": MappingProxyType(dict(claim.work)),
-        "solver": SolverRun(spec.name, {}, claim.form),
-        "message": claim.message,
-        "history": None,
-        "dual": None,
-        "certificate": None,
-        "impulse_bound": None,
-        "claim_check": CONFIRMED,
-        "status_conflict": "",
-        "sweeps_per_decade": math.nan,
-        "stages": claim.stages,
-    }
+    run = FinishedRun(problem, spec, {}, judged.impulse, claim, tol=0.0)
+    return make_fields(run, judged.refine(math.inf))

@@ -1,42 +1,29 @@
-"""Check the arguments of a solve, and whether its time limit leaves time for the forms that a solver needs."""
+"""Time limits: whether the time that remains suffices for the forms, the set-up and the judge of a solve.
+
+Nothing here runs if a solve has no time limit.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import check_bool, check_float, check_int
-from lavender.base.deadline import NEVER, Deadline, Stopwatch
-from lavender.base.errors import CapabilityError, InputError
+from lavender.base.arrays import check_float
+from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.problem import Problem, check_problem
+from lavender.problem import Problem
 from lavender.solvers.costs import (
+    SCIPY_MODULES,
     estimate_disk_cost,
     estimate_import_cost,
     estimate_judge_setup_cost,
     estimate_refusal_cost,
     get_loose_limit,
 )
-from lavender.solvers.loop import Callback
-from lavender.solvers.registry import SolverSpec
-
-if TYPE_CHECKING:
-    pass
-
-
-def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
-    """Raise an error if the argument is not a problem or the solver refuses it; return the result of `is_too_late`.
-
-    If that is true, only the kind of the problem is checked, because other checks would exceed the time limit.
-    """
-    check_problem(problem)
-    late = is_too_late(problem, spec, deadline)
-    reason = spec.refuses(problem, late)
-    if reason:
-        raise CapabilityError(f"solver {spec.name!r} {reason}")
-    return late
+from lavender.solvers.registry import Solver, SolverSpec
 
 
 def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
@@ -62,12 +49,26 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
         and deadline.has_passed(needed)
         and estimate_import_cost("scipy.sparse")
     ):
-        watch = Stopwatch()
-        import_numerical_modules()
-        # Import SciPy without counting the time; otherwise no call with this limit could ever import it.
-        deadline.reserve_seconds(-watch.elapsed_seconds)
+        _import_outside_time_limit(deadline)
         needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
     return needed > 0.0 and deadline.has_passed(needed)
+
+
+def is_setup_too_late(solver: Solver, problem: Problem, deadline: Deadline) -> bool:
+    """Return whether the solver's `prepare` would end after the deadline."""
+    if not deadline.has_passed(1e-9 * solver.cost(problem).setup):
+        return False
+    if not (solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES)):
+        return True
+    _import_outside_time_limit(deadline)
+    return deadline.has_passed(1e-9 * solver.cost(problem).setup)
+
+
+def _import_outside_time_limit(deadline: Deadline) -> None:
+    """Import SciPy without counting the time; otherwise no call with this limit could ever import it."""
+    begin = perf_counter()
+    import_numerical_modules()
+    deadline.reserve_seconds(begin - perf_counter())
 
 
 def is_tight(problem: Problem, deadline: Deadline) -> bool:
@@ -75,7 +76,7 @@ def is_tight(problem: Problem, deadline: Deadline) -> bool:
 
     Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
     """
-    return deadline.is_set and deadline.has_passed(1e-9 * get_loose_limit(problem))
+    return deadline.has_passed(1e-9 * get_loose_limit(problem))
 
 
 def check_time_limit(time_limit: Any) -> float:
@@ -93,43 +94,13 @@ def check_time_limit(time_limit: Any) -> float:
     return check_float("time_limit", time_limit, above=0.0)
 
 
-def make_deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
-    """Create the deadline of a call from its time limit [s].
+def make_deadline(spec: SolverSpec, limit: float, begun: float) -> Deadline:
+    """Create the deadline of a call that began at this reading of the clock [s], with a limit [s].
 
     Third-party solvers, and the modules of SciPy that they need, are imported first, so that this time does not count.
     """
-    if limit == math.inf:
-        return NEVER
     if spec.external or not spec.builtin:
         spec.load()
         import_numerical_modules(*(() if spec.external else spec.requires))
-        begun = None
+        return Deadline(limit)
     return Deadline(limit, begun)
-
-
-def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
-    """Return `tol` and `max_iter` as numbers; a `max_iter` of None becomes the default of the spec.
-
-    Raises
-    ------
-    InputError
-        A value is not valid.
-    """
-    tol = check_float("tol", tol, low=0.0)
-    return tol, check_int("max_iter", spec.max_iter if max_iter is None else max_iter)
-
-
-def check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
-    """Raise an error if `history` or `callback` is not valid or not supported by the solver."""
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
-    if callback is not None and not spec.callback:
-        raise CapabilityError(
-            f"solver {spec.name!r} runs in one call, so it cannot call a callback: leave callback out, or "
-            "use a solver of lavender.available(problem, callback=True)"
-        )
-    if check_bool("history", history) and not spec.history:
-        raise CapabilityError(
-            f"solver {spec.name!r} runs in one call, so it cannot record a history: leave history out, or "
-            "use a solver of lavender.available(problem, history=True)"
-        )

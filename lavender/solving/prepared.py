@@ -1,4 +1,8 @@
-"""`prepare` and the one sequence of a solve: set a solver up, run it (`solvers/loop.py`), and judge the result."""
+"""`prepare` and the one sequence of every solve: check the arguments, set the solver up, run it, finish.
+
+`lavender.solve`, `Prepared.solve`, `solve_many`, `solve_qp` and the engine's `solver=` start a solve here. The steps
+are in `solvers/loop.py`, the end is in `finish.py`.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,13 @@ from dataclasses import replace
 from functools import partial
 from threading import Lock
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, are_equal
-from lavender.base.deadline import NEVER, Deadline, Stopwatch
+from lavender.base.arrays import ArrayLike, FloatArray, are_equal, check_bool, check_float, check_int
+from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
-from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.foreign import ForeignSolver
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
@@ -46,19 +49,11 @@ from lavender.solvers.costs import (
     estimate_result_cost,
 )
 from lavender.solvers.islands import find_islands
-from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop, Record
+from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
-from lavender.solving.limits import (
-    check_accepted,
-    check_budget,
-    check_records,
-    check_time_limit,
-    is_tight,
-    is_too_late,
-    make_deadline,
-)
-from lavender.solving.outcome import create_unjudged, decide_empty_rows, finish, name_lost_row
+from lavender.solving.finish import FinishedRun, create_unjudged, decide_empty_rows, finish, name_lost_row
+from lavender.solving.limits import check_time_limit, is_setup_too_late, is_tight, is_too_late, make_deadline
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
 from lavender_ext.judge.stopping_test import StoppingTest
@@ -115,6 +110,64 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     return Prepared(problem, get(solver), cast("dict[str, Any]", options))
 
 
+class SolveArguments(NamedTuple):
+    """Checked arguments of one solve (`check_arguments`).
+
+    Parameters
+    ----------
+    impulse : array-like (m,) N s, optional
+        Start; it is checked with the problem that it belongs to.
+    tol : float, -
+    max_iter : int
+    deadline : Deadline, optional
+    history : bool
+    callback : callable, optional
+    failed_call : tuple of int, optional
+        Work counts of a compiled call that has failed; None if no call was made.
+    """
+
+    impulse: Any
+    tol: float
+    max_iter: int
+    deadline: Deadline | None = None
+    history: bool = False
+    callback: Callback | None = None
+    failed_call: tuple[int, ...] | None = None
+
+
+class SetUp:
+    """State of `Prepared` with a solver that is set up for its problem.
+
+    Attributes
+    ----------
+    solver : Solver
+    state : object
+        Result of the solver's `prepare` or `update`.
+    is_used : bool
+        Whether a solve has used the state, so that the next solve has to update it.
+    """
+
+    __slots__ = ("is_used", "solver", "state")
+
+    def __init__(self, solver: Solver, state: Any) -> None:
+        self.solver, self.state, self.is_used = solver, state, False
+
+
+class NotSetUp(NamedTuple):
+    """State of `Prepared` without a solver that is set up: it is set up by the next solve.
+
+    Parameters
+    ----------
+    failure : str
+        Arithmetic error that ended the last set-up; empty if there was none.
+    is_late : bool
+        Whether the set-up was left out because it would have ended after the deadline.
+    """
+
+    failure: str = ""
+    is_late: bool = False
+
+
 class Prepared:
     """A solver prepared for a problem; `solve(problem2)` reuses the preparation if the structure is the same.
 
@@ -128,62 +181,41 @@ class Prepared:
         spec: SolverSpec,
         options: dict[str, Any],
         begin: bool = True,
-        deadline: Deadline = NEVER,
+        deadline: Deadline | None = None,
     ) -> None:
         # The time of checks counts as set-up: they may form A and convert ellipses to disks.
-        watch = Stopwatch()
+        start = perf_counter()
         late = check_accepted(problem, spec, deadline)
-        for name in options:
-            if name not in spec.accepts:
-                if name in SOLVE_ARGUMENTS:
-                    raise CapabilityError(
-                        f"prepare does not take {name}=; give it to the method solve of the returned "
-                        f"object: prepare(...).solve({name}=...)"
-                    )
-                if name in ("order", "ground", "seed"):
-                    raise CapabilityError(
-                        f"solver {spec.name!r} does not take {name}=; it takes: "
-                        f"{', '.join(sorted(spec.accepts)) or 'no options'}"
-                    )
-                valid = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
-                kind = f"option of solver {spec.name!r}"
-                raise UnknownName(kind, name, valid)
+        if options:
+            _check_option_names(spec, options)
         self.spec = spec
         self.options = options
-        self._original, self.problem = problem, problem if late else problem.disk
+        self._original = problem
+        self.problem = problem.disk if not late and problem.cones._blocks.has_ellipse else problem
         self._lock = Lock()
+        self._setup: SetUp | NotSetUp = NotSetUp()
+        self.setup_time = 0.0  # [s] Time of the preparation since the last solve.
         # `auto` has nothing to prepare before its compiled call for small problems.
         if begin and (options or not spec.delegates):
-            self._prepare_solver(NEVER)
-        self.setup_time = watch.elapsed_seconds
+            self._set_up(problem, None)
+        self.setup_time = perf_counter() - start
 
     def __repr__(self) -> str:
         return f"<Prepared {self.spec.name} for {self._original!r}>"
 
-    solver: Any = None  # Created when it is first needed.
-    setup_time = 0.0  # [s] Time of the preparation.
-    _is_fresh = True  # Whether no solve has used the state yet.
-    _failure = ""  # Reason why no state exists, or empty.
-    _is_late = False  # Whether no state exists because building it would have exceeded the time limit.
+    @property
+    def solver(self) -> Any:
+        """The solver; None if it is not set up."""
+        return getattr(self._setup, "solver", None)
 
-    def _prepare_solver(self, deadline: Deadline) -> None:
-        """Create the solver and its state."""
-        watch = Stopwatch()
-        self.problem = self._original.disk
-        self.solver = _make_solver(self.spec, self.options)
-        try:
-            self._set_up(self.problem, True, deadline)
-        except BaseException:
-            self.solver = None  # Makes the next call try again.
-            raise
-        self._is_fresh = True
-        self.setup_time += watch.elapsed_seconds
+    @property
+    def state(self) -> Any:
+        """State that the solver has prepared; None if it is not set up."""
+        return getattr(self._setup, "state", None)
 
-    def _replace_problem(self, problem: Problem | None, deadline: Deadline = NEVER) -> None:
-        """Replace the prepared problem by another one, if one is given, without a set-up."""
-        if problem is not None and problem is not self._original:
-            late = check_accepted(problem, self.spec, deadline)
-            self._original, self.problem, self.solver = problem, problem if late else problem.disk, None
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy or pickle the arguments only; the copy prepares the solver again, as two solves cannot share a state."""
+        return partial(prepare, **self.options), (self._original, self.spec.name)
 
     def solve(
         self,
@@ -224,167 +256,227 @@ class Prepared:
             solution: Solution | None = None
             failed_call: tuple[int, ...] | None = None
             is_default = max_iter is None and callback is None and history is False
-            if is_default and self.spec.delegates and not self.options:
+            is_default = is_default and self.spec.delegates and not self.options
+            if is_default and self.spec._tries_compiled_call(original):
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
             if solution is not None:
-                self._replace_problem(problem)
+                self._replace_problem(original, None)
             else:
-                deadline = make_deadline(self.spec, limit, begun)
+                deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
                 solution = self._solve(
-                    problem, impulse, tol, max_iter, deadline, history, callback, failed_call
+                    check_arguments(
+                        self.spec, impulse, tol, max_iter, deadline, history, callback, failed_call
+                    ),
+                    original,
                 )
         finally:
             self._lock.release()
         return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
-    def _solve(
-        self,
-        problem: Problem | None,
-        impulse: ArrayLike | None,
-        tol: float,
-        max_iter: int | None,
-        deadline: Deadline,
-        history: bool = False,
-        callback: Callback | None = None,
-        failed_call: tuple[int, ...] | None = None,
-    ) -> Solution:
-        """Solve as `solve`, without the compiled call; `failed_call` holds its counts if it has been made."""
-        try:
-            original = self._original if problem is None else problem
-            tol, max_iter = check_budget(self.spec, tol, max_iter)
-            check_records(self.spec, history, callback)
+    def _solve(self, arguments: SolveArguments, original: Problem) -> Solution:
+        """Prepare, step and finish: solve `original`, without the compiled call for small problems."""
+        if type(original) is not Problem:
             check_problem(original)
-            tight = is_tight(original, deadline)
-            if tight and is_too_late(original, self.spec, deadline):
-                self._replace_problem(problem, deadline)
-                return create_unjudged(original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE)
+        deadline = arguments.deadline
+        if deadline is not None and is_tight(original, deadline):
+            unjudged = self._reserve_time_of_judge(original, arguments)
+            if unjudged is not None:
+                return unjudged
+        start = None
+        if arguments.impulse is not None:
             disk = original.disk
-            start = None if impulse is None else original.on_disk(disk.impulse_array(impulse))
-            if tight:
-                # The judge makes one pass for the result, and one for a start that is not zero.
-                passes = 2 if start is not None or disk.guess is not None else 1
-                judge_time = 1e-9 * passes * estimate_result_cost(disk)
-                setup_time = 1e-9 * estimate_judge_setup_cost(disk)
-                if deadline.has_passed(setup_time + judge_time) and not self.spec.external:
-                    self._replace_problem(problem)
-                    return create_unjudged(
-                        original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
-                    )
-                deadline.reserve_seconds(judge_time)
-                selection_time = 1e-9 * SELECTION_PASSES * estimate_pass_cost(disk)
-                if self.spec.delegates and not deadline.has_passed(4.0 * selection_time):
-                    deadline.reserve_seconds(selection_time)
-            if self.solver is None:
-                self._replace_problem(problem)
-                self._prepare_solver(deadline)
-            self._refresh(problem, deadline)
-            loop = self._loop(start, tol, deadline, history, callback)
-            if self.spec.delegates and self.state is not None:
-                self.state.failed_call, self.state.loop = failed_call, loop if history else None
-            return self._run(loop, max_iter)
-        finally:
-            if self._is_late:
-                self.solver, self._is_late = None, False  # Makes the next call try again.
-
-    def _loop(
-        self,
-        lam: FloatArray | None,
-        tol: float,
-        deadline: Deadline,
-        history: bool,
-        callback: Callback | None,
-    ) -> Loop:
-        """Build the loop of a solve, and start the worker processes of the solver."""
-        problem, original = self.problem, self._original
-        if original is not problem and callback is not None:
+            start = original.on_disk(disk.impulse_array(arguments.impulse))
+        setup = self._setup
+        if type(setup) is NotSetUp or setup.is_used or original is not self._original:
+            setup = self._set_up(original, deadline)
+        problem = self.problem
+        has_default_start = start is None and problem.guess is None
+        if start is None:
+            start = problem._start.copy() if problem.guess is None else problem.guess.copy()
+        callback = arguments.callback
+        if callback is not None and problem is not original:
             callback = _make_callback_in_original_tangents(original, original.cones.stretch, callback)
-        if lam is None:
-            lam = problem.start() if problem.guess is None else problem.guess.copy()
-        left = deadline.get_remaining_seconds()
-        has_workers = self.spec.external or not self.spec.builtin or problem.has_singular_program
-        if left is not None and has_workers and not self._is_late and not self._failure:
-            watch = Stopwatch()
-            self.solver.start_workers(self.state, left)
-            deadline.reserve_seconds(-watch.elapsed_seconds)
-            self.setup_time += watch.elapsed_seconds
-        records: list[Record] | None = [] if history else None
-        return Loop(
-            problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, deadline=deadline,
-            callback=callback, records=records,
+        loop = Loop(
+            problem=problem, solver=None, state=None, impulse=start, tol=arguments.tol, deadline=deadline,
+            callback=callback, records=[] if arguments.history else None,
         )  # fmt: skip
+        if type(setup) is SetUp:
+            setup.is_used = True
+            loop.solver, loop.state = setup.solver, setup.state
+            if deadline is not None:
+                self._start_workers(setup, deadline)
+            if self.spec.delegates:
+                setup.state.failed_call = arguments.failed_call
+                setup.state.loop = loop if arguments.history else None
+        return self._run(loop, setup, arguments.max_iter, has_default_start)
 
-    def _run(self, loop: Loop, max_iter: int) -> Solution:
+    # -- set-up ----------------------------------------------------------------------------------
+
+    def _replace_problem(self, original: Problem, deadline: Deadline | None) -> None:
+        """Replace the prepared problem by another one without a set-up."""
+        if original is not self._original:
+            late = check_accepted(original, self.spec, deadline)
+            self._original, self.problem = original, original if late else original.disk
+            self._setup = NotSetUp()
+
+    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
+        """Set the solver up for a problem, if its estimated time fits; reuse its state for the same structure.
+
+        The problem replaces the old one unless an error is raised.
+        """
+        begin, spec, last = perf_counter(), self.spec, self._setup
+        problem = original.disk if original.cones._blocks.has_ellipse else original
+        is_other = original is not self._original
+        if is_other:
+            check_accepted(original, spec)
+            self.setup_time = 0.0
+        if problem.metric.reference_energy < 0.0:
+            # Compute the judge's reference before a solver gets the problem.
+            get_zero_impulse_reference(problem)
+        setup: SetUp | NotSetUp
+        solver = last.solver if type(last) is SetUp else _make_solver(spec, self.options)
+        if deadline is not None and not spec.delegates and is_setup_too_late(solver, problem, deadline):
+            setup = NotSetUp(is_late=True)
+        else:
+            try:
+                if type(last) is SetUp and not (is_other and not same_structure(self.problem, problem)):
+                    state = solver.update(last.state, problem)
+                else:
+                    state = solver.prepare(problem)
+                setup = SetUp(solver, state)
+            except InputError:
+                raise  # The solver does not accept the problem.
+            except BREAKDOWN as error:
+                setup = NotSetUp(failure=format_error(error))
+        self._original, self.problem, self._setup = original, problem, setup
+        self.setup_time += perf_counter() - begin
+        return setup
+
+    def _reserve_time_of_judge(self, original: Problem, arguments: SolveArguments) -> Solution | None:
+        """Move the deadline to leave time for the judge; return the start unjudged if the judge would end too late."""
+        deadline, spec = arguments.deadline, self.spec
+        assert deadline is not None
+        late = is_too_late(original, spec, deadline)
+        if not late:
+            disk = original.disk
+            # The judge makes one pass for the result, and one for a start that is not zero.
+            passes = 2 if arguments.impulse is not None or disk.guess is not None else 1
+            judge_time = 1e-9 * passes * estimate_result_cost(disk)
+            setup_time = 1e-9 * estimate_judge_setup_cost(disk)
+            late = deadline.has_passed(setup_time + judge_time) and not spec.external
+        if late:
+            self._replace_problem(original, deadline)
+            return create_unjudged(
+                original, spec, self.options, arguments.impulse, arguments.tol, JUDGE_LATE_MESSAGE
+            )
+        deadline.reserve_seconds(judge_time)
+        selection_time = 1e-9 * SELECTION_PASSES * estimate_pass_cost(disk)
+        if spec.delegates and not deadline.has_passed(4.0 * selection_time):
+            deadline.reserve_seconds(selection_time)
+        return None
+
+    def _start_workers(self, setup: SetUp, deadline: Deadline) -> None:
+        """Start the worker processes of a solver, without counting their start as time of the solve."""
+        if self.spec.external or not self.spec.builtin or self.problem.has_singular_program:
+            begin = perf_counter()
+            setup.solver.start_workers(setup.state, deadline.get_remaining_seconds() or 0.0)
+            elapsed = perf_counter() - begin
+            deadline.reserve_seconds(-elapsed)
+            self.setup_time += elapsed
+
+    # -- the run ---------------------------------------------------------------------------------
+
+    def _run(self, loop: Loop, setup: SetUp | NotSetUp, max_iter: int, has_default_start: bool) -> Solution:
         """Run the solver unless the problem is decided without it, and build the solution."""
-        spec, problem = self.spec, self.problem
+        spec, problem, deadline = self.spec, self.problem, loop.deadline
         setup_time, self.setup_time = self.setup_time, 0.0
-        given, refutation = loop.impulse.copy(), ""
-        proof = decide_empty_rows(problem, loop.impulse, loop.tol)
+        is_foreign = spec.external or not spec.builtin
+        given, refutation, proof = loop.impulse, "", None
+        if len(problem.metric.empty):
+            given = given.copy()
+            proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
             message, certificate, impossible = proof
             claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
-        elif self._failure:
-            claim = Claim(NUMERICAL_ERROR, 0, {}, self._failure)
-        elif self._is_late or (loop.deadline.has_passed() and not spec.external):
-            # If the start is the zero impulse, no better impulse can be selected, and judging is postponed.
-            at_zero = find_relative_at_zero(problem, loop.impulse)
-            if (
-                at_zero is not None
-                and at_zero > loop.tol
-                and loop.records is None
-                and loop.deadline.has_passed()
-            ):
-                start = loop.impulse
-                if self._original is not problem:
-                    start = self._original.cones.stretch * loop.impulse
-                message = f"{SETUP_LATE_MESSAGE}: the start, unjudged"
-                return create_unjudged(
-                    self._original, spec, self.options, start, loop.tol, message, setup_time
-                )
+        elif type(setup) is NotSetUp and setup.failure:
+            claim = Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
+        elif type(setup) is NotSetUp or (
+            deadline is not None and deadline.has_passed() and not spec.external
+        ):
+            unjudged = self._keep_zero_impulse_unjudged(loop, setup_time)
+            if unjudged is not None:
+                return unjudged
             claim = Claim(TIME_LIMIT, 0, {}, SETUP_LATE_MESSAGE)
             loop.replace_by_best_impulse(loop.impulse)
         else:
-            has_checks = isinstance(getattr(self.state, "watch", None), StoppingTest)
-            if loop.tol > 0.0 and not has_checks and not spec.delegates and not problem.has_singular_program:
-                # Judge the start as given, as compiled calls do: without its empty rows it may be worse than zero.
-                kept = given.copy()
-                replace_stale_start(problem, kept)
-                is_stale = kept != given
-                loop.impulse[is_stale] = kept[is_stale]
+            has_checks = type(getattr(setup.state, "watch", None)) is StoppingTest
+            keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
+            if (
+                loop.tol > 0.0
+                and not keeps_best
+                and not has_default_start
+                and not problem.has_singular_program
+            ):
+                _replace_stale_islands(problem, given, loop.impulse)
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             # Own solvers claim only what the judge confirms.
-            is_own = spec.builtin and not spec.external
-            if loop.tol > 0.0 and not (is_own and claim.status in (CONVERGED, ROUNDOFF_LIMIT)):
-                claim = name_lost_row(problem, loop.impulse, claim)
-                # `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
-                keeps_best = spec.delegates and not problem.has_singular_program
-                if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
-                    claimed = loop.impulse.copy()
-                    loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
-                    if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
-                        relative = residual(problem, claimed).relative
-                        if relative > loop.tol:
-                            refutation = f"its own impulse has a relative residual of {relative:.2e}"
-            if (
-                claim.status is TIME_LIMIT
-                and spec.delegates
-                and problem.m > SMALL_ROWS
-                and estimate_import_cost(*SCIPY_MODULES)
-            ):
-                claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
-        if claim.status is INFEASIBLE and (spec.external or not spec.builtin):
-            claim, _, refutation = check_infeasibility_claim(problem, claim, loop.tol, loop.deadline)
-        if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:
-            claim = self._without_infeasible_islands(loop, claim, max_iter)
-        claim = replace(claim, judged=loop.judged)
+            if loop.tol > 0.0 and (is_foreign or claim.status not in (CONVERGED, ROUNDOFF_LIMIT)):
+                claim, refutation = self._select_best_impulse(loop, claim, start, has_checks)
+        if claim.status is INFEASIBLE:
+            if is_foreign:
+                claim, _, refutation = check_infeasibility_claim(problem, claim, loop.tol, deadline or NEVER)
+            if claim.certificate is not None and loop.tol > 0.0 and proof is None:
+                claim = self._solve_feasible_islands(loop, claim, max_iter)
+        if claim.judged is not loop.judged:
+            claim = replace(claim, judged=loop.judged)
         solution = finish(
-            problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.get_history(),
-            float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
+            FinishedRun(
+                problem, spec, self.options, loop.impulse, claim, tol=loop.tol, setup_time=setup_time,
+                solve_time=loop.time, history=None if loop.records is None else loop.get_history(),
+                sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)), refutation=refutation,
+            )
         )  # fmt: skip
         return solution if self._original is problem else solution.convert_from_disk(self._original)
 
-    def _without_infeasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
+    def _keep_zero_impulse_unjudged(self, loop: Loop, setup_time: float) -> Solution | None:
+        """Return the start unjudged if it is the zero impulse and no time remains: no better one can be selected."""
+        problem, deadline = self.problem, loop.deadline
+        at_zero = find_relative_at_zero(problem, loop.impulse)
+        if at_zero is None or at_zero <= loop.tol or loop.records is not None:
+            return None
+        if deadline is None or not deadline.has_passed():
+            return None
+        start = loop.impulse
+        if self._original is not problem:
+            start = self._original.cones.stretch * start
+        message = f"{SETUP_LATE_MESSAGE}: the start, unjudged"
+        return create_unjudged(self._original, self.spec, self.options, start, loop.tol, message, setup_time)
+
+    def _select_best_impulse(
+        self, loop: Loop, claim: Claim, start: FloatArray, has_checks: bool
+    ) -> tuple[Claim, str]:
+        """Select the best of result and start in each island; return the claim and what refutes it, or an empty text.
+
+        `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
+        """
+        spec, problem, refutation = self.spec, self.problem, ""
+        claim = name_lost_row(problem, loop.impulse, claim)
+        keeps_best = spec.delegates and not problem.has_singular_program
+        if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
+            claimed = loop.impulse.copy()
+            loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
+            if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
+                relative = residual(problem, claimed).relative
+                if relative > loop.tol:
+                    refutation = f"its own impulse has a relative residual of {relative:.2e}"
+        needs_scipy = claim.status is TIME_LIMIT and spec.delegates and problem.m > SMALL_ROWS
+        if needs_scipy and estimate_import_cost(*SCIPY_MODULES):
+            claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
+        return claim, refutation
+
+    def _solve_feasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
         """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
         assert claim.certificate is not None
         count, label = find_islands(self.problem)
@@ -402,7 +494,8 @@ class Prepared:
 
     def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
         """Solve with b = 0 on rows that cannot be met, so that other islands get an impulse; return the same claim."""
-        if loop.tol == 0.0 or loop.deadline.has_passed():
+        deadline = loop.deadline
+        if loop.tol == 0.0 or (deadline is not None and deadline.has_passed()):
             return claim
         b, start = self.problem.b.copy(), loop.impulse.copy()
         b[rows] = start[rows] = 0.0
@@ -414,7 +507,7 @@ class Prepared:
             impulse=start,
             tol=loop.tol,
             max_iter=max_iter,
-            time_limit=loop.deadline.get_remaining_seconds(MIN_TIME_LIMIT),
+            time_limit=None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT),
         )
         loop.impulse[:] = combine_best_islands(
             self.problem, (loop.impulse,), (solution.impulse,), loop.tol, by_residual=True
@@ -423,56 +516,95 @@ class Prepared:
         work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
-    def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
-        """Update the state for another problem, or for another solve of the same problem."""
-        if problem is None or problem is self._original:
-            if not self._is_fresh:
-                self._set_up(self.problem, False, deadline)
-        else:
-            watch = Stopwatch()
-            check_accepted(problem, self.spec)
-            original, problem = problem, problem.disk
-            self._set_up(problem, not same_structure(self.problem, problem), deadline)
-            self.setup_time = watch.elapsed_seconds
-            # Assign the problem last, so that it does not replace the old problem if its set-up raises an error.
-            self._original, self.problem = original, problem
-        self._is_fresh = False
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copy or pickle the arguments only; the copy prepares the solver again, as two solves cannot share a state."""
-        return partial(prepare, **self.options), (self._original, self.spec.name)
+def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline | None = None) -> bool:
+    """Raise an error if the argument is not a problem or the solver refuses it; return the result of `is_too_late`.
 
-    def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
-        """Build the state, or update it for a problem of the same structure, if its estimated time fits.
+    If that is true, only the kind of the problem is checked, because other checks would exceed the time limit.
+    """
+    if type(problem) is not Problem:
+        check_problem(problem)
+    late = deadline is not None and is_too_late(problem, spec, deadline)
+    reason = spec.refuses(problem, late)
+    if reason:
+        raise CapabilityError(f"solver {spec.name!r} {reason}")
+    return late
 
-        Otherwise, and after a breakdown, the state is None; after a breakdown, the next call builds it anew.
-        """
-        if problem.metric.reference_energy < 0.0:
-            get_zero_impulse_reference(
-                problem
-            )  # Compute the judge's reference before a solver gets the problem.
-        is_new, self._failure = is_new or bool(self._failure), ""
-        if deadline.is_set and not self.spec.delegates:  # `auto` prepares nothing.
-            self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
-            if self._is_late and self.solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES):
-                # Import SciPy without counting the time, like the start of processes; otherwise no call with this
-                # limit could ever import it.
-                watch = Stopwatch()
-                import_numerical_modules()
-                deadline.reserve_seconds(-watch.elapsed_seconds)
-                self._is_late = deadline.has_passed(1e-9 * self.solver.cost(problem).setup)
-            if self._is_late:
-                self.state = None
-                return
-        try:
-            if is_new:
-                self.state = self.solver.prepare(problem)
-            else:
-                self.state = self.solver.update(self.state, problem)
-        except InputError:
-            raise  # The solver does not accept the problem.
-        except BREAKDOWN as error:
-            self.state, self._failure = None, format_error(error)
+
+def _check_option_names(spec: SolverSpec, options: dict[str, Any]) -> None:
+    """Raise an error for the first option that the solver does not accept."""
+    for name in options:
+        if name in spec.accepts:
+            continue
+        if name in SOLVE_ARGUMENTS:
+            raise CapabilityError(
+                f"prepare does not take {name}=; give it to the method solve of the returned "
+                f"object: prepare(...).solve({name}=...)"
+            )
+        if name in ("order", "ground", "seed"):
+            raise CapabilityError(
+                f"solver {spec.name!r} does not take {name}=; it takes: "
+                f"{', '.join(sorted(spec.accepts)) or 'no options'}"
+            )
+        raise UnknownName(
+            f"option of solver {spec.name!r}", name, {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
+        )
+
+
+def check_arguments(
+    spec: SolverSpec,
+    impulse: Any,
+    tol: float,
+    max_iter: int | None,
+    deadline: Deadline | None = None,
+    history: bool = False,
+    callback: Callback | None = None,
+    failed_call: tuple[int, ...] | None = None,
+) -> SolveArguments:
+    """Check the arguments of a solve; a `max_iter` of None becomes the default of the spec.
+
+    Raises
+    ------
+    InputError
+        `tol`, `max_iter`, `history` or `callback` is not valid.
+    CapabilityError
+        The solver does not support `history` or `callback`.
+    """
+    if type(tol) is not float or not 0.0 <= tol <= 1.0:
+        tol = check_float("tol", tol, low=0.0)
+    if max_iter is None:
+        max_iter = spec.max_iter
+    elif type(max_iter) is not int or not 0 <= max_iter < 2**31:
+        max_iter = check_int("max_iter", max_iter)
+    if callback is not None:
+        if not callable(callback):
+            raise InputError(
+                f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed"
+            )
+        if not spec.callback:
+            raise CapabilityError(
+                f"solver {spec.name!r} runs in one call, so it cannot call a callback: leave callback out, or "
+                "use a solver of lavender.available(problem, callback=True)"
+            )
+    if history is not False and check_bool("history", history) and not spec.history:
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call, so it cannot record a history: leave history out, or "
+            "use a solver of lavender.available(problem, history=True)"
+        )
+    return SolveArguments(
+        impulse, tol, max_iter, deadline, history=bool(history), callback=callback, failed_call=failed_call
+    )
+
+
+def _replace_stale_islands(problem: Problem, given: FloatArray, impulse: FloatArray) -> None:
+    """Set `impulse` (m,) in place to zero in islands in which the given start (m,) is worse than that.
+
+    The start is judged as given, as compiled calls do: without its empty rows it may be worse than zero.
+    """
+    kept = given.copy()
+    replace_stale_start(problem, kept)
+    is_stale = kept != given
+    impulse[is_stale] = kept[is_stale]
 
 
 def _make_callback_in_original_tangents(

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 import numpy as np
 
 from lavender.base.arrays import ArrayLike
-from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.judge.solution import Solution
 from lavender.problem import Problem, check_problem
 from lavender.solvers.loop import Callback
-from lavender.solvers.registry import SolverSpec, get
+from lavender.solvers.registry import get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.limits import check_time_limit, make_deadline
-from lavender.solving.prepared import Prepared
+from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 
 if TYPE_CHECKING:
@@ -89,7 +88,8 @@ def solve(
         `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid.
     """
     begun = 0.0 if time_limit is None else perf_counter()
-    check_problem(problem)  # Check this first, because a frequent error is to pass A and b.
+    if type(problem) is not Problem:  # Check this first, because a frequent error is to pass A and b.
+        check_problem(problem)
     if surplus:
         raise InputError(
             f"solve has {2 + len(surplus)} positional arguments; a problem and the name of a solver are needed, "
@@ -101,13 +101,14 @@ def solve(
         tol = relative_tolerance(problem, velocity_tol)
     solution: Solution | None = None
     failed_call: tuple[int, ...] | None = None
-    if max_iter is None and callback is None and history is False and not options:
+    is_default = max_iter is None and callback is None and history is False and not options
+    if is_default and spec._tries_compiled_call(problem):
         solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
     if solution is None:
-        solution = solve_prepared(
-            problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter,
-            make_deadline(spec, limit, begun), history, callback, failed_call,
-        )  # fmt: skip
+        deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
+        prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False, deadline)
+        arguments = check_arguments(spec, impulse, tol, max_iter, deadline, history, callback, failed_call)
+        solution = prepared._solve(arguments, problem)
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
 
@@ -128,20 +129,3 @@ def _reject_solver(solver: Any) -> NoReturn:
     raise InputError(
         f"solver is {value}; the name of a solver is needed, all others by name: lavender.solve(problem, {example})"
     )
-
-
-def solve_prepared(
-    problem: Problem,
-    spec: SolverSpec,
-    options: dict[str, Any],
-    impulse: ArrayLike | None,
-    tol: float,
-    max_iter: int | None,
-    deadline: Deadline,
-    history: bool = False,
-    callback: Callback | None = None,
-    failed_call: tuple[int, ...] | None = None,
-) -> Solution:
-    """Prepare a solver and solve once; `failed_call` holds the counts of a compiled call that failed, or None."""
-    prepared = Prepared(problem, spec, options, False, deadline)
-    return prepared._solve(None, impulse, tol, max_iter, deadline, history, callback, failed_call)

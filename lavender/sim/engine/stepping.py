@@ -27,7 +27,7 @@ from lavender.sim.scene.scene import MAX_SWEEPS, MIN_SWEEPS, Parameters
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
 from lavender.solvers.warm_start import make_warm_start_claim
-from lavender.solving.outcome import finish
+from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_CAPACITY, OK
 
@@ -416,7 +416,9 @@ class Stepping:
         options = dict(self._parameters.solver_options)
         options.pop("tol", None)
         return finish(
-            problem, get("newton"), options, impulse, claim, self._warm_tol, 0.0, pending.time, None
+            FinishedRun(
+                problem, get("newton"), options, impulse, claim, tol=self._warm_tol, solve_time=pending.time
+            )
         )
 
     def _solve(self, problem: Problem) -> FloatArray:

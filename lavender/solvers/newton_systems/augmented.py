@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
+from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.solvers.costs import RATES, estimate_import_cost, estimate_sparse_work
@@ -30,11 +30,12 @@ from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 class AugmentedSystem:
     """Factorises (1) and (2) for the kernel `Solve`. K is built at the first call."""
 
-    def __init__(self, kernel: Solve, layout: Layout, bodies: Any) -> None:
-        self.kernel, self.layout, self.bodies = kernel, layout, bodies
+    def __init__(self, system: Any, bodies: Any) -> None:
+        self.kernel: Solve = system.solve
+        self.layout: Layout = system.layout
+        self.system, self.bodies = system, bodies
         self.k: Any = None
         self.lu: Any = None
-        self.deadline: Deadline = NEVER
         # Time [s] of the next factor: an estimate at first, then the time of the last factor.
         self.seconds = 0.0
 
@@ -46,8 +47,9 @@ class AugmentedSystem:
         TooLate
             The factorisation would end after the deadline.
         """
+        deadline: Deadline | None = self.system.deadline
         if self.k is None:
-            if self.deadline.has_passed(1e-9 * RATES["scipy calls"]):
+            if deadline is not None and deadline.has_passed(1e-9 * RATES["scipy calls"]):
                 raise TooLate
             self.k = self._build_jacobian()
             # The system contains K twice, and block-diagonal matrices.
@@ -57,7 +59,7 @@ class AugmentedSystem:
                 + RATES["sparse factor"] * estimate_sparse_work(entries, sum(self.k.shape))
                 + estimate_import_cost("scipy.sparse.linalg")
             )
-        if self.deadline.has_passed(self.seconds):
+        if deadline is not None and deadline.has_passed(self.seconds):
             raise TooLate
         watch = Stopwatch()
         succeeded = self._build_and_factor_system(what, eps)

@@ -16,7 +16,6 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import splu
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
-from lavender.solvers.costs import count_dense_work
 from lavender.solvers.factors import MAX_DENSE_ROWS, USE_WIDE_LANES
 from lavender.solvers.newton_systems.augmented import AugmentedSystem
 from lavender_ext.factor import graph
@@ -78,7 +77,7 @@ def find_bodies(problem: Problem) -> Bodies | None:
         return (
             Bodies(problem.rows.moving_block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
         )
-    if problem.generalized is None or problem.cones.has_round:
+    if problem.generalized is None or problem.cones._blocks.has_round:
         return None
     parts = graph.find_bodies_of_velocities(problem.metric, problem.generalized.order)
     return None if parts is None else Bodies(*parts)
@@ -89,32 +88,25 @@ class System:
 
     form = ""
     work = 0.0  # Multiply-adds of one factorisation.
-    pace = 1e-9  # [s] Upper bound of the time per multiply-add, on machines of the last ten years.
+    expected_factor_seconds = 0.0  # Estimated time of the next factor [s].
+    # Factorisations by Python that are expected to end after this deadline are not started.
+    deadline: Deadline | None = None
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
 
     def __init__(self, problem: Problem, solve: Solve) -> None:
         self.problem, self.solve = problem, solve
 
-    @property
-    def expected_factor_seconds(self) -> float:
-        """Estimated time of the next factor [s]."""
-        return self.pace * self.work
-
-    def set_deadline(self, deadline: Deadline) -> None:
-        """Set the deadline; factorisations by Python that are expected to end after it are not started."""
-
     def record_factor_time(self, seconds: float) -> None:
         """Record the time of the last factorisation with the steps around it [s], to estimate the next time."""
         if self.work > 0.0:
-            self.pace = seconds / self.work
+            self.expected_factor_seconds = seconds
 
 
 class VelocitySystem(System):
     """H = K K^T + theta over the bodies, with one block column of s unknowns for each body."""
 
     form = "velocity"
-    pace = 0.5e-9
 
     def __init__(self, problem: Problem, bodies: Bodies, like: System | None = None) -> None:
         """Build the system; the layout of an earlier system `like` between the same bodies is reused."""
@@ -125,14 +117,12 @@ class VelocitySystem(System):
         reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
         self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
+        self.expected_factor_seconds = 0.5e-9 * self.work
         solve.use_bodies(
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
         )
-        self.augmented = AugmentedSystem(solve, self.layout, bodies)
+        self.augmented = AugmentedSystem(self, bodies)
         solve.set_external(self.augmented)
-
-    def set_deadline(self, deadline: Deadline) -> None:
-        self.augmented.deadline = deadline
 
 
 class MatrixSystem(System):
@@ -144,25 +134,30 @@ class MatrixSystem(System):
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem, Solve(problem.metric, problem.csr_data))
         solve = self.solve
-        m, a = solve.m, problem.csr
+        m, a = solve.m, None
+        nnz = len(problem._compressed[1])
         if not solve.whole:
-            a = a[solve.keep][:, solve.keep]
+            a = problem.csr[solve.keep][:, solve.keep]
+            nnz = a.nnz
         self.symmetric = problem.is_symmetric
-        self.dense = use_dense_matrix(a.nnz, m, solve.has_friction and problem.law == "cone")
-        self.entries = float(a.nnz)
-        self.pace = 0.3e-9 if self.dense else 1e-9
+        self.dense = use_dense_matrix(nnz, m, solve.has_friction and problem.law == "cone")
+        self.entries = float(nnz)
         self.h: Any
         if self.dense:
-            self.h = a.toarray()
-            self.h *= solve.scale[:, None]
-            self.h *= solve.scale
+            self.h = problem.dense() if a is None else a.toarray()
+            with np.errstate(all="ignore"):  # Results that overflow are judged.
+                self.h *= solve.scale[:, None]
+                self.h *= solve.scale
             solve.use_dense_matrix(self.h, self.symmetric, USE_WIDE_LANES)
-            self.work = count_dense_work(m)
+            self.work = m**3 / 3.0  # As `costs.count_dense_work`.
         else:
+            a = problem.csr if a is None else a
             values = scale_matrix_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
             self._bind_rows()
             self.work = (1.0 if self.symmetric else 2.0) * self.sparse.cost
+        # Upper bounds of the time per multiply-add, on machines of the last ten years.
+        self.expected_factor_seconds = (0.3e-9 if self.dense else 1e-9) * self.work
 
     def _bind_rows(self) -> None:
         """Pass H to the kernel in compressed rows, and in the pattern of its elements."""
@@ -208,7 +203,8 @@ def make_system(
     bodies : Bodies, optional
         Default: `find_bodies`.
     """
-    get_zero_impulse_reference(problem)
+    if problem.metric.reference_energy < 0.0:
+        get_zero_impulse_reference(problem)
     if form == "impulse":
         return MatrixSystem(problem)
     bodies = bodies or find_bodies(problem)

@@ -31,7 +31,7 @@ from lavender.report.bench.record import ERROR, CaseInfo, Record, make_measureme
 from lavender.report.bench.stopwatch import measure_backend_time
 from lavender.report.bench.timed_call import make_call_arguments
 from lavender.solvers import registry
-from lavender.solving.outcome import finish
+from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
@@ -370,16 +370,17 @@ def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
         certificate=outcome.certificate,
     )
     return finish(
-        problem,
-        registry.get(task.solver),
-        dict(task.options),
-        np.array(outcome.impulse),
-        claim,
-        task.tol,
-        outcome.setups[-1],
-        outcome.solves[-1],
-        None,
-        refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
+        FinishedRun(
+            problem,
+            registry.get(task.solver),
+            dict(task.options),
+            np.array(outcome.impulse),
+            claim,
+            tol=task.tol,
+            setup_time=outcome.setups[-1],
+            solve_time=outcome.solves[-1],
+            refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
+        )
     )
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lavender.judge.residuals import (
     combine_best_islands,
     divide_by_reference,
     get_zero_impulse_reference,
-    refine_residual,
+    make_residual,
     replace_stale_start,
     residual,
     reuse_or_judge_impulse,
@@ -58,88 +59,205 @@ LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "ce
 CONTRADICTING_IMPULSE_RATIO = 100.0
 
 
-def finish(
-    problem: Problem,
-    spec: SolverSpec,
-    options: dict[str, Any],
-    impulse: FloatArray,
-    claim: Claim,
-    tol: float,
-    setup_time: float,
-    solve_time: float,
-    history: History | None,
-    sweeps_per_decade: float = math.nan,
-    refutation: str = "",
-) -> Solution:
-    """Build the solution: the judge's residual, the status that it supports, and the check of the claim.
+class FinishedRun(NamedTuple):
+    """One run of a solver: the arguments, the impulse and the claim that it returned, and the time that it took.
 
-    `refutation` is empty unless the caller knows that the claim is false: it describes a solution that was found
-    although the solver claims that none exists, or the residual of the solver's own impulse if that was replaced.
+    Parameters
+    ----------
+    problem : Problem
+    spec : SolverSpec
+    options : dict
+    impulse : (m,) N s
+    claim : Claim
+    tol : float, -
+    setup_time, solve_time : float, s
+    history : History, optional
+    sweeps_per_decade : float
+    refutation : str
+        Empty unless the caller knows that the claim is false: it describes a solution that was found although the
+        solver claims that none exists, or the residual of the solver's own impulse if that was replaced.
     """
-    claim = name_lost_row(problem, impulse, claim)
+
+    problem: Problem
+    spec: SolverSpec
+    options: dict[str, Any]
+    impulse: FloatArray
+    claim: Claim
+    tol: float
+    setup_time: float = 0.0
+    solve_time: float = 0.0
+    history: History | None = None
+    sweeps_per_decade: float = math.nan
+    refutation: str = ""
+
+
+class Verdict(NamedTuple):
+    """Result of the comparison of a claim with the judge's residual: the fields of `Solution` that depend on it."""
+
+    status: Status
+    message: str
+    certificate: FloatArray | None = None
+    impulse_bound: float | None = None
+    claim_check: str = CONFIRMED
+    status_conflict: str = ""
+
+
+class Rule(NamedTuple):
+    """One row of `RULES`.
+
+    Parameters
+    ----------
+    claims : set of Status
+    applies : callable (run, judged) -> bool
+        The judge's finding to which the rule refers.
+    status : Status
+        Status that replaces a claim in `claims` if the rule applies.
+    message : str
+        Reason, which is appended to the solver's message; "{floor}" is the round-off floor.
+    """
+
+    claims: tuple[Status, ...]
+    applies: Callable[[FinishedRun, Residual], bool]
+    status: Status
+    message: str = ""
+
+
+def _meets_tol(run: FinishedRun, judged: Residual) -> bool:
+    return judged.relative <= run.tol
+
+
+def _meets_positive_tol(run: FinishedRun, judged: Residual) -> bool:
+    return run.tol > 0.0 and judged.relative <= run.tol
+
+
+def _hides_b(run: FinishedRun, judged: Residual) -> bool:
+    """Return whether the impulse is so large that float64 loses b: the floor alone exceeds tol."""
+    metric = run.problem.metric
+    return (
+        run.tol < judged.relative == judged.roundoff_floor
+        and divide_by_reference(metric, judged.energy, judged.velocity) <= run.tol
+    )
+
+
+def _met_tol_before_refinement(run: FinishedRun, judged: Residual) -> bool:
+    return judged._float64_relative <= run.tol < judged.relative
+
+
+def _is_refined_above_tol(run: FinishedRun, judged: Residual) -> bool:
+    return run.tol < judged.relative and judged._float64_relative < math.inf
+
+
+def _met_tol_as_formed(run: FinishedRun, judged: Residual) -> bool:
+    return judged.relative > run.tol and _holds_as_formed(run)
+
+
+def _met_floor_as_formed(run: FinishedRun, judged: Residual) -> bool:
+    return not judged.above_floor <= run.tol and _holds_as_formed(run)
+
+
+def _is_rounding(run: FinishedRun, judged: Residual) -> bool:
+    return judged.above_floor <= run.tol < judged.relative
+
+
+_ILL_CONDITIONED = "M is ill-conditioned: residuals below {floor:.1e} are rounding errors of float64"
+_FORMED = "its test was met only on A as it was formed, not on the given data"
+# The rules are applied in order, each to the status that the rules before it have left.
+RULES = (
+    Rule((CONVERGED, STALLED), _hides_b, DIVERGED, "next to such impulses float64 loses b"),
+    Rule((MAX_ITERATIONS, TIME_LIMIT, STALLED), _meets_positive_tol, CONVERGED),
+    Rule((CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT), _met_tol_before_refinement, STALLED, _ILL_CONDITIONED),
+    Rule((ROUNDOFF_LIMIT,), _is_refined_above_tol, STALLED, _ILL_CONDITIONED),
+    Rule((CONVERGED,), _met_tol_as_formed, STALLED, _FORMED),
+    Rule((ROUNDOFF_LIMIT,), _met_floor_as_formed, STALLED, _FORMED),
+    Rule((CONVERGED, STALLED), _is_rounding, ROUNDOFF_LIMIT),
+    # The impulse is a solution to tol, even if no exact solution exists.
+    Rule((INFEASIBLE,), _meets_tol, CONVERGED, "the impulse meets tol nevertheless"),
+)  # fmt: skip
+
+
+def finish(run: FinishedRun) -> Solution:
+    """Build the solution: the judge's residual, the status that it supports, and the check of the claim."""
+    problem, claim, impulse, tol = run.problem, run.claim, run.impulse, run.tol
+    if not all_finite(impulse):
+        claim = name_lost_row(problem, impulse, claim)
     if claim.status is INFEASIBLE:
         # Project the impulse on its bounds, so that an engine that applies it does not pull at a contact.
         impulse = project_impulse(problem.cones, impulse)
         if tol > 0.0:
             impulse = combine_best_islands(problem, (problem._start,), (impulse,), tol, by_residual=True)
     # Solvers work in float64, whatever the precision of the data.
-    judged = refine_residual(problem, reuse_or_judge_impulse(problem, impulse, claim.judged), tol)
-    status, message = claim.status, claim.message
-    relative = judged.relative
-    if (
-        status in (CONVERGED, STALLED)
-        and tol < relative == judged.roundoff_floor
-        and divide_by_reference(problem.metric, judged.energy, judged.velocity) <= tol
-    ):
-        status = DIVERGED
-        message = _joined(message, "next to such impulses float64 loses b")
-    elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
-        status = CONVERGED
-    elif tol < relative and (
-        (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
-        or (status is ROUNDOFF_LIMIT and judged._float64_relative < math.inf)
-    ):  # The unrefined residual met tol, but the refined residual does not: correct the claim.
-        status = STALLED
-        message = _joined(
-            message,
-            f"M is ill-conditioned: residuals below {judged.roundoff_floor:.1e} are rounding errors of float64",
-        )
-    elif (
-        problem.operator not in spec.operators
-        and (
-            (status is CONVERGED and relative > tol)
-            or (status is ROUNDOFF_LIMIT and not judged.above_floor <= tol)
-        )
-        and _holds_as_formed(problem, impulse, tol)
-    ):
-        status = STALLED
-        message = _joined(message, "its test was met only on A as it was formed, not on the given data")
-    if status in (CONVERGED, STALLED) and judged.above_floor <= tol < relative:
-        status = ROUNDOFF_LIMIT
-    certificate, bound, unproven, status_conflict = claim.certificate, None, "", ""
-    if status is INFEASIBLE and relative <= tol:
-        # The impulse is a solution to tol, even if no exact solution exists.
-        status = CONVERGED
-        message = _joined(message, "the impulse meets tol nevertheless")
-    elif status is INFEASIBLE and certificate is None:
+    judged = reuse_or_judge_impulse(problem, impulse, claim.judged).refine(tol)
+    if claim is not run.claim or impulse is not run.impulse:
+        run = run._replace(claim=claim, impulse=impulse)
+    impulse.setflags(write=False)
+    solution: Solution = object.__new__(Solution)
+    if claim.status is CONVERGED and judged.relative <= tol and not run.refutation:
+        # The other fields are computed when one of them is first read.
+        solution.__dict__.update(
+            impulse=impulse, status=CONVERGED, tol=tol, setup_time=run.setup_time, solve_time=run.solve_time,
+            _rest=(make_fields, (run, judged)),
+        )  # fmt: skip
+        return solution
+    verdict = check_claim(run, make_residual(problem, judged))
+    solution.__dict__.update(
+        make_fields(run, judged, verdict),
+        impulse=impulse, status=verdict.status, tol=tol, setup_time=run.setup_time, solve_time=run.solve_time,
+    )  # fmt: skip
+    return solution
+
+
+def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None) -> dict[str, Any]:
+    """Return the fields of a solution that are computed at the first access; by default, the claim is confirmed."""
+    spec, claim, order = run.spec, run.claim, ""
+    if spec.order:
+        order = get_order_name(run.options.get("order", "given"))
+    if verdict is None:
+        verdict = Verdict(claim.status, claim.message)
+    return {
+        "residual": make_residual(run.problem, judged),
+        "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, run.options, claim.form, order),
+        "message": verdict.message,
+        "history": run.history,
+        "dual": claim.dual,
+        "certificate": verdict.certificate,
+        "impulse_bound": verdict.impulse_bound,
+        "claim_check": verdict.claim_check,
+        "status_conflict": verdict.status_conflict,
+        "sweeps_per_decade": run.sweeps_per_decade,
+        "stages": claim.stages,
+    }
+
+
+def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
+    """Apply `RULES` to a claim, check its certificate, and name the conflict with the judge's residual."""
+    problem, claim, tol, refutation = run.problem, run.claim, run.tol, run.refutation
+    status, message, relative = claim.status, claim.message, judged.relative
+    for rule in RULES:
+        if status in rule.claims and rule.applies(run, judged):
+            status = rule.status
+            message = _joined(message, rule.message.format(floor=judged.roundoff_floor))
+    certificate, bound, unproven, status_conflict = None, None, "", ""
+    if status is INFEASIBLE and claim.certificate is None:
         unproven = "no certificate was given"
-    elif status in (INFEASIBLE, STALLED) and certificate is not None:
-        proof = prove_infeasibility(problem, certificate, tol)
-        certificate, bound = proof.y, proof.impulse_bound or None
+    elif status in (INFEASIBLE, STALLED) and claim.certificate is not None:
+        proof = prove_infeasibility(problem, claim.certificate, tol)
+        bound = proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
-            message = _joined(message, proof.message)
+            certificate, message = proof.y, _joined(message, proof.message)
         elif bound == math.inf:
             status, message = STALLED, _joined(message, proof.reason)
         elif status is INFEASIBLE:
             unproven = proof.reason
-        elif bound is not None and bound > max(np.abs(impulse).sum(), _contradicting_impulse(problem)):
+        elif bound is not None and bound > max(np.abs(run.impulse).sum(), _contradicting_impulse(problem)):
             message = _joined(
                 message, f"every solution has an impulse of at least {format_lower_bound(bound)} N s"
             )
     if unproven:
         message = _joined(message, f"not proven: {unproven}")
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
-    if status is CONVERGED and not relative <= tol:
+    elif status is CONVERGED and not relative <= tol:
         status_conflict = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
     elif status is CONVERGED and claim.status is CONVERGED and refutation:
         status_conflict = f"says CONVERGED, {refutation}"
@@ -147,37 +265,16 @@ def finish(
         status_conflict = (
             f"says ROUNDOFF_LIMIT, rounding does not explain a relative residual of {judged.above_floor:.2e}"
         )
-    if status in (DIVERGED, STALLED) and not message and spec.resumable:
+    if status in (DIVERGED, STALLED) and not message and run.spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
-        prediction = _predict_iterations(problem, relative, tol, claim.iterations, sweeps_per_decade)
-        message = _joined(message, prediction)
+        message = _joined(message, _predict_iterations(run, relative))
     unfinished = status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
-    order = get_order_name(options.get("order", "given")) if spec.order else ""
-    impulse.setflags(write=False)
-    return Solution.from_fields(
-        {
-            "impulse": impulse,
-            "residual": judged,
-            "status": status,
-            "tol": tol,
-            "iterations": claim.iterations,
-            "work": MappingProxyType(dict(claim.work)),
-            "setup_time": setup_time,
-            "solve_time": solve_time,
-            "solver": SolverRun(spec.name, options, claim.form, order),
-            "message": message,
-            "history": history,
-            "dual": claim.dual,
-            "certificate": certificate if status is INFEASIBLE and not unproven else None,
-            "impulse_bound": bound,
-            "claim_check": CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED,
-            "status_conflict": status_conflict,
-            "sweeps_per_decade": sweeps_per_decade,
-            "stages": claim.stages,
-        }
+    claim_check = CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED
+    return Verdict(
+        status, message, certificate, bound, claim_check=claim_check, status_conflict=status_conflict
     )
 
 
@@ -238,7 +335,7 @@ def judge_late_fields(
                 claim.message.removesuffix(UNJUDGED) + ", with zero impulses in islands in which it was worse"
             )
             claim = replace(claim, message=message)
-    solution = finish(disk, spec, options, start, claim, tol, 0.0, 0.0, None)
+    solution = finish(FinishedRun(disk, spec, options, start, claim, tol=tol))
     if problem is not disk:
         judged = residual(problem, impulse, "float64")
         solution = replace(solution.convert_from_disk(problem), residual=judged, impulse=impulse)
@@ -293,30 +390,34 @@ def _joined(message: str, addition: str) -> str:
     return message if addition in message else f"{message}; {addition}".removeprefix("; ")
 
 
-def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
-    """Return whether the residual of the formed A meets tol or its floor, so that only rounding separates both."""
+def _holds_as_formed(run: FinishedRun) -> bool:
+    """Return whether A was formed, and its residual meets tol or its floor, so that only rounding separates both."""
+    problem = run.problem
+    if problem.operator in run.spec.operators:
+        return False
     try:
         formed = problem.csr_data
     except InputError:  # A is too large to be formed.
         return False
     get_zero_impulse_reference(problem)
     formed.share_reference(problem.metric)
-    return bool(Judged(formed, impulse).above_floor <= tol)
+    return bool(Judged(formed, run.impulse).above_floor <= run.tol)
 
 
-def _predict_iterations(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+def _predict_iterations(run: FinishedRun, relative: float) -> str:
     """Return a message about an exhausted budget that predicts the iterations needed to reach tol.
 
     It is empty if no more iterations than were done are predicted.
     """
+    per_decade, tol = run.sweeps_per_decade, run.tol
     remaining = (
         per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
     )
-    if not done < remaining < math.inf:
+    if not run.claim.iterations < remaining < math.inf:
         return ""
     return (
         f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {remaining:.2g} more; "
-        f"solvers of another kind may be faster: {', '.join(list_not_resumable(problem))}"
+        f"solvers of another kind may be faster: {', '.join(list_not_resumable(run.problem))}"
     )
 
 
@@ -332,8 +433,6 @@ def decide_empty_rows(
         be met. None otherwise.
     """
     cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
-    if not len(empty):
-        return None
     # Leave out friction rows, which have no fixed bounds.
     nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if (
