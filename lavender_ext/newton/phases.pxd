@@ -20,7 +20,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.block_projection cimport classify_active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
-from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone_variable
 from lavender_ext.newton.elements cimport elements_t, is_row
@@ -66,6 +66,11 @@ cdef enum:                      # damped Newton
 cdef inline double roundoff_residual() noexcept nogil:
     """Return the relative residual below which rounding may stall an interior point."""
     return 1e-6
+
+
+cdef inline double slip_residual() noexcept nogil:
+    """Return the residual of the convex law below which an interior point's z is judged under Coulomb's law."""
+    return 1e-5
 
 
 cdef inline double short_step() noexcept nogil:
@@ -297,6 +302,8 @@ cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nog
     pop_phase(n)
     if k.lowest < n.best:
         judge_and_keep_best_point(n, k.best_z)
+    if n.problem.p.law == COULOMB:
+        return
     if may_continue and not k.bounded_rows and k.lowest < roundoff_residual() and not is_finished(n) and not is_at_roundoff(n):
         begin_damped_newton(n, k.best_z, CONE, k.lowest, MAX_INNER_STEPS)
         push_damped_newton(n, CONE_END_FACTORISATIONS)
@@ -324,6 +331,9 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
             copy_vector(n, k.best_z, n.ip.z)
         if residual <= n.tol and judge_and_keep_best_point(n, n.ip.z) <= n.tol:
             end_interior_steps(n, False)
+            return
+        if n.problem.p.law == COULOMB and residual < slip_residual() and residual < 0.01 * judge_and_keep_best_point(n, n.ip.z):
+            end_interior_steps(n, False)                # The convex problem is solved, and contacts slip.
             return
         if k.bounded_rows and residual < k.trial_residual:
             k.trial_residual = 0.1 * residual

@@ -11,13 +11,18 @@
     both            AUGMENTED_INTERIOR_POINT  interior point on the augmented system of bodies    CONVEX_DAMPED_NEWTON
                     CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
                                               that there is no solution
-    Coulomb's       START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
-                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_PATH
+    Coulomb's       START_SHIFTED             shifted Newton, if the start solves the convex law  START_DAMPED_NEWTON
+                    START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
+                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative CONVEX_POINT
+                    CONVEX_POINT              interior point of the convex law, judged under      FIRST_SHIFTED
+                                              Coulomb's law, unless the start solves it
+                    FIRST_SHIFTED             shifted Newton from it, if few contacts slide       FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
                     AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
                                               rigid
-                    MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
+                    MORE_PATHS                paths with other ratios of smoothing                SECOND_SHIFTED
+                    SECOND_SHIFTED            shifted Newton from the convex point                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
@@ -36,6 +41,7 @@ from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
+from lavender_ext.newton.shifted cimport begin_shifted_newton, compute_sliding_fraction, step_shifted_newton
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
                                          begin_damped_newton, begin_interior_steps, begin_interior_with_newton,
@@ -44,12 +50,12 @@ from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augm
                                          continue_damped_newton_stretches)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
-                                      PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, compute_slack, copy_vector,
+                                      PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual, compute_slack, copy_vector,
                                       de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
                                       is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
-from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, factor_newton_system, solve_newton_system
+from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, factor_newton_system, multiply_system_matrix, solve_newton_system
 
 
 cdef enum:                      # states of PLAN_CONVEX
@@ -64,14 +70,18 @@ cdef enum:                      # states of PLAN_CONVEX
     CONVEX_END = 8
 
 cdef enum:                      # states of PLAN_COULOMB
-    START_DAMPED_NEWTON = 0
-    FIRST_DE_SAXCE = 1
-    FIRST_PATH = 2
-    SECOND_DE_SAXCE = 3
-    AUGMENTED_DE_SAXCE = 4
-    MORE_PATHS = 5
-    COULOMB_DAMPED_NEWTON = 6
-    COULOMB_END = 7
+    START_SHIFTED = 0
+    START_DAMPED_NEWTON = 1
+    FIRST_DE_SAXCE = 2
+    CONVEX_POINT = 3
+    FIRST_SHIFTED = 4
+    FIRST_PATH = 5
+    SECOND_DE_SAXCE = 6
+    AUGMENTED_DE_SAXCE = 7
+    MORE_PATHS = 8
+    SECOND_SHIFTED = 9
+    COULOMB_DAMPED_NEWTON = 10
+    COULOMB_END = 11
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -82,6 +92,10 @@ cdef enum:                      # states of DE_SAXCE
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
     EXACT_POINT_REFINEMENTS = 20    # Refinements of linear rows with a factor of nearly no weight, which is less exact.
+    MIN_SHIFTED_ROWS = 300      # With fewer rows the paths cost less than the convex point.
+    START_SHIFTED_FACTORISATIONS = 40   # Budget of shifted Newton from the start; many piles take fewer than 30.
+    FIRST_SHIFTED_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
+    SHIFTED_PATIENCE = 200      # Shifted Newton ends if so many factorisations do not halve the change of centre and shift.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
     FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
@@ -105,6 +119,14 @@ cdef inline double second_derivative_fraction() noexcept nogil:
 cdef inline double far_from_end() noexcept nogil:
     """Return the residual of De Saxce's interior point above which no damped Newton phase follows."""
     return 1e-2
+
+
+cdef inline double max_sliding_fraction() noexcept nogil:
+    """Return the fraction of sliding contacts above which the paths come before shifted Newton.
+
+    Of piles of balls that it solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
+    """
+    return 0.05
 
 
 cdef inline double max_start_residual_ratio() noexcept nogil:
@@ -301,13 +323,33 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     # result.
     cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
     n.stage = state + 1
-    if state != START_DAMPED_NEWTON and is_over(n):
+    if state != START_SHIFTED and is_over(n):
         state = COULOMB_END
-    if state == START_DAMPED_NEWTON:
+    if state == START_SHIFTED:
+        if not n.is_cold:
+            multiply_system_matrix(&n.s, n.best_z, n.hz)
+            if n.s.e.m >= MIN_SHIFTED_ROWS and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
+                n.has_convex_start = 1
+                copy_vector(n, n.saved_z, n.best_z)
+                n.mostly_slides = compute_sliding_fraction(n, n.saved_z) > max_sliding_fraction()
+                if not n.mostly_slides:
+                    begin_shifted_newton(n, n.best_z, START_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
+    elif state == START_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
         begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
+    elif state == CONVEX_POINT:
+        if not n.has_convex_start and n.s.e.m >= MIN_SHIFTED_ROWS:
+            begin_interior_point(n, compute_proximal_weight(), 0.0)
+            begin_interior_steps(n, False)
+    elif state == FIRST_SHIFTED:
+        if not n.has_convex_start and n.s.e.m >= MIN_SHIFTED_ROWS:
+            n.has_convex_start = 1
+            copy_vector(n, n.saved_z, n.progress.best_z)
+            n.mostly_slides = compute_sliding_fraction(n, n.saved_z) > max_sliding_fraction()
+        if n.has_convex_start and not n.mostly_slides:
+            begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
     elif state == FIRST_PATH:
         if not has_rigid_joints:
             begin_path(n)
@@ -320,6 +362,9 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         if n.path.paths < N_PATHS:
             n.stage = MORE_PATHS
             begin_path(n)
+    elif state == SECOND_SHIFTED:
+        if n.has_convex_start:
+            begin_shifted_newton(n, n.saved_z, UNLIMITED, SHIFTED_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
@@ -349,6 +394,8 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
         step_augmented_newton(n)
     elif phase == DAMPED_NEWTON:
         step_damped_newton(n)
+    elif phase == SHIFTED_NEWTON:
+        step_shifted_newton(n)
     elif phase == DAMPED_STRETCHES:
         continue_damped_newton_stretches(n)
     else:
@@ -359,7 +406,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
-    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
+    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = n.has_convex_start = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

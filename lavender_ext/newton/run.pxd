@@ -34,6 +34,7 @@ cdef enum:                      # phases
     DAMPED_NEWTON = 7
     DAMPED_STRETCHES = 8
     PATH = 9                    # path.pxd
+    SHIFTED_NEWTON = 10         # shifted.pxd
 
 cdef enum:                      # counters
     N_ACTIVE_SET = 0
@@ -45,7 +46,8 @@ cdef enum:                      # counters
     N_AUGMENTED_DE_SAXCE = 6
     N_AUGMENTED_NEWTON = 7
     N_PATH = 8
-    N_COUNTED = 9
+    N_SHIFTED = 9
+    N_COUNTED = 10
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
@@ -171,6 +173,27 @@ cdef struct path_t:             # a path of smoothed problems; its vectors belon
     int32_t last                # factorisations at which the path ends
 
 
+cdef struct shifted_t:          # convex problems with a fixed shift; its vectors belong to phases that have ended
+    double* z                   # the point of (1)
+    double* hz                  # H z
+    double* centre              # c
+    double* shift               # phi, 0 except on the normals of contacts
+    double* step                # last update of phi
+    double* centre_step         # last update of c
+    double* next                # scratch
+    double eps                  # proximal weight
+    double tolerance            # |F| in the norm of H at which (1) is solved
+    double lowest               # smallest change of c and phi, up to a factor of two
+    double trial_residual       # damped Newton is tried below this relative residual
+    double history[5]           # changes of phi by the last updates
+    int32_t inner_steps
+    int32_t free_updates        # updates in a row without a factorisation
+    int32_t updates
+    int32_t patience            # factorisations within which the change must halve
+    int32_t since               # factorisations at the last such progress
+    int32_t last                # factorisations at which the phase ends
+
+
 cdef struct newton_t:           # bound to its workspace; it must not move
     system_t s
     scaled_t sc
@@ -186,6 +209,8 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t disabled_phases     # bit set of the phases that are skipped
     int32_t stage               # state of the plan (plan.pxd)
     int32_t has_saved_best
+    int32_t has_convex_start    # Coulomb's law: the start solves the convex law; it is in saved_z
+    int32_t mostly_slides       # Coulomb's law: many contacts slide at the solution of the convex law, saved_z
     int32_t counts[N_COUNTED]
     int32_t stack[MAX_PHASE_DEPTH]
     int32_t depth
@@ -221,6 +246,7 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     stretches_t stretches
     de_saxce_t de_saxce
     path_t path
+    shifted_t shifted
 
 
 # -- workspace -------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
-                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, N_COUNTED, PATH, bind_index_workspace,
+                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, N_COUNTED, PATH, SHIFTED_NEWTON, bind_index_workspace,
                                       bind_judge_workspace, bind_real_workspace, convex_residual, judge_workspace_size,
                                       method_index_size, method_real_size, newton_t, set_problem, set_reference,
                                       write_certificate, write_impulse)
@@ -52,6 +52,7 @@ PHASES = {
     "augmented Newton": 1 << AUGMENTED_NEWTON,
     "De Saxce": 1 << DE_SAXCE,
     "path": 1 << PATH,
+    "shifted Newton": 1 << SHIFTED_NEWTON,
 }
 #: Compliance eps of a path of smoothed problems, relative to d.
 COMPLIANCE = path_compliance()
@@ -67,6 +68,7 @@ COUNTED = (
     "augmented De Saxce steps",
     "augmented steps",
     "path steps",
+    "shifted Newton steps",
 )
 
 
