@@ -15,7 +15,8 @@
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
                     FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative CONVEX_POINT
                     CONVEX_POINT              interior point of the convex law, judged under      FIRST_SHIFTED
-                                              Coulomb's law, unless the start solves it
+                                              Coulomb's law, unless the start solves it; ends
+                                              if many contacts slide
                     FIRST_SHIFTED             shifted Newton from it, if few contacts slide       FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
@@ -41,21 +42,22 @@ from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
-from lavender_ext.newton.shifted cimport begin_shifted_newton, compute_sliding_fraction, step_shifted_newton
+from lavender_ext.newton.shifted cimport begin_shifted_newton, step_shifted_newton
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
                                          begin_damped_newton, begin_interior_steps, begin_interior_with_newton,
                                          begin_damped_newton_stretches, push_damped_newton, step_active_set, step_augmented_newton,
                                          step_damped_newton, step_interior_point, step_interior_with_newton,
-                                         continue_damped_newton_stretches)
+                                         compute_sliding_fraction, continue_damped_newton_stretches)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
-                                      PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual, compute_slack, copy_vector,
-                                      de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
+                                      PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
+                                      compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
                                       is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
-from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, factor_newton_system, multiply_system_matrix, solve_newton_system
+from lavender_ext.newton.system cimport (BARRIER, BODIES, SPARSE, factor_newton_system, multiply_system_matrix,
+                                         solve_newton_system)
 
 
 cdef enum:                      # states of PLAN_CONVEX
@@ -316,6 +318,16 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
         begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
+cdef inline bint is_shifted_possible(const newton_t* n) noexcept nogil:
+    """Return whether shifted Newton may run: H is symmetric, and the problem is large."""
+    return n.s.symmetric and n.s.e.m >= MIN_SHIFTED_ROWS
+
+
+cdef inline bint slides_mostly(newton_t* n, const double* z) noexcept nogil:
+    """Return whether too many contacts slide at z, a solution of the convex law, for shifted Newton before the paths."""
+    return compute_sliding_fraction(n, z, 1e-6) > max_sliding_fraction()
+
+
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
@@ -328,10 +340,10 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     if state == START_SHIFTED:
         if not n.is_cold:
             multiply_system_matrix(&n.s, n.best_z, n.hz)
-            if n.s.e.m >= MIN_SHIFTED_ROWS and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
+            if is_shifted_possible(n) and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
                 n.has_convex_start = 1
                 copy_vector(n, n.saved_z, n.best_z)
-                n.mostly_slides = compute_sliding_fraction(n, n.saved_z) > max_sliding_fraction()
+                n.mostly_slides = slides_mostly(n, n.saved_z)
                 if not n.mostly_slides:
                     begin_shifted_newton(n, n.best_z, START_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
     elif state == START_DAMPED_NEWTON:
@@ -340,14 +352,14 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
     elif state == CONVEX_POINT:
-        if not n.has_convex_start and n.s.e.m >= MIN_SHIFTED_ROWS:
+        if not n.has_convex_start and is_shifted_possible(n):
             begin_interior_point(n, compute_proximal_weight(), 0.0)
             begin_interior_steps(n, False)
     elif state == FIRST_SHIFTED:
-        if not n.has_convex_start and n.s.e.m >= MIN_SHIFTED_ROWS:
+        if not n.has_convex_start and is_shifted_possible(n):
             n.has_convex_start = 1
             copy_vector(n, n.saved_z, n.progress.best_z)
-            n.mostly_slides = compute_sliding_fraction(n, n.saved_z) > max_sliding_fraction()
+            n.mostly_slides = n.mostly_slides or slides_mostly(n, n.saved_z)
         if n.has_convex_start and not n.mostly_slides:
             begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
     elif state == FIRST_PATH:
@@ -406,7 +418,8 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
-    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = n.has_convex_start = 0
+    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
+    n.has_convex_start = n.mostly_slides = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

@@ -96,6 +96,7 @@ cdef struct progress_t:         # progress of an interior point's steps
     int32_t bounded_rows        # the problem has bounded rows alone
     int32_t law                 # law that the Newton steps use
     int32_t augmented
+    int32_t is_counted          # Coulomb's law: the contacts that slide fast have been counted
 
 
 cdef struct augmented_newton_t:
@@ -209,8 +210,8 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t disabled_phases     # bit set of the phases that are skipped
     int32_t stage               # state of the plan (plan.pxd)
     int32_t has_saved_best
-    int32_t has_convex_start    # Coulomb's law: the start solves the convex law; it is in saved_z
-    int32_t mostly_slides       # Coulomb's law: many contacts slide at the solution of the convex law, saved_z
+    int32_t has_convex_start    # Coulomb's law: saved_z solves the convex law, or nearly so if many contacts slide
+    int32_t mostly_slides       # Coulomb's law: many contacts slide at saved_z
     int32_t counts[N_COUNTED]
     int32_t stack[MAX_PHASE_DEPTH]
     int32_t depth

@@ -23,7 +23,7 @@ from libc.string cimport memset
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.newton.elements cimport elements_t, invert_small_matrix, is_row
+from lavender_ext.newton.elements cimport elements_t, invert_small_matrix
 from lavender_ext.newton.natural_map cimport evaluate_all_natural_maps
 from lavender_ext.newton.phases cimport UNLIMITED, begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_SHIFTED, SHIFTED_NEWTON, compute_slack, convex_residual, copy_vector, is_finished,
@@ -54,26 +54,6 @@ cdef inline double slow_ratio() noexcept nogil:
 cdef inline double momentum() noexcept nogil:
     """Return the fraction of the last update that momentum repeats; 0.95 overshoots, 0.5 is slower on pyramids and walls."""
     return 0.8
-
-
-cdef inline double compute_sliding_fraction(newton_t* n, const double* z) noexcept nogil:
-    """Return the fraction of the loaded contacts that slide at z, a solution of the convex law."""
-    cdef const elements_t* e = n.s.e
-    cdef double load = 0.0, size = 0.0
-    cdef int32_t i, j, loaded = 0, sliding = 0
-    compute_slack(n, z, n.slack)
-    compute_all_normal_shifts(e, n.slack, 0.0, n.t2, n.psi)
-    for j in range(e.m):
-        size = fabs(e.g[j]) if fabs(e.g[j]) > size else size
-    for i in range(e.n):
-        j = e.ptr[i]
-        load = z[j] if not is_row(e, i) and z[j] > load else load
-    for i in range(e.n):
-        j = e.ptr[i]
-        if not is_row(e, i) and z[j] > 1e-6 * load:
-            loaded += 1
-            sliding += n.t2[j] > 1e-6 * size
-    return <double>sliding / loaded if loaded else 1.0
 
 
 cdef inline void begin_shifted_newton(newton_t* n, const double* z, int32_t limit, int32_t patience) noexcept nogil:
