@@ -20,13 +20,13 @@ from libc.string cimport memset
 
 from lavender_ext.core.block_projection cimport classify_active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
-from lavender_ext.core.block_types cimport CONE, COULOMB
+from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone_variable
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, INTERIOR_POINT,
                                       INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_ACTIVE_SET, N_AUGMENTED_DE_SAXCE,
-                                      N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR, N_PROXIMAL,
+                                      N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR, N_PROXIMAL, PLAN_COULOMB,
                                       active_set_t, augmented_newton_t, begin_separate_best, compute_slack,
                                       convex_residual, copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, newton_t, pop_phase, progress_t, push_phase,
@@ -340,7 +340,7 @@ cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nog
     pop_phase(n)
     if k.lowest < n.best:
         judge_and_keep_best_point(n, k.best_z)
-    if n.problem.p.law == COULOMB:
+    if n.stack[0] == PLAN_COULOMB:                      # Shifted Newton follows.
         return
     if may_continue and not k.bounded_rows and k.lowest < roundoff_residual() and not is_finished(n) and not is_at_roundoff(n):
         begin_damped_newton(n, k.best_z, CONE, k.lowest, MAX_INNER_STEPS)
@@ -371,7 +371,7 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
             end_interior_steps(n, False)
             return
         # Under Coulomb's law the phase ends if the convex problem is solved and contacts slip, or if many of them will.
-        if n.problem.p.law == COULOMB:
+        if n.stack[0] == PLAN_COULOMB:
             if residual < early_slip_residual() and not k.is_counted:
                 k.is_counted = 1
                 n.mostly_slides = compute_sliding_fraction(n, n.ip.z, early_slip_speed()) > max_early_sliding_fraction()

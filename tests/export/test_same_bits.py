@@ -347,6 +347,16 @@ def test_newton_solves_more_bodies_than_a_full_factor_would_hold(library):
     assert np.abs(wanted).max() > 0.05
 
 
+def test_newton_pile_slides_shifted_newton_has_the_bits_of_the_package(library):
+    given = lv.suite.case("granularF(n=4, sliding=2, seed=10)").problem
+    wanted, factorisations = run_compiled_newton(given, 1e-6, 100)
+    solver = library.open(library.problem(given), library.options("newton"))
+    result = solver.run(100, 1e-6)
+    # Without shifted Newton, 300 factorisations do not suffice.
+    assert result.outcome == 1 and result.verdict.relative <= 1e-6
+    assert (solver.impulse().tobytes(), result.iterations) == (wanted.tobytes(), factorisations)
+
+
 def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library):
     """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
     ran = 0
