@@ -9,6 +9,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_choice
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
     FILE,
@@ -34,6 +35,7 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
     default="mujoco",
     show_default=True,
     metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis",
+    shell_complete=complete_choice,
     help="Engine that steps the worlds.",
 )
 @click.option("--max-velocity-error", type=float, metavar="M/S",

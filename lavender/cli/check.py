@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lavender.base.errors import InputError
+from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import (
     ErrorReporter,
     ListType,
@@ -25,8 +26,15 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=MultiValueCommand)
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--solvers", type=ListType(str), help="Solvers by name; default: all that accept the problem.")
+@click.argument(
+    "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
+)
+@click.option(
+    "--solvers",
+    type=ListType(str),
+    shell_complete=complete_solver,
+    help="Solvers by name; default: all that accept the problem.",
+)
 @click.option(
     "--reference",
     default="osqp",

@@ -8,11 +8,14 @@ from dataclasses import asdict
 import click
 
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_case_or_file
 from lavender.cli.options import ErrorReporter, print_escaped
 
 
 @click.command()
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@click.argument(
+    "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
+)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON, for a bug report.")
 def doctor(files: tuple[str, ...], as_json: bool) -> None:
     """Check the installation, or the data of problems.

@@ -6,11 +6,12 @@ import json
 
 import click
 
+from lavender.cli.completion import complete_case_or_file
 from lavender.cli.options import ErrorReporter, print_escaped
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILES...")
+@click.argument("files", nargs=-1, required=True, metavar="FILES...", shell_complete=complete_case_or_file)
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option("--json", "as_data", is_flag=True, help="Print one decision trace per line as JSON.")
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:

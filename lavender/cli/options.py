@@ -15,6 +15,7 @@ import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.cli.completion import complete_solver
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -250,7 +251,8 @@ recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=Tr
 
 #: Options of the commands that measure, as fields of `lavender.report.bench.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": ListType(str), "help": "Solvers by name; default: all that are installed."}),
+    ("--solvers", {"type": ListType(str), "shell_complete": complete_solver,
+                   "help": "Solvers by name; default: all that are installed."}),
     ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
     ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,

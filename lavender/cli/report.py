@@ -14,6 +14,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.cli.completion import complete_case_or_file
 from lavender.cli.measuring import Measured, is_campaign, measure_files
 from lavender.cli.options import (
     PATH,
@@ -33,7 +34,9 @@ from lavender.io.stored import lock_output, write_text
 
 
 @click.command(cls=MultiValueCommand)
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@click.argument(
+    "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
+)
 @plan_options
 @click.option(
     "--out", type=PATH, default=Path("lavender-report"), show_default=True, help="Folder of the report."

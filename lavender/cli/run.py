@@ -12,6 +12,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_scene, complete_solver
 from lavender.cli.options import (
     PATH,
     continue_after_closed_output,
@@ -24,7 +25,7 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
 
 
 @click.command()
-@click.argument("scene")
+@click.argument("scene", shell_complete=complete_scene)
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option("--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64.")
 @click.option(
@@ -37,7 +38,11 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
     help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
     "Default: alternating.",
 )
-@click.option("--solver", help="Solver of each step, by name. Default: sequential_impulses.")
+@click.option(
+    "--solver",
+    shell_complete=complete_solver,
+    help="Solver of each step, by name. Default: sequential_impulses.",
+)
 @click.option(
     "--velocity-tol",
     type=float,

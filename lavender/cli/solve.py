@@ -9,6 +9,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
 from lavender.io.stored import check_writable, write_atomically
 
@@ -17,9 +18,13 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
 
 
 @click.command()
-@click.argument("file")
+@click.argument("file", shell_complete=complete_case_or_file)
 @click.option(
-    "--solver", default="auto", show_default=True, help="Name of the solver; see `lavender solvers`."
+    "--solver",
+    default="auto",
+    show_default=True,
+    shell_complete=complete_solver,
+    help="Name of the solver; see `lavender solvers`.",
 )
 @click.option(
     "--tol",

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_choice
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output
@@ -20,6 +21,7 @@ from lavender.io.stored import lock_output
     default="mujoco",
     show_default=True,
     metavar="mujoco|mujoco_warp|kamino",
+    shell_complete=complete_choice,
     help="Engine whose settings are measured.",
 )
 @add_worlds_options(worlds=16, steps=200)

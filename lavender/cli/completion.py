@@ -1,0 +1,48 @@
+"""Complete names of solvers, cases and scenes in a shell; click completes commands, options, choices and files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import click
+from click.shell_completion import CompletionItem
+
+
+def _list_matches(names: Iterable[str], incomplete: str, prefix: str = "") -> list[CompletionItem]:
+    return [CompletionItem(prefix + name) for name in sorted(names) if name.startswith(incomplete)]
+
+
+def complete_solver(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the names of solvers that begin with the last word of `incomplete`, a list separated by commas."""
+    from lavender.solvers import registry
+
+    done, comma, last = incomplete.rpartition(",")
+    return _list_matches(registry.specs(), last, done + comma)
+
+
+def complete_case_or_file(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the families and sets of the suite that begin with `incomplete`, and a request for the shell's files."""
+    from lavender import suite
+
+    names = [*suite.FAMILIES, *(f"@{name}" for name in suite.SETS)]
+    return [*_list_matches(names, incomplete), CompletionItem(incomplete, type="file")]
+
+
+def complete_scene(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the names of the built-in scenes that begin with `incomplete`."""
+    from lavender.sim.scene import SCENES
+
+    return _list_matches(SCENES, incomplete)
+
+
+def complete_choice(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Return the words of the parameter's metavar, such as `mujoco|mjx`, that begin with `incomplete`."""
+    return _list_matches((parameter.metavar or "").split("|"), incomplete)
