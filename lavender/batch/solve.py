@@ -22,11 +22,11 @@ from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_int
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.costs import RATES, estimate_judge_setup_cost, estimate_pass_cost
-from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.compiled_call import COST_PER_SECOND, NO_STAGE_MESSAGE, compute_postponed_fields
 from lavender.solving.finish import create_unjudged, keep_unjudged_start
 from lavender.solving.limits import check_time_limit
+from lavender.solving.loop import MIN_TIME_LIMIT
 from lavender.solving.prepared import Prepared, check_accepted, check_arguments
 from lavender.solving.solve import solve
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
@@ -36,8 +36,8 @@ from lavender_ext.judge.measure import all_finite
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from lavender.solvers.loop import Callback
     from lavender.solvers.registry import SolverOptions
+    from lavender.solving.loop import Callback
 
     class ManyOptions(SolverOptions, total=False):
         """Options of `solve` that `solve_many` passes on."""

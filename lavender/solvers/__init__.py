@@ -1,4 +1,7 @@
-"""Table of the built-in solvers. A new solver needs a file in this folder and a line in the table."""
+"""Table of the built-in solvers. A new solver needs a file in this folder and a line in the table.
+
+`auto` calls other solvers in the sequence of every solve, so its file is in `lavender.solving`.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,8 @@ SPECS: tuple[SolverSpec, ...]  # The specs of all solvers; `__getattr__` imports
 
 def get_spec(name: str) -> SolverSpec | None:
     """Return the spec of one solver, importing its file if necessary; None if it is not in the table."""
-    return import_module_under_lock(f"{__name__}.{name}").SPEC if name in _TABLE else None
+    package = "lavender.solving" if name == "auto" else __name__
+    return import_module_under_lock(f"{package}.{name}").SPEC if name in _TABLE else None
 
 
 def __getattr__(name: str) -> Any:

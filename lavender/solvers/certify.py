@@ -14,7 +14,7 @@ With J and M, the certificate is computed from the smallest violation of J v = t
 (`certify_by_least_violation`).
 
 One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because a linear program
-accepts no rows with upper bounds, and other islands may have them.
+accepts no rows with upper bounds, and other islands may have them. `log` is the `SolveLog` of a solve by `auto`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ from lavender.solvers.costs import RATES, estimate_import_cost
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
-from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import residuals_by_island
 
@@ -149,7 +148,7 @@ def drop_negligible_rows(y: FloatArray, d: FloatArray) -> FloatArray:
     return np.where(size > NEGLIGIBLE_ROW_FRACTION * size.max(), y, 0.0)
 
 
-def certify_by_least_violation(log: SolveLog) -> None:
+def certify_by_least_violation(log: Any) -> None:
     """Search for a certificate of a problem with J and M, from the motion with the smallest violation of J v = target.
 
     With a diagonal mass C instead of M and compliances eps d, the impulses lambda(eps) of
@@ -207,7 +206,7 @@ def certify_by_least_violation(log: SolveLog) -> None:
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def certify_infeasibility(log: SolveLog) -> None:
+def certify_infeasibility(log: Any) -> None:
     """Search for a certificate that a problem has no solution; under Coulomb's law, also for the convex relaxation."""
     problem = log.problem
     if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:
@@ -221,7 +220,7 @@ def certify_infeasibility(log: SolveLog) -> None:
         log.conflict = find_conflict(problem, log.tol, log.deadline)
 
 
-def certify_by_linear_programs(log: SolveLog) -> None:
+def certify_by_linear_programs(log: Any) -> None:
     """Search for a certificate by linear programs, one for each unsolved island without upper bounds."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_after_deadline(
@@ -246,7 +245,7 @@ def certify_by_linear_programs(log: SolveLog) -> None:
             return
 
 
-def _list_unsolved_islands(log: SolveLog) -> Any:
+def _list_unsolved_islands(log: Any) -> Any:
     """Yield (problem, rows) of each unsolved island, the smallest first, or the whole problem if it is one island."""
     problem = log.problem
     count, label = find_islands(problem)
@@ -259,7 +258,7 @@ def _list_unsolved_islands(log: SolveLog) -> Any:
         yield restrict_to_blocks(problem, blocks[i], rows), rows
 
 
-def _find_unsolved_labels(log: SolveLog, label: IntArray) -> IntArray:
+def _find_unsolved_labels(log: Any, label: IntArray) -> IntArray:
     """Return the islands with a relative residual above the tolerance."""
     own, table = residuals_by_island(log.problem.metric, log.impulse)
     if len(table) == 1:

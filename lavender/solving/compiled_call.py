@@ -11,10 +11,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
 from lavender.problem import Problem
-from lavender.solvers.loop import select_best_impulse
 from lavender.solvers.registry import SMALL_ROWS, SolverSpec
 from lavender.solvers.small import get_call_time_fraction
 from lavender.solving.finish import FinishedRun, make_fields
+from lavender.solving.loop import select_best_impulse
 from lavender_ext.judge.measure import all_finite
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from lavender.base.deadline import format_seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
-from lavender.solvers.auto import DecisionTree, Stage, program_backends
 from lavender.solvers.registry import get
 from lavender.solvers.small import describe_small_call
+from lavender.solving.auto import DecisionTree, Stage, program_backends
 
 MAX_EXPLAINED_STAGES = 6  # Largest number of stages that are listed before the alternation with doubled work.
 

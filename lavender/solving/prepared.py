@@ -1,7 +1,7 @@
 """`prepare` and the one sequence of every solve: check the arguments, set the solver up, run it, finish.
 
 `lavender.solve`, `Prepared.solve`, `solve_many`, `solve_qp` and the engine's `solver=` start a solve here. The steps
-are in `solvers/loop.py`, the end is in `finish.py`.
+are in `solving/loop.py`, the end is in `finish.py`.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ from lavender.solvers.costs import (
     estimate_result_cost,
 )
 from lavender.solvers.islands import find_islands
-from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, create_unjudged, decide_empty_rows, finish, name_lost_row
 from lavender.solving.limits import check_time_limit, is_setup_too_late, is_tight, is_too_late, make_deadline
+from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
 from lavender_ext.judge.stopping_test import StoppingTest

@@ -12,10 +12,10 @@ from lavender.base.arrays import ArrayLike
 from lavender.base.errors import InputError
 from lavender.judge.solution import Solution
 from lavender.problem import Problem, check_problem
-from lavender.solvers.loop import Callback
 from lavender.solvers.registry import get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.limits import check_time_limit, make_deadline
+from lavender.solving.loop import Callback
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 

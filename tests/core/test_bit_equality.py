@@ -25,10 +25,9 @@ import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.judge.residuals import get_zero_impulse_reference
-from lavender.solvers.auto import DecisionTree, create_solver_step
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
-from lavender.solvers.solve_log import SolveLog
+from lavender.solving.auto import DecisionTree, SolveLog, create_solver_step
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.pivot.lemke import Lemke
 

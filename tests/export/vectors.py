@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.export import HEADER
 from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.solvers import registry
-from lavender.solvers.steps import METHODS as CANDIDATES
+from lavender.solving.auto import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 

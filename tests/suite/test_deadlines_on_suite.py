@@ -10,10 +10,9 @@ import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.solvers.auto import DecisionTree
 from lavender.solvers.costs import estimate_judge_setup_cost, estimate_result_cost
-from lavender.solvers.steps import Newton, Step, estimate_cost
 from lavender.solvers.sweeping import SweepSolver
+from lavender.solving.auto import DecisionTree, Newton, Step, estimate_cost
 
 OWN = [
     name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"

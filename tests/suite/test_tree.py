@@ -13,7 +13,7 @@ from random_problems import as_matrix, general, random_generalized_problem, rand
 import lavender as lv
 from lavender import registry, suite
 from lavender.solvers import costs
-from lavender.solvers.steps import METHODS
+from lavender.solving.auto import METHODS
 
 
 @pytest.fixture(autouse=True)

@@ -71,7 +71,7 @@ def test_the_package_loads_what_auto_needs_a_name_its_own_file_and_a_listing_no_
 LATE = """
 import os, sys
 import numpy as np, lavender as lv
-from lavender.solvers.loop import Loop
+from lavender.solving.loop import Loop
 
 class Watch:
     running = False

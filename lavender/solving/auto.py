@@ -35,20 +35,31 @@ the stages that would run. The decisions depend on these numbers (`decisions.py`
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from itertools import islice
-from math import inf, nan
+from math import inf, log, nan
+from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline, format_seconds
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import NEVER, Deadline, Stopwatch, format_seconds
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.residuals import combine_best_islands
-from lavender.judge.solution import Claim, Status
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import (
+    MAX_EXCUSED_RESIDUAL,
+    combine_best_islands,
+    find_relative_at_zero,
+    get_zero_impulse_reference,
+    replace_stale_start,
+    residual,
+    reuse_or_judge_impulse,
+)
+from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
+from lavender.solvers._accelerated import build_state_in_given_form
 from lavender.solvers.certify import (
     certify_by_least_violation,
     certify_by_linear_programs,
@@ -56,6 +67,7 @@ from lavender.solvers.certify import (
 )
 from lavender.solvers.costs import (
     RATES,
+    Cost,
     estimate_first_factor_cost,
     estimate_first_sweep_cost,
     estimate_formation_cost,
@@ -63,24 +75,20 @@ from lavender.solvers.costs import (
     get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
+from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
-from lavender.solvers.loop import Loop
 from lavender.solvers.newton import NewtonState
-from lavender.solvers.recording import Recorder
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
-from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, get_call_time_fraction
-from lavender.solvers.solve_log import SolveLog, get_relaxation
-from lavender.solvers.steps import (
-    METHODS,
-    Iterations,
-    Newton,
-    RelaxedNewton,
-    Step,
-    Sweeps,
-    estimate_cost,
-    starts_relaxed,
+from lavender.solvers.small import (
+    AUTO,
+    NO_TIME_MESSAGE,
+    NO_WORK_MESSAGES,
+    SmallCall,
+    describe_stages,
+    get_call_time_fraction,
 )
-from lavender_ext.judge.measure import residuals_by_island
+from lavender.solving.loop import Loop, Record
+from lavender_ext.judge.measure import all_finite, residuals_by_island
 
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
@@ -97,6 +105,561 @@ MAX_ALTERNATIONS = 12
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200
+NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
+MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
+#: Solver and options of each step, by its name.
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "anderson": ("anderson", {}),
+    "newton": ("newton", {}),
+    "newton over rows": ("newton", {"form": "impulse"}),
+    "direct": ("direct", {}),
+    "nncg": ("nncg", NNCG_OPTIONS),
+    "admm": ("admm", {}),
+    # On large piles, `admm` needs fewer iterations from zero than from an iterate of sweeps.
+    "admm from zero": ("admm", {}),
+    "newton on the relaxation": ("newton", {}),
+}
+# Predictions of remaining sweeps replace a smaller tol by this relative residual.
+MIN_PREDICTED_RESIDUAL = 1e-16
+# [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
+ITERATION_TIME_PER_COST = 4e-9
+# Sweeps over large problems with friction before the first prediction of how many remain.
+FIRST_SWEEPS_OF_LARGE_PROBLEM = 8
+# Interior points on the relaxation need at least this number of factorisations.
+FIRST_RELAXED_FACTORISATIONS = 6
+# Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
+RELAXED_TOLERANCE = 0.01
+# Sweeps use a formed A only if at least this multiple of the cost to form it remains.
+FORMATION_COST_RATIO = 4.0
+MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
+SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
+
+
+def make_solver(name: str, problem: Problem) -> Any:
+    """Create the solver of a step."""
+    solver, options = METHODS[name]
+    if name == "direct" and problem.law == "linear":
+        return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
+    # Solve blocks exactly under the cone law, and for a matrix, in which the rows of a contact may have different
+    # units.
+    exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
+    if exact and "sweep" in get(solver).options:
+        options = options | {"sweep": "blocks"}
+    return get(solver).load()(**options)
+
+
+def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
+    """Estimate the costs of the solver of a step."""
+    cost: Cost = make_solver(name, problem).cost(problem, state)
+    return cost
+
+
+def starts_relaxed(problem: Problem) -> bool:
+    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large."""
+    large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
+    return large and not problem.cones.has_round and problem.is_symmetric
+
+
+# Key in `Derived.cache` of the problem's convex relaxation.
+RELAXATION_KEY = "lavender.solving.auto: relaxation"
+
+
+def get_relaxation(problem: Problem) -> Problem:
+    """Return the convex relaxation over the same arrays and references; it is cached with the problem."""
+    relaxed: Problem | None = problem.derived.cache.get(RELAXATION_KEY)
+    if relaxed is None:
+        relaxed = problem.relaxed("cone")
+        get_zero_impulse_reference(problem)
+        relaxed.metric.share_reference(problem.metric)
+        problem.derived.cache[RELAXATION_KEY] = relaxed
+    return relaxed
+
+
+class SolveLog:
+    """Stages that ran on a problem, their work, and the best impulse."""
+
+    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
+        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
+        self.interrupted = False
+        self.failure = ""  # Message of the last arithmetic error.
+        self.remark = ""  # Message of the solve of some islands.
+        # A stage was left out or ended early, because the remaining time was too short.
+        self.timed_out = False
+        # Smallest relative residual, and the impulse (m,) [N s] with this residual.
+        self.best, self.impulse = (
+            np.inf,
+            problem._start,
+        )
+        # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
+        self.result = problem._start
+        self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
+        self.stages: list[SolverStage] = []
+        self.work: dict[str, int] = {}
+        self.iterations = 0
+        self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
+        # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
+        self.direction: FloatArray | None = None
+        self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
+        self.recorder: Recorder | None = None  # Writes the history if one is requested.
+
+    def start_from_better_impulse(self, start: FloatArray) -> None:
+        """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
+        get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
+        start = start.copy()
+        replace_stale_start(self.problem, start)
+        self.judge_and_store_best(start, is_start=True)
+
+    def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
+        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
+
+        `judged` is the judge's result if it is known. If `is_start` is true, the impulse also sets an upper bound of
+        the relative residual of each island of `result`.
+        """
+        relative = find_relative_at_zero(self.problem, impulse)
+        is_known = relative is not None and self.result is self.problem._start
+        if relative is None:
+            last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
+            relative, impulse = float(last.relative), last.impulse
+            if relative < self.best:
+                self.judged = last
+        if relative < self.best:
+            self.best, self.impulse = relative, impulse.copy()
+        if self.best > self.tol and not is_known:
+            starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
+            self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
+
+    def compare_with_relaxation(self, impulse: FloatArray) -> float:
+        """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.
+
+        The ratio is the largest of all islands that are not solved; 0 if all are solved.
+        """
+        problems = self.problem, get_relaxation(self.problem)
+        exact, relaxed = (residuals_by_island(p.metric, impulse)[1] for p in problems)
+        unsolved = exact[:, 0] > self.tol
+        return float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
+
+    def record_stage(self, name: str, claim: Claim, before: float) -> None:
+        """Record a stage that has ended; the relative residual before it was `before`."""
+        self.iterations += claim.iterations
+        self.work = sum_work_counts((self.work, claim.work))
+        self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
+        if claim.certificate is not None:
+            if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
+                self.certificate = claim.certificate
+            else:
+                self.direction = claim.certificate
+        if claim.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+
+    def record_part(self, claim: Claim, rows: IntArray) -> None:
+        """Record the claim of a solve of some islands, with these row numbers."""
+        self.iterations += claim.iterations
+        self.work = sum_work_counts((self.work, claim.work))
+        self.stages += claim.stages
+        remark = claim.message.removeprefix(describe_stages(claim.stages)).removeprefix("; ")
+        if claim.status is Status.NUMERICAL_ERROR:
+            self.failure = remark
+        elif claim.stages:
+            self.remark = remark
+        if claim.certificate is not None:
+            direction = np.zeros(self.problem.m)
+            direction[rows] = claim.certificate
+            if claim.status is Status.INFEASIBLE:
+                self.certificate = direction
+            else:
+                self.direction = direction
+        if claim.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+
+    # -- the end ---------------------------------------------------------------------------------
+
+    @property
+    def remaining_iterations(self) -> int:
+        """Number of iterations that the budget still allows."""
+        return self.budget - self.iterations
+
+    @property
+    def time_left(self) -> float | None:
+        """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
+        return self.deadline.get_remaining_seconds(1e-5)
+
+    def ends_after_deadline(self, cost: float) -> bool:
+        """Return whether a step of this estimated cost [ns] would end after the deadline."""
+        return self.deadline.has_passed(1e-9 * cost)
+
+    @property
+    def last_stage_failed(self) -> bool:
+        """Whether the last stage did not reduce the residual."""
+        return bool(self.stages) and self.best >= self.stages[-1].before
+
+    def done(self) -> bool:
+        """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""
+        return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
+
+    def is_at_floor(self) -> bool:
+        """Return whether rounding explains the best residual: no solver can be expected to reach the tolerance."""
+        if self.best > MAX_EXCUSED_RESIDUAL:
+            return False
+        self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
+        return bool(self.judged.above_floor <= self.tol)
+
+    @property
+    def status(self) -> Status:
+        """Status of the solve so far."""
+        if self.certificate is not None:
+            return Status.INFEASIBLE
+        if self.best <= self.tol:
+            return Status.CONVERGED
+        if self.is_at_floor():
+            return Status.ROUNDOFF_LIMIT
+        if self.deadline.has_passed():
+            return Status.TIME_LIMIT
+        if self.remaining_iterations <= 0:
+            return Status.MAX_ITERATIONS
+        return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
+
+    def make_claim(self) -> Claim:
+        """Return the claim of the complete solve."""
+        status = self.status
+        if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
+            status = Status.TIME_LIMIT
+        no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
+        no_work = NO_WORK_MESSAGES.get(status, no_work)
+        message = describe_stages(self.stages) or ("" if self.failure else no_work)
+        return Claim(
+            Status.INTERRUPTED if self.interrupted else status,
+            self.iterations,
+            self.work,
+            "; ".join(
+                filter(None, (message, self.failure, self.remark, *self._describe_conflict_in_relaxation()))
+            ),
+            certificate=self.direction if self.certificate is None else self.certificate,
+            stages=tuple(self.stages),
+            judged=self.judged,
+        )
+
+    def _describe_conflict_in_relaxation(self) -> list[str]:
+        """Return messages about the conflict in the relaxation and the recommended compliance, if it is unsolved."""
+        if self.conflict is None or self.best <= self.tol:
+            return []
+        messages = []
+        if self.certificate is None:
+            messages = ["of the convex relaxation, " + self.conflict.proof.message]
+        return [*messages, self.conflict.advice]
+
+
+@dataclass
+class Recorder:
+    """Writes the records of one solve by `auto`.
+
+    Parameters
+    ----------
+    solve : Loop
+        The loop of the solve, which holds the records, their solvers and the time of recording.
+    watch : Stopwatch
+        Time since the beginning of the solve.
+    """
+
+    solve: Loop
+    watch: Stopwatch = field(default_factory=Stopwatch)
+
+    @property
+    def records(self) -> list[Record]:
+        """The records so far."""
+        return self.solve.records or []
+
+    @property
+    def time(self) -> float:
+        """Time of the solve without recording [s]."""
+        return self.watch.elapsed_seconds - self.solve.recording_time
+
+    def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
+        """Append the records with more iterations than the last one."""
+        assert self.solve.records is not None
+        for record in records:
+            if not self.solve.records or record[0] > self.solve.records[-1][0]:
+                self.solve.records.append(record)
+                self.solve.record_solvers.append(solver)
+
+    def record_impulse(
+        self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
+    ) -> None:
+        """Record an impulse (m,) [N s] after this number of iterations of all stages."""
+        time = self.time if time is None else time
+        watch = Stopwatch()
+        r = residual(self.solve.problem, impulse, "float64")
+        self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
+        self.solve.recording_time += watch.elapsed_seconds
+
+    def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
+        """Append the records of a loop that began at this number of iterations and this time [s]."""
+        self.solve.recording_time += loop.recording_time
+        self.append_later_records(
+            solver, [(iterations + r[0], time + r[1], *r[2:]) for r in loop.records or ()]
+        )
+
+    def finish(self, claim: Claim, impulse: FloatArray) -> None:
+        """Record the result, an impulse (m,) [N s], unless its number of iterations is recorded already."""
+        self.record_impulse(claim.stages[-1].solver if claim.stages else "start", claim.iterations, impulse)
+
+    def record_compiled_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
+        """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
+        call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
+        problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
+        before = self.solve.recording_time
+        while claim.iterations > self.records[-1][0]:
+            watch = Stopwatch()
+            result, counts = call.solve_and_judge(problem, start, tol, cost)
+            seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
+            if result is not None:
+                part = call.make_claim(problem, counts, start, result.relative)
+                if part.iterations <= claim.iterations:
+                    name = part.stages[-1].solver if part.stages else call.name
+                    self.record_impulse(name, part.iterations, result.impulse, seconds)
+                if result.relative <= tol:
+                    break
+            cost *= SAMPLED_COST_RATIO
+        self.solve.recording_time = before + excluded.elapsed_seconds
+
+
+class Step:
+    """A solver that runs on the problem of a log.
+
+    `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
+    more than `least` iterations are still needed.
+    """
+
+    over = late = slips = False
+    least = np.inf
+    state: Any = None
+    impulse: FloatArray  # Present iterate (m,) [N s].
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        self.name, self.log = name, log
+        self.solver = make_solver(name, log.problem)
+
+    def run(self, n: float) -> None:
+        """Run at most n iterations and record the stage in the log."""
+        log, before = self.log, self.log.best
+        try:
+            claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, MAX_CALL_ITERATIONS)))
+        except BREAKDOWN as error:
+            log.failure, self.over = format_error(error), True
+            claim = Claim(Status.NUMERICAL_ERROR, 0)
+        self.over = self.over or claim.status is not Status.MAX_ITERATIONS
+        self.late = claim.status is Status.TIME_LIMIT
+        log.timed_out = log.timed_out or self.late
+        log.record_stage(self.name, claim, before)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the result to the log."""
+        log = self.log
+        if self.state is None:
+            self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
+        claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
+        self.store_iterate_in_log(claim.judged)
+        self.record_iterate(claim)
+        return claim
+
+    def record_iterate(self, claim: Claim) -> None:
+        """Record the iterate at the end of a stage, if a history is requested."""
+        log = self.log
+        if log.recorder is not None:
+            log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
+
+    def store_iterate_in_log(self, judged: Any = None) -> None:
+        """Offer the iterate, and the judge's pass over it if there is one, to the log if it is finite."""
+        if all_finite(self.impulse):
+            self.log.judge_and_store_best(self.impulse, judged=judged)
+
+
+class Newton(Step):
+    """Newton's method with the state that the tree has analysed.
+
+    It starts from the best impulse. If it stalls after a start that is not the zero impulse, it starts once more from
+    zero, unless the compiled call has started from zero.
+    """
+
+    started_from_zero = is_second_start = has_stalled = False
+
+    def run(self, n: float) -> None:
+        """Run at most n iterations, with a second start from zero if the first one stalls."""
+        log, done = self.log, self.log.iterations
+        super().run(n)
+        if self.has_stalled and not self.started_from_zero and not log.done():
+            self.started_from_zero = self.is_second_start = True
+            self.over = self.state.begun = False
+            super().run(n - (log.iterations - done))
+
+    def advance(self, n: int) -> Claim:
+        """Run about n iterations; choose the start at the first call."""
+        log = self.log
+        if not self.state.begun:
+            self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
+            self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
+        claim = self.solver.advance(
+            self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
+        )
+        self.has_stalled = claim.status is Status.STALLED
+        self.store_iterate_in_log(claim.judged)
+        self.record_iterate(claim)
+        return claim
+
+
+class Iterations(Step):
+    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
+
+    time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the last and the best iterate to the log."""
+        log, left = self.log, self.log.deadline.get_remaining_seconds()
+        if self.state is None:
+            self.prepare_and_set_start()
+        loop = Loop(
+            problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
+            deadline=None if left is None else log.deadline if self.time_fraction == 1.0
+            else Deadline(self.time_fraction * left),
+            pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
+            records=None if log.recorder is None else [],
+        )  # fmt: skip
+        begun = 0.0 if log.recorder is None else log.recorder.time
+        claim = self.run_loop_iterations(loop, n)
+        if log.recorder is not None:
+            log.recorder.append_loop_records(self.name, log.iterations, begun, loop)
+        self.store_iterate_in_log()
+        if log.best > log.tol:
+            best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]
+            if impulse is not None and best < log.best:
+                log.judge_and_store_best(impulse)
+        return claim
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the solver and start from the best impulse of the log, or from zero."""
+        start = self.log.problem._start if self.name == "admm from zero" else self.log.impulse
+        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
+
+    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
+        """Run at most n iterations."""
+        return loop.run_chunks(n)
+
+
+class Sweeps(Iterations):
+    """Sweeps that stop if more than `least` remaining sweeps are predicted.
+
+    With a time limit, they use a part of the remaining time, or all of it in `auto.sweep_until_deadline`.
+    """
+
+    time_fraction = DECISIONS.time_share
+    predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
+    n_islands = 0  # Number of islands; 0 if it is not known.
+
+    @property
+    def is_large(self) -> bool:
+        """Whether `auto` solves the convex relaxation of the problem first."""
+        return starts_relaxed(self.log.problem)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n sweeps, offer the result to the log, and predict how many remain."""
+        before = self.log.best
+        claim = super().advance(n)
+        now, tol = self.log.best, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if now > tol:
+            gain = log(before / now) if now < before else 0.0
+            self.predicted = claim.iterations * log(now / tol) / gain if gain > 0.0 else np.inf
+        return claim
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the sweeps; start from the best impulse."""
+        p, deadline = self.log.problem, self.log.deadline
+        too_late = deadline.has_passed(1e-9 * get_loose_limit(p)) and deadline.has_passed(
+            1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
+        )
+        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
+        self.impulse = self.log.impulse.copy()
+
+    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
+        """Run at most n sweeps; predict how many remain at intervals."""
+        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
+        growth = 1.0 if self.is_large else 0.5
+        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
+            loop.tol = 0.0
+            claim = loop.run_chunks(min(n, first))
+            if claim.status is not Status.MAX_ITERATIONS:
+                return claim
+            loop.tol = self.log.tol
+        now = self.log.best
+        while True:
+            step = n - due
+            if self.least < np.inf:
+                step = min(step, max(int(growth * (done + due)), 1 if done else first))
+            due += step
+            claim = loop.run_chunks(due)
+            if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
+                return replace(claim, status=Status.MAX_ITERATIONS)
+            if claim.status is not Status.MAX_ITERATIONS or due == n:
+                return claim
+            before, now = now, self.measure_progress()
+            if self.has_solved_half():
+                return claim
+            gain = log(before / now) if 0.0 < now < before else 0.0
+            self.predicted = step * log(now / tol) / gain if now > tol and gain > 0.0 else np.inf
+            if now <= tol or self.is_hopeless(self.least):
+                return claim
+
+    def is_hopeless(self, max_remaining: float) -> bool:
+        """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
+        done = 0.0 if self.state is None else self.state.watch.total
+        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        return self.predicted > max_remaining and not is_early
+
+    def measure_progress(self) -> float:
+        """Return the smallest relative residual so far."""
+        if self.is_large:
+            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
+        self.store_iterate_in_log()
+        return self.log.best
+
+    def has_solved_half(self) -> bool:
+        """Return whether at least half of the blocks of a large problem belong to solved islands."""
+        if not self.is_large or self.n_islands == 1:
+            return False
+        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
+        self.n_islands = len(table)
+        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
+
+
+class RelaxedNewton(Step):
+    """Interior points on the convex relaxation, judged under Coulomb's law. They stop if contacts slip."""
+
+    like: Any = None  # `NewtonState` of the problem, whose elimination order is reused.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n factorisations, and compare both laws after each from the first possible end on."""
+        log = self.log
+        if self.state is None:
+            self.state = self.solver.update(self.like, get_relaxation(log.problem))
+            self.impulse = log.problem.start()
+        system, trial = self.state.system, self.impulse.copy()
+        claim, done = Claim(Status.MAX_ITERATIONS, 0), 0
+        work: dict[str, int] = {}
+        count = min(n, FIRST_RELAXED_FACTORISATIONS) if system is not None else n
+        while done < n and claim.status is Status.MAX_ITERATIONS:
+            claim = self.solver.advance(
+                self.state, self.impulse, count, RELAXED_TOLERANCE * log.tol, log.time_left, n - done
+            )
+            done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
+            self.store_iterate_in_log()
+            if claim.status is not Status.MAX_ITERATIONS or system is None:
+                break
+            system.solve.write_interior_impulse(trial)
+            log.judge_and_store_best(trial)
+            self.slips = log.compare_with_relaxation(trial) < DECISIONS.slip_ratio
+            if log.best <= log.tol or self.slips:
+                break
+        self.record_iterate(claim)
+        return replace(claim, iterations=done, work=work)
 
 
 @dataclass(frozen=True)
