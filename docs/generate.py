@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite docs/solvers.md and docs/scenes.md, which are checked in (seconds)
+    python docs/generate.py --pages    rewrite docs/solvers.md, scenes.md and backends.md, which are checked in
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
@@ -377,6 +377,72 @@ def solver_overview():
     )
 
 
+# Paragraphs of docs/backends.md.
+BACKENDS_INTRODUCTION = """\
+This page shows the behaviour of each QP *backend* on small programs with known solutions. A backend is a solver of
+another package that [lavender calls](solvers.md#options-of-backends). Each was called alone by
+[qpsolvers](https://github.com/qpsolvers/qpsolvers), at its default settings, in the version of the table. A test
+repeats each program with the installed version, and fails if the behaviour has changed. `lavender solvers NAME` prints
+the same in sentences, and [`lavender check`](cross-check.md) quotes them if it contradicts a claim.
+
+A cell of the first table has one of these results: *right* (reported as solved, within 1 %), *wrong* (reported as
+solved, but not right), *not found*, or *raises* (an exception)."""
+BACKENDS_VERDICTS = """\
+*Triangle* is the part of P that is used if P is not symmetric: *all* gives a wrong answer, *none* rejects P. *Start*
+has the arrays of a start that the backend uses. The program *contradictory* has no solution, *unbounded* has no
+minimum, and *saddle* is not convex: *wrong* means that a saddle point is reported as solved."""
+BACKENDS_NUMBERS = """\
+*Linear term* is x2, and 1 is right. *Small part* is x3, and 0.5 is right. *Smallest* is the largest e of 0.1, 0.01,
+..., 1e-9 that is not returned within 1 %, or 0. *Far bound* is the smallest B of 1e3, 1e4, ..., 1e19 that prevents a
+solution. *Fixed multiplier* is the multiplier of x1, and -1 is right. *Infeasible x* is the first entry of x after the
+program. In all columns, *none* means that nothing was returned."""
+
+
+def backends_page():
+    """Return the text of docs/backends.md: observed behaviour of backends."""
+    from lavender.external import backends as b
+
+    seen = [x for x in b.BACKENDS if x.behaviour is not None]
+    verdicts = ["version", "triangle", "start", "repeated", "contradictory", "unbounded", "singular"]
+    verdicts += ["convex_on_rows", "saddle"]
+    numbers = ["linear_term", "small_part", "smallest", "far_bound", "fixed_multiplier", "infeasible_x"]
+
+    def cell(value):
+        return "none" if value is None else value if isinstance(value, str) else f"{value:g}"
+
+    def observed(names):
+        rows = [(f"`{x.name}`", *(cell(getattr(x.behaviour, n)) for n in names)) for x in seen]
+        return table(("backend", *(n.replace("_", " ") for n in names)), rows)
+
+    def texts(head, by_name):
+        return table(head, [(name.replace("_", " "), text) for name, text in by_name.items()])
+
+    notes = [
+        f"- `{x.name}` {x.behaviour.version}: {text}" for x in seen for text in x.behaviour.notes.values()
+    ]
+    rest = ", ".join(f"`{x.name}`" for x in b.BACKENDS if x.behaviour is None and not x.cones)
+    return "\n\n".join(
+        (
+            "# Backends: what they really do",
+            "<!-- Written by `python docs/generate.py --pages`. -->",
+            BACKENDS_INTRODUCTION,
+            "## Solvable and unsolvable programs",
+            observed(verdicts),
+            BACKENDS_VERDICTS,
+            "## Accuracy",
+            observed(numbers),
+            BACKENDS_NUMBERS,
+            "## Programs",
+            texts(("name", "program"), b.PROBE_PROGRAMS),
+            "## Other observations",
+            "\n".join(notes),
+            "## Remedies in lavender",
+            texts(("observation", "lavender"), b.ADAPTER_REMEDIES),
+            f"Not observed yet: {rest}.",
+        )
+    )
+
+
 def solver_pages(site, records, figures):
     """Write the page of each built-in solver, and one page for the backends."""
     specs = built_in()
@@ -668,13 +734,16 @@ def write(source, cache):
 
 def committed_pages():
     """Return the texts of the pages that are checked in, by file name."""
-    return {"solvers.md": solver_overview().rstrip() + "\n", "scenes.md": scene_page().rstrip() + "\n"}
+    pages = {"solvers.md": solver_overview(), "scenes.md": scene_page(), "backends.md": backends_page()}
+    return {name: text.rstrip() + "\n" for name, text in pages.items()}
 
 
 def main():
     """Run the command line that the docstring of this module describes."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--pages", action="store_true", help="rewrite docs/solvers.md and docs/scenes.md")
+    parser.add_argument(
+        "--pages", action="store_true", help="rewrite docs/solvers.md, scenes.md and backends.md"
+    )
     parser.add_argument("--tables", action="store_true", help="measure; rewrite tables and figures of pages")
     chosen = parser.parse_args()
     here = Path(__file__).resolve().parent

@@ -16,6 +16,7 @@ import lavender as lv
 
 DIGITS = 50
 TOL = 1e-6
+KINDS = "definite", "singular", "repeated", "placeholder"
 MAX_RATIO = 10.0  # An answer may be this many times as far from the KKT conditions as the backend's own.
 # Settings of a backend called alone: the ones that its adapter passes, at the same tolerance.
 INTERIOR = {"feastol": TOL, "abstol": TOL, "reltol": TOL}
@@ -62,6 +63,23 @@ def draw_program(seed):
             program["lb"][rng.random(n) < 0.5] = -np.inf
             program["ub"][rng.random(n) < 0.5] = np.inf
     return program
+
+
+def draw_kind(seed):
+    """Draw a program of one of four kinds in turn: definite, singular, with repeated rows, with placeholder bounds.
+
+    Placeholder bounds are inactive bounds of 1e3 to 1e19, which users write for "no bound".
+    """
+    kind, turn = KINDS[seed % len(KINDS)], seed // len(KINDS) % 2
+    # The seed of `draw_program` decides definiteness (even) and repeated rows (a multiple of 3).
+    first = {"definite": 2, "singular": 1, "repeated": 3 * turn, "placeholder": 1 + turn}[kind]
+    program = draw_program(6 * (1000 + seed) + first)
+    if kind == "placeholder":
+        rng, n = np.random.default_rng(seed), len(program["q"])
+        far = np.full(n, 10.0 ** rng.integers(3, 20))
+        # With this q, the objective has a minimum without bounds also if P is singular.
+        program |= {"q": program["P"] @ rng.normal(size=n), "lb": -far, "ub": far}
+    return kind, program
 
 
 def draw_lcp(seed):

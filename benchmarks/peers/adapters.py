@@ -100,7 +100,7 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = QPSolver(backend, form=form).prepare(problem)
-        if form == "velocity" and backend.definite and not qp.is_definite:
+        if form == "velocity" and backend.needs_definite and not qp.is_definite:
             return
         start = problem.start()
 
@@ -384,7 +384,7 @@ def contestants(siconos: str = "") -> list[Contestant]:
             # Backends with calls so short that the adapter's overhead matters, with dense and sparse matrices.
             ways = QUICK.get(backend.name)
             made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
-                _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
+                _backend(replace(backend, dense=dense), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
     made += [

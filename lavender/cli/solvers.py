@@ -8,11 +8,44 @@ from lavender.cli.options import escape_markup, make_console
 
 
 @click.command()
-def solvers() -> None:
-    """List the solvers and their capabilities.
+@click.argument("name", required=False)
+def solvers(name: str | None) -> None:
+    """List the solvers and their capabilities, or describe the solver NAME.
 
-    Solvers that are not installed show the package to install.
+    Solvers that are not installed show the package to install. For a backend of another package, the description has
+    its observed behaviour with small programs.
     """
+    if name is None:
+        _list_solvers()
+    else:
+        _describe_solver(name)
+
+
+def _describe_solver(name: str) -> None:
+    """Print summary, reference, options and observed behaviour of a solver."""
+    from lavender.external.backends import describe_backend, get_observed_version
+    from lavender.solvers import registry
+
+    if name not in registry.specs():
+        registry.get(name)  # Raises UnknownName with similar names.
+    spec, reason = registry.specs()[name], registry.known()[name]
+    lines = [f"{name}: {spec.summary}", spec.reference and f"Reference: {spec.reference}", reason]
+    lines += [f"Option {option}: {text}" for option, text in spec.options.items()]
+    sentences = describe_backend(name)
+    if sentences:
+        lines += [
+            f"Observed with version {get_observed_version(name)}, called alone at its default settings:"
+        ]
+        lines += [f"- {sentence}" for sentence in sentences]
+    elif spec.external:
+        lines += ["Its behaviour was not observed."]
+    console = make_console()
+    for line in filter(None, lines):
+        console.print(escape_markup(line), highlight=False)
+
+
+def _list_solvers() -> None:
+    """Print a table of the solvers."""
     from rich.table import Table
 
     from lavender.problem import LAWS, OPERATORS

@@ -6,11 +6,12 @@ SciPy's LSQR instead; `build_program` adds a row to such problems.
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -37,6 +38,58 @@ _HANDLER_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
+class Behaviour:
+    """Results of a backend alone, at its default settings, on small programs with solutions that are known.
+
+    A verdict is "right" (found, within 1 %), "wrong" (found, but not right), "not found" or "raises". The programs are
+    in `PROBE_PROGRAMS` of `backends`, and `tests/core/external/backend_probes.py` runs them. Defaults are the results
+    of a backend that accepts every convex program.
+
+    Parameters
+    ----------
+    version : str
+        Version of the backend with which the results were found.
+    triangle : str
+        Part of P that is used if P is not symmetric: "upper", "lower", "mean", "all", or "none" if P is rejected.
+    start : str
+        Arrays of a start that it uses; "" if it uses none.
+    repeated, contradictory, singular, convex_on_rows, saddle, unbounded : str
+        Verdicts.
+    infeasible_x : str
+        First entry of x after an infeasible program; "none" if no x is returned, "raises" after an exception.
+    linear_term : float or None
+        x2 with a small linear term and a singular P; None if a singular P is rejected.
+    small_part : float or None
+        x3 of two independent parts with linear terms of 3e6 and 1; 0.5 is right, None if it is not found.
+    fixed_multiplier : float
+        Multiplier of a variable with equal bounds; -1 is right.
+    smallest : float
+        Largest tested size of a solution that is not returned within 1 %; 0 without one.
+    far_bound : float
+        Size of inactive bounds at which it first fails; inf if it does not fail.
+    notes : mapping of str to str
+        Other observations: key of the probe -> sentence.
+    """
+
+    version: str
+    triangle: str = "upper"
+    start: str = ""
+    repeated: str = "right"
+    contradictory: str = "not found"
+    singular: str = "right"
+    convex_on_rows: str = "right"
+    saddle: str = "not found"
+    unbounded: str = "not found"
+    infeasible_x: str = "none"
+    linear_term: float | None = 1.0
+    small_part: float | None = 0.5
+    fixed_multiplier: float = -1.0
+    smallest: float = 0.0
+    far_bound: float = math.inf
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Backend:
     """Requirements and capabilities of a backend.
 
@@ -48,6 +101,8 @@ class Backend:
     install : str
         Packages that pip installs.
     summary, reference : str
+    behaviour : Behaviour or None
+        Observed behaviour; None for a backend that was not run.
     call : callable, optional
         Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     settings : mapping, optional
@@ -59,10 +114,6 @@ class Backend:
         Default limit of iterations.
     dense : bool
         Whether the backend accepts dense matrices only.
-    definite : bool
-        Whether the backend needs a positive definite P, as in the velocity form.
-    warm : bool
-        Whether the backend uses a start point.
     stoppable : bool
         Whether the backend accepts a time limit.
     finite : bool
@@ -83,19 +134,28 @@ class Backend:
     install: str
     summary: str
     reference: str
+    behaviour: Behaviour | None = None
     call: Call | None = None
     settings: Mapping[str, Any] | None = None
     min_tolerance: float = 0.0
     max_iter: int = 10_000
     dense: bool = False
-    definite: bool = False
-    warm: bool = False
     stoppable: bool = False
     finite: bool = False
     noisy: bool = False
     cones: bool = False
     interrupts: bool = False
     jax: bool = False
+
+    @property
+    def needs_definite(self) -> bool:
+        """Whether the backend needs a positive definite P, as in the velocity form."""
+        return self.behaviour is not None and self.behaviour.linear_term is None
+
+    @property
+    def uses_start(self) -> bool:
+        """Whether the backend uses a start point."""
+        return self.behaviour is not None and bool(self.behaviour.start)
 
     def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
         """Run the backend once, in this process."""

@@ -14,11 +14,17 @@ iterations nor their exit flags and certificates, and cannot warm-start them. Th
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from lavender.external import native
-from lavender.external.backend import Backend
+from lavender.external.backend import Backend, Behaviour
 from lavender.external.qp_solver import OPTION_HELP, QPSolver, explain_refusal
+from lavender.judge.solution import Status
+from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec
 
 #: Options of backends that qpsolvers calls: a str is a field of `Limits`, other values are fixed.
@@ -48,34 +54,69 @@ QPAX = {"solver_tol": "eps"}
 JAXOPT = {"tol": "eps", "maxiter": "max_iter"}
 SIP = {"eps_abs": "eps", "eps_rel": 0.0, "max_iterations": "max_iter", "time_limit": "time_limit"}
 
+CVXOPT_BEHAVIOUR = Behaviour(
+    "1.3.3", "lower", repeated="raises", contradictory="wrong", convex_on_rows="raises", saddle="right",
+    unbounded="wrong", infeasible_x="raises", far_bound=1e16, small_part=0.9, notes={
+    "infinite": "qpsolvers passes infinite bounds as 1e10. An unbounded program ends there as solved."},
+)  # fmt: skip
 ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic programs"
 BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
-            call=native.call_osqp, max_iter=100_000, warm=True, stoppable=True, interrupts=True),
+            call=native.call_osqp, max_iter=100_000, stoppable=True, interrupts=True,
+            behaviour=Behaviour("1.1.3", start="x and y", saddle="raises", infeasible_x="2143289344",
+                linear_term=4e-5, notes={
+                "memory": "An object keeps its step size of earlier solves, also with warm_starting=False.",
+                "kept_y": "A start x without y keeps y of the last solve."})),
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
-            "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True),
+            "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True,
+            behaviour=Behaviour("0.11.1", saddle="right", infeasible_x="0", far_bound=1e10, small_part=40.0)),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
-            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250),
+            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250,
+            behaviour=Behaviour("0.7.0", saddle="right", infeasible_x="0", far_bound=1e9, small_part=2.0, notes={
+                "unsorted": "If the indices of a sparse P are not sorted, a solvable program is not solved."})),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
-            "Bambade et al. 2022, ProxQP", settings=PROXIMAL, warm=True),
+            "Bambade et al. 2022, ProxQP", settings=PROXIMAL,
+            behaviour=Behaviour("0.8.0", start="x, y and z", singular="wrong", saddle="wrong", infeasible_x="0",
+                linear_term=0.1, notes={
+                "false_infeasible": "A solvable program with a singular P can be reported as primal infeasible.",
+                "dense_triangle": "It reads the lower triangle of a dense P.",
+                "crossed_bounds": "Bounds of a variable that exclude each other (lb > ub) are reported as solved."})),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
-            "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, warm=True, stoppable=True),
+            "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, stoppable=True,
+            behaviour=Behaviour("1.3.0", start="x and y", saddle="wrong", infeasible_x="0", linear_term=0.0,
+                smallest=1e-5)),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
-            call=native.call_daqp, dense=True, warm=True, stoppable=True),
+            call=native.call_daqp, dense=True, stoppable=True,
+            behaviour=Behaviour("0.11.0", "all", "x", contradictory="wrong", convex_on_rows="not found",
+                linear_term=0.03, notes={
+                "flag": "Contradictory equalities end with its exit flag -6, which qpsolvers reports as solved."})),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
-            call=native.call_highs, max_iter=100_000, stoppable=True),
+            call=native.call_highs, max_iter=100_000, stoppable=True,
+            behaviour=Behaviour("1.16.0", "lower", convex_on_rows="not found", infeasible_x="0", smallest=1e-4,
+                far_bound=1e15, notes={
+                "free_row": "A free row does not avoid the zeros below 1e-4; q and bounds multiplied by 1024 do."})),
     Backend("scs", ("scs",), "scs", "operator splitting, homogeneous embedding",
-            "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, warm=True, stoppable=True,
-            interrupts=True),
+            "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, stoppable=True,
+            interrupts=True,
+            behaviour=Behaviour("3.3.1", start="x, y and s", saddle="raises", infeasible_x="nan", linear_term=3e-5,
+                small_part=0.8, notes={
+                "start": "A solution as start ends the solve at once if x, y and s are given, not with fewer of them.",
+                "memory": "An object keeps its scale of earlier solves, also with warm_start=False."})),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",
-            "Goldfarb, Idnani 1983", dense=True, definite=True, finite=True),
+            "Goldfarb, Idnani 1983", dense=True, finite=True,
+            behaviour=Behaviour("0.1.14", singular="raises", convex_on_rows="raises", saddle="raises",
+                unbounded="raises", linear_term=None)),
     Backend("cvxopt", ("qpsolvers", "cvxopt"), "cvxopt", "interior point", "Vandenberghe 2010, CVXOPT",
-            settings=CVXOPT, max_iter=100, finite=True),
+            settings=CVXOPT, max_iter=100, finite=True,
+            behaviour=CVXOPT_BEHAVIOUR),
     Backend("kvxopt", ("qpsolvers", "kvxopt"), "kvxopt", "interior point, CVXOPT with more factorisations",
-            "Vandenberghe 2010, CVXOPT", settings=CVXOPT, max_iter=100),
+            "Vandenberghe 2010, CVXOPT", settings=CVXOPT, max_iter=100, finite=True,
+            behaviour=replace(CVXOPT_BEHAVIOUR, version="1.3.3.3")),
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
             "Domahidi, Chu, Boyd 2013, ECOS", settings=ECOS, max_iter=100,
-            dense=True, definite=True, finite=True, interrupts=True),
+            dense=True, finite=True, interrupts=True,
+            behaviour=Behaviour("2.0.14", "lower", singular="raises", convex_on_rows="raises", saddle="raises",
+                unbounded="raises", infeasible_x="0", linear_term=None, far_bound=1e4, small_part=None)),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
             settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
@@ -83,12 +124,18 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True,
             finite=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
-            settings=QTQP, max_iter=200, finite=True),
+            settings=QTQP, max_iter=200, finite=True,
+            behaviour=Behaviour("0.0.7", "none", repeated="not found", convex_on_rows="raises", saddle="raises",
+                infeasible_x="nan", far_bound=1e12, small_part=30.0)),
     Backend("pyqpmad", ("qpsolvers", "pyqpmad"), "pyqpmad", "dual active set, positive definite A",
-            "Goldfarb, Idnani 1983", settings=PYQPMAD, min_tolerance=1e-12, dense=True, definite=True),
+            "Goldfarb, Idnani 1983", settings=PYQPMAD, min_tolerance=1e-12, dense=True, finite=True,
+            behaviour=Behaviour("1.4.1", "lower", singular="not found", convex_on_rows="not found", linear_term=None,
+                fixed_multiplier=0.0, notes={"in_place": "It overwrites a P that is stored by columns."})),
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
             settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True, jax=True,
-            finite=True),
+            finite=True,
+            behaviour=Behaviour("0.1.4", "mean", contradictory="wrong", convex_on_rows="not found", saddle="right",
+                infeasible_x="0", linear_term=0.5, far_bound=1e3, small_part=None)),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
             settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
@@ -101,12 +148,148 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
             "Pandala, Ding, Park 2019, qpSWIFT", dense=True, finite=True),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual",
-            settings=SIP, max_iter=500, stoppable=True),
+            settings=SIP, max_iter=500, stoppable=True,
+            behaviour=Behaviour("0.0.2", "none", saddle="right", infeasible_x="0")),
     Backend("clarabel_cone", ("clarabel",), "clarabel",
             "interior point on the convex relaxation of friction, second-order cones",
             "Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
             call=native.call_clarabel, max_iter=200, stoppable=True, cones=True),
 )  # fmt: skip
+
+
+#: Programs of the probes, by the field of `Behaviour` that holds the result.
+PROBE_PROGRAMS = {
+    "repeated": "min |x|²/2 with the row 0.3 x1 + 0.7 x2 = 1 twice",
+    "contradictory": "min |x|²/2 with x1 + x2 = 1 and x1 + x2 = 2",
+    "unbounded": "min x1²/2 - x2 with x >= 0, which is unbounded",
+    "singular": "min x1²/2 - x2 with |x1| <= 5 and 0 <= x2 <= 1",
+    "convex_on_rows": "min x1²/2 - x2²/2 with x2 = 0.5",
+    "saddle": "min x1²/2 - x2²/2 with |x1| <= 1 and -1 <= x2 <= 2",
+    "linear_term": "min x1²/2 - 1e-7 x2 with 0 <= x <= 1",
+    "small_part": "two independent parts with linear terms of 3e6 and 1",
+    "smallest": "min |x|²/2 - e (x1 + 2 x2) with |x| <= 1",
+    "far_bound": "a program with the bounds |x| <= B, all inactive",
+    "fixed_multiplier": "min |x|²/2 with x1 = 1 as two equal bounds",
+    "infeasible_x": "x1 <= -1 and x1 >= 1",
+}
+VERDICT_PHRASES = {
+    "right": "is solved",
+    "wrong": "is reported as solved at a wrong point",
+    "not found": "is not solved",
+    "raises": "raises an exception",
+}
+TRIANGLE_SENTENCES = {
+    "upper": "Only the upper triangle of P is read.",
+    "lower": "Only the lower triangle of P is read.",
+    "mean": "The mean of both triangles of P is used.",
+    "all": "Both triangles of P are used, and an asymmetric P gives a wrong answer.",
+    "none": "An asymmetric P is rejected.",
+}
+#: What the adapter does about an observation, by field of `Behaviour`.
+ADAPTER_REMEDIES = {
+    "triangle": "Both triangles of P are passed equal in every bit, or the one that is read.",
+    "start": "These arrays are passed if a start is given.",
+    "linear_term": "Calls with smaller tolerances follow until the judge accepts the answer.",
+    "small_part": "Calls with smaller tolerances follow until the judge accepts the answer.",
+    "smallest": "Programs are scaled to numbers near 1.",
+    "far_bound": "Far bounds are left out, and are checked at the solution.",
+    "fixed_multiplier": "Bounds are passed as rows.",
+    "infeasible_x": "The start is returned, and the claim counts only with a certificate.",
+    "contradictory": "The judge contradicts such a claim.",
+    "unbounded": "The judge contradicts such a claim.",
+}
+
+
+def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
+    """Return a sentence for each field and each note of an observed behaviour."""
+    b = behaviour
+    sentences = {
+        "triangle": TRIANGLE_SENTENCES[b.triangle],
+        "start": f"A start is used: {b.start}." if b.start else "No start is used.",
+    }
+    for name in ("repeated", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle"):
+        sentences[name] = f"The program {PROBE_PROGRAMS[name]} {VERDICT_PHRASES[getattr(b, name)]}."
+    for name, symbol, right in (("linear_term", "x2", 1.0), ("small_part", "x3", 0.5)):
+        value = getattr(b, name)
+        result = "is not solved" if value is None else f"gives {symbol} = {value:g}; {right:g} is right"
+        sentences[name] = f"The program {PROBE_PROGRAMS[name]} {result}."
+    size, far, found = b.smallest, b.far_bound, {"none": "is None", "raises": "is lost by an exception"}
+    sentences["smallest"] = (
+        f"Solutions of about {size:g} and below are wrong."
+        if size
+        else "Solutions down to 1e-9 are returned within 1 %."
+    )
+    sentences["far_bound"] = (
+        f"Inactive bounds of {far:g} and above prevent a solution."
+        if far < math.inf
+        else "Inactive bounds up to 1e19 do no harm."
+    )
+    sentences["fixed_multiplier"] = f"A fixed variable with a multiplier of -1 has {b.fixed_multiplier:g}."
+    sentences["infeasible_x"] = (
+        f"After the rows {PROBE_PROGRAMS['infeasible_x']}, x {found.get(b.infeasible_x, 'holds ' + b.infeasible_x)}."
+    )
+    return sentences | dict(b.notes)
+
+
+def describe_backend(name: str) -> list[str]:
+    """Return sentences on the behaviour of the backend `name`, with what its adapter does about it."""
+    behaviour = _get_behaviour(name)
+    if behaviour is None:
+        return []
+    usual = Behaviour(behaviour.version)
+    return [
+        f"{text} {ADAPTER_REMEDIES[key]}"
+        if key in ADAPTER_REMEDIES and getattr(behaviour, key) != getattr(usual, key)
+        else text
+        for key, text in describe_behaviour(behaviour).items()
+    ]
+
+
+def explain_contradicted_claim(name: str, problem: Problem, status: Status) -> str:
+    """Return the observations on the backend `name` that fit a claim that the judge contradicts; "" without one.
+
+    Parameters
+    ----------
+    name : str
+        Name of a solver.
+    problem : Problem
+    status : Status
+        The claim.
+    """
+    behaviour = _get_behaviour(name)
+    if behaviour is None:
+        return ""
+    sentences = describe_behaviour(behaviour)
+    if status is Status.INFEASIBLE:
+        keys = ["false_infeasible" if "false_infeasible" in sentences else "infeasible_x"]
+    else:
+        bounds = np.abs(
+            [problem.cones.lower, problem.cones.upper] if problem.qp is None else problem.qp.target
+        )
+        far = bounds[np.isfinite(bounds)].max(initial=0.0)
+        is_affected = {
+            "far_bound": far >= behaviour.far_bound,
+            "linear_term": problem.has_singular_program and behaviour.linear_term != 1.0,
+            "unbounded": problem.has_singular_program and behaviour.unbounded == "wrong",
+            "contradictory": behaviour.contradictory == "wrong",
+            "small_part": behaviour.small_part != 0.5,
+            "smallest": behaviour.smallest > 0.0,
+        }
+        keys = [key for key, is_true in is_affected.items() if is_true][:2]
+    texts = " ".join(sentences[key] for key in keys)
+    return f"observed with {name} {behaviour.version}: {texts}" if texts else ""
+
+
+def get_observed_version(name: str) -> str:
+    """Return the version of the backend `name` with which its behaviour was observed; "" if it was not."""
+    behaviour = _get_behaviour(name)
+    return "" if behaviour is None else behaviour.version
+
+
+def _get_behaviour(name: str) -> Behaviour | None:
+    """Return the observed behaviour of a backend; `clarabel_cone` has the entry of `clarabel`."""
+    name = name.removesuffix("_cone")
+    return next((b.behaviour for b in BACKENDS if b.name == name), None)
 
 
 def _make_spec(backend: Backend) -> SolverSpec:
@@ -117,11 +300,11 @@ def _make_spec(backend: Backend) -> SolverSpec:
         laws=frozenset({"linear", "lcp", *(["cone"] if backend.cones else [])}),
         # Under the law "cone", friction boxes are written as one row for each edge of the cone, which makes A
         # singular.
-        box_friction_laws=frozenset() if backend.definite else frozenset({"cone"}),
+        box_friction_laws=frozenset() if backend.needs_definite else frozenset({"cone"}),
         resumable=False,
         external=True,
-        impulse=backend.warm,
-        singular_programs=not (backend.definite or backend.cones),
+        impulse=backend.uses_start,
+        singular_programs=not (backend.needs_definite or backend.cones),
         round_cones=backend.cones,
         supports_rolling=backend.cones,
         max_iter=backend.max_iter,

@@ -34,7 +34,7 @@ DAQP_OVERDETERMINED = -6  # Exit flag of DAQP if its first working set, the equa
 # [-] Added to the diagonal of P by HiGHS, in units of about 1, in the first and in each repeated call. A large value
 # changes the solution; with a small one, its active-set method ends at wrong points if P is singular.
 HIGHS_REGULARIZATION = 1e-10, 1e-12, 1e-8
-# [-] Factor of q, b and bounds passed to HiGHS, which rounds numbers below about 1e-4 to zero or fails with them.
+# [-] Factor of q, b and bounds passed to HiGHS, which returns solutions of about 1e-4 and below as exact zeros.
 HIGHS_SCALE = 1024.0
 # [-] HiGHS reports an unbounded program as optimal at a point of about the inverse of its regularisation. If the
 # product of both is larger than this, the regularisation determines the answer.
@@ -70,7 +70,6 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     set_backend_options(settings, extra, "clarabel")
     solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, rows.A, rows.b, cones, settings)
     result = solver.solve()
-    name = str(result.status)
     name = str(result.status)
     status = classify_status(name)
     x, (zeta, xi) = np.array(result.x), rows.split_multipliers(np.array(result.z))
@@ -173,7 +172,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     lp.col_lower_ = np.full(qp.n, -np.inf) if qp.lb is None else k * qp.lb
     lp.col_upper_ = np.full(qp.n, np.inf) if qp.ub is None else k * qp.ub
     if not len(qp.b):
-        # Without rows, HiGHS returns exact zeros for numbers below 1e-4; a row without bounds prevents it.
+        # Without rows and with the tolerances below, HiGHS returns small numbers as zeros even if scaled.
         rows, low, high = sp.csc_matrix(sp.eye_array(1, qp.n)), np.array([-np.inf]), np.array([np.inf])
     lp.num_row_, lp.row_lower_, lp.row_upper_ = len(low), k * low, k * high
     lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise

@@ -60,10 +60,10 @@ class QPSolver(Solver):
     def _build_program(self, problem: Problem, fix_far_rows: bool) -> QP:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
         b, qp = self.backend, None
-        form = choose_program_form(problem, self.form, b.definite)
+        form = choose_program_form(problem, self.form, b.needs_definite)
         if form != "impulse":
             qp = build_program(problem, form, fix_far_rows=fix_far_rows)
-        if qp is None or (b.definite and self.form == "auto" and not qp.is_definite):
+        if qp is None or (b.needs_definite and self.form == "auto" and not qp.is_definite):
             qp = build_program(
                 problem, "impulse", fix_far_rows=fix_far_rows, unit_diagonal=self.unit_diagonal
             )
@@ -72,7 +72,7 @@ class QPSolver(Solver):
                 f"solver {b.name!r} accepts dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
                 f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
-        return shift_to_definite(qp) if b.definite else qp
+        return shift_to_definite(qp) if b.needs_definite else qp
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def run(

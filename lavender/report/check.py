@@ -26,6 +26,7 @@ import numpy as np
 
 from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
+from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
@@ -393,7 +394,8 @@ def compare_with_reference(
     if breached:
         verdict = BREACH
     elif solution.claim_check == CONTRADICTED:
-        verdict, note = CLAIM_CONTRADICTED, f"{solution.status_conflict}; {note}".rstrip("; ")
+        known = explain_contradicted_claim(name, problem, solution.status)
+        verdict, note = CLAIM_CONTRADICTED, "; ".join(filter(None, (solution.status_conflict, known, note)))
     elif solution.claim_check == NOT_PROVEN:
         verdict = UNPROVED
     elif solution.status is Status.INFEASIBLE:

@@ -1,0 +1,112 @@
+"""Backends behave as the table of `lavender/external/backends.py` records, and the adapters as it promises."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from backend_probes import BEHAVIOUR_PROBES, NOTE_PROBES
+from backend_truth import TOL, call_here, draw_kind
+from calls import BACKENDS
+
+import lavender as lv
+from lavender.external import backends
+from lavender.report.check import compare_with_reference
+from lavender.solvers import registry
+
+OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
+N_DRAWS = 12  # Three programs of each kind; `python tests/backend_truth.py --kinds 200` draws more.
+
+
+def require(name):
+    """Skip a test if a backend, or qpsolvers, by which the probes call it, is not installed."""
+    pytest.importorskip("qpsolvers")
+    for module in OBSERVED[name].modules:
+        pytest.importorskip(module)
+
+
+def mark_slow(names):
+    """Mark backends in JAX, which compiles each of 40 programs for 1 s or more, as tests of the night."""
+    is_jax = {b.name: b.jax for b in backends.BACKENDS}
+    return [pytest.param(name, marks=[pytest.mark.nightly] * is_jax[name]) for name in names]
+
+
+@pytest.mark.parametrize("name", mark_slow(OBSERVED))
+def test_probe_of_the_installed_backend_gives_the_recorded_behaviour(name):
+    require(name)
+    behaviour = OBSERVED[name].behaviour
+    found = {field: probe(name) for field, probe in BEHAVIOUR_PROBES.items()}
+    assert found == {field: getattr(behaviour, field) for field in BEHAVIOUR_PROBES}
+
+
+@pytest.mark.parametrize(("name", "key"), NOTE_PROBES)
+def test_note_of_the_installed_backend_still_holds(name, key):
+    require(name)
+    assert NOTE_PROBES[name, key](), OBSERVED[name].behaviour.notes[key]
+
+
+def test_every_note_has_a_probe():
+    assert set(NOTE_PROBES) == {(b.name, key) for b in OBSERVED.values() for key in b.behaviour.notes}
+
+
+@pytest.mark.parametrize("name", mark_slow(BACKENDS))
+def test_program_without_a_solution_is_no_success(name):
+    P, rows = np.diag([1.0, 0.0]), np.ones((2, 2))
+    programs = (
+        lv.Problem.from_qp(np.eye(2), np.zeros(2), A=rows, b=[1.0, 2.0]),
+        lv.Problem.from_qp(P, [0.0, -1.0], lb=[0.0, 0.0], ub=[np.inf, np.inf]),
+    )
+    for problem in programs:
+        if registry.get(name).refuses(problem) is None:
+            assert not lv.solve(problem, name).success
+
+
+@pytest.mark.parametrize("name", mark_slow(BACKENDS))
+def test_active_bounds_of_a_program_have_multipliers(name):
+    """pyqpmad returns zeros for multipliers of bounds."""
+    problem = lv.Problem.from_qp([[2.0, 0.5], [0.5, 1.0]], [0.0, 1.0], lb=[1.0, -2.0], ub=[1.0, 2.0])
+    if registry.get(name).refuses(problem) is not None:
+        pytest.skip(f"{name} does not accept programs")
+    answer = lv.solve_qp(problem, name, tol=1e-6)
+    assert answer.found
+    np.testing.assert_allclose(answer.z_box, [-1.25, 0.0], atol=1e-5)  # of a relative residual of 1e-6
+
+
+@pytest.mark.parametrize("name", mark_slow(BACKENDS))
+def test_contradicted_claim_is_wrong_by_the_kkt_conditions_and_quotes_the_table(name):
+    for seed in range(N_DRAWS):
+        kind, program = draw_kind(seed)
+        try:
+            error, solution = call_here(program, name, False)
+        except lv.CapabilityError:
+            continue
+        if solution.is_contradicted:
+            quoted = backends.explain_contradicted_claim(name, solution.problem, solution.status)
+            assert error > TOL, f"{seed}, {kind}: {solution}"
+            assert OBSERVED[name].behaviour.version in quoted
+
+
+def test_explanation_of_a_contradicted_claim_quotes_the_entry_that_fits():
+    singular = lv.Problem.from_qp(np.diag([1.0, 0.0]), [0.0, -1.0], lb=[0.0, 0.0], ub=[1.0, 1.0])
+    explain = backends.explain_contradicted_claim
+    assert "gives x2 = 0.03; 1 is right" in explain("daqp", singular, lv.Status.CONVERGED)
+    assert "primal infeasible" in explain("proxqp", singular, lv.Status.INFEASIBLE)
+    far = lv.Problem.from_qp(np.eye(2), [-1.0, -1.0], lb=[-1e12, -1e12], ub=[1e12, 1e12])
+    assert "Inactive bounds of 1e+09" in explain("piqp", far, lv.Status.CONVERGED)
+    assert explain("newton", singular, lv.Status.CONVERGED) == ""
+
+
+def test_description_of_a_backend_has_its_observations_and_what_its_adapter_does():
+    sentences = backends.describe_backend("highs")
+    assert any("1e+15" in s and "left out" in s for s in sentences)
+    assert backends.describe_backend("clarabel_cone") == backends.describe_backend("clarabel")
+    assert backends.describe_backend("gurobi") == []
+
+
+def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
+    problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [0.0, -1e-7], lb=[0.0, 0.0], ub=[1.0, 1.0])
+    solution = lv.solve(problem, "auto", max_iter=0)
+    contradicted = replace(
+        solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x"
+    )
+    row = compare_with_reference(problem, "daqp", contradicted, None)
+    assert "observed with daqp" in row.note and "x2 = 0.03" in row.note
