@@ -15,6 +15,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 
@@ -92,9 +93,8 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         counted[f"{label}, stages"] = math.fsum(
             min(stage.iterations, 1e9) * (1 + i) for i, stage in enumerate(lv.explain(problem).stages)
         )
-        halving = DecisionTree(problem)
-        halving.best, total = 1.0, 0.0
-        for stage in halving:
+        halving, total = SimpleNamespace(best=1.0), 0.0
+        for stage in DecisionTree(problem, log=halving):
             halving.best *= 0.5
             total += min(stage.cost, 1e12)
         counted[f"{label}, all stages"] = total

@@ -63,6 +63,10 @@ class Deadline:
         """Return whether a step of `step` seconds that starts now would end after the deadline."""
         return self._end < math.inf and perf_counter() + step >= self._end
 
+    def fits(self, cost: float) -> bool:
+        """Return whether a step of this estimated cost [ns] that starts now ends before the deadline."""
+        return not self.has_passed(1e-9 * cost)
+
     def get_remaining_nanoseconds(self) -> float:
         """Return the remaining time [ns], the unit of estimated costs; inf without a limit."""
         return 1e9 * (self._end - perf_counter())

@@ -182,7 +182,7 @@ def certify_by_least_violation(log: Any) -> None:
             rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
         )  # Set rows of J with negligible entries to zero.
         kernel = general.prepare_islands(soft)
-        if kernel is None or log.ends_after_deadline(RATES["linear program"]):
+        if kernel is None or not log.deadline.fits(RATES["linear program"]):
             return
         before, lam = lam, lam.copy()
         steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
@@ -223,14 +223,13 @@ def certify_infeasibility(log: Any) -> None:
 def certify_by_linear_programs(log: Any) -> None:
     """Search for a certificate by linear programs, one for each unsolved island without upper bounds."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_after_deadline(
-        RATES["linear program"] + estimate_import_cost("scipy.optimize")
-    ):
+    cost = RATES["linear program"] + estimate_import_cost("scipy.optimize")
+    if log.best < 1e-6 or not log.deadline.fits(cost):
         return
     total_rows = 0
     for part, rows in _list_unsolved_islands(log):
         total_rows += part.m
-        if total_rows > CERTIFICATE_ROWS or log.ends_after_deadline(RATES["linear program"]):
+        if total_rows > CERTIFICATE_ROWS or not log.deadline.fits(RATES["linear program"]):
             return
         if not _has_simple_bounds(part):
             continue

@@ -35,10 +35,11 @@ the stages that would run. The decisions depend on these numbers (`decisions.py`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from math import inf, log, nan
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,6 @@ from lavender.solvers.small import (
     AUTO,
     NO_TIME_MESSAGE,
     NO_WORK_MESSAGES,
-    SmallCall,
     describe_stages,
     get_call_time_fraction,
 )
@@ -105,34 +105,41 @@ MAX_ALTERNATIONS = 12
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200
-NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
+MIN_PREDICTED_RESIDUAL = (
+    1e-16  # Predictions of remaining sweeps replace a smaller tol by this relative residual.
+)
+ITERATION_TIME_PER_COST = (
+    4e-9  # [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
+)
+FIRST_SWEEPS_OF_LARGE_PROBLEM = (
+    8  # Sweeps of `is_large` problems before the first prediction of how many remain.
+)
+FIRST_RELAXED_FACTORISATIONS = (
+    6  # Interior points on the relaxation need at least this number of factorisations.
+)
+# Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
+RELAXED_TOLERANCE = 0.01
+FORMATION_COST_RATIO = (
+    4.0  # Sweeps use a formed A only if at least this multiple of the cost to form it remains.
+)
+MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
+SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
 #: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
-    "nncg": ("nncg", NNCG_OPTIONS),
+    "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
     "admm": ("admm", {}),
     # On large piles, `admm` needs fewer iterations from zero than from an iterate of sweeps.
     "admm from zero": ("admm", {}),
     "newton on the relaxation": ("newton", {}),
 }
-# Predictions of remaining sweeps replace a smaller tol by this relative residual.
-MIN_PREDICTED_RESIDUAL = 1e-16
-# [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
-ITERATION_TIME_PER_COST = 4e-9
-# Sweeps over large problems with friction before the first prediction of how many remain.
-FIRST_SWEEPS_OF_LARGE_PROBLEM = 8
-# Interior points on the relaxation need at least this number of factorisations.
-FIRST_RELAXED_FACTORISATIONS = 6
-# Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
-RELAXED_TOLERANCE = 0.01
-# Sweeps use a formed A only if at least this multiple of the cost to form it remains.
-FORMATION_COST_RATIO = 4.0
-MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
-SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
+RELAXATION_KEY = (
+    "lavender.solving.auto: relaxation"  # Key in `Derived.cache` of the problem's convex relaxation.
+)
 
 
 def make_solver(name: str, problem: Problem) -> Any:
@@ -148,9 +155,9 @@ def make_solver(name: str, problem: Problem) -> Any:
     return get(solver).load()(**options)
 
 
-def estimate_cost(name: str, problem: Problem, state: Any = None) -> Cost:
+def estimate_cost(name: str, problem: Problem) -> Cost:
     """Estimate the costs of the solver of a step."""
-    cost: Cost = make_solver(name, problem).cost(problem, state)
+    cost: Cost = make_solver(name, problem).cost(problem)
     return cost
 
 
@@ -158,10 +165,6 @@ def starts_relaxed(problem: Problem) -> bool:
     """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large."""
     large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
     return large and not problem.cones.has_round and problem.is_symmetric
-
-
-# Key in `Derived.cache` of the problem's convex relaxation.
-RELAXATION_KEY = "lavender.solving.auto: relaxation"
 
 
 def get_relaxation(problem: Problem) -> Problem:
@@ -175,24 +178,24 @@ def get_relaxation(problem: Problem) -> Problem:
     return relaxed
 
 
+# -- the log of one solve --------------------------------------------------------------------------
+
+
 class SolveLog:
-    """Stages that ran on a problem, their work, and the best impulse."""
+    """Stages that ran on a problem, their work, the best impulse and the deadline."""
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
         self.remark = ""  # Message of the solve of some islands.
-        # A stage was left out or ended early, because the remaining time was too short.
-        self.timed_out = False
-        # Smallest relative residual, and the impulse (m,) [N s] with this residual.
-        self.best, self.impulse = (
-            np.inf,
-            problem._start,
+        self.timed_out = (
+            False  # A stage was left out or ended early, because the remaining time was too short.
         )
+        # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
+        self.best, self.impulse, self.judged = inf, problem._start, None
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
-        self.judged: Any = None  # Result of the judge for `impulse`, if it was judged.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
@@ -240,38 +243,39 @@ class SolveLog:
 
     def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""
-        self.iterations += claim.iterations
-        self.work = sum_work_counts((self.work, claim.work))
-        self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
-        if claim.certificate is not None:
-            if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
-                self.certificate = claim.certificate
-            else:
-                self.direction = claim.certificate
-        if claim.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
+        stage = SolverStage(name, dict(claim.work), before, self.best)
+        is_proof = (
+            claim.certificate is not None
+            and check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None
+        )
+        self._add_claim(claim, (stage,), claim.certificate, is_proof)
 
     def record_part(self, claim: Claim, rows: IntArray) -> None:
         """Record the claim of a solve of some islands, with these row numbers."""
-        self.iterations += claim.iterations
-        self.work = sum_work_counts((self.work, claim.work))
-        self.stages += claim.stages
         remark = claim.message.removeprefix(describe_stages(claim.stages)).removeprefix("; ")
         if claim.status is Status.NUMERICAL_ERROR:
             self.failure = remark
         elif claim.stages:
             self.remark = remark
+        direction = None
         if claim.certificate is not None:
             direction = np.zeros(self.problem.m)
             direction[rows] = claim.certificate
-            if claim.status is Status.INFEASIBLE:
-                self.certificate = direction
-            else:
-                self.direction = direction
+        self._add_claim(claim, claim.stages, direction, claim.status is Status.INFEASIBLE)
+
+    def _add_claim(
+        self, claim: Claim, stages: Iterable[SolverStage], direction: FloatArray | None, is_proof: bool
+    ) -> None:
+        """Add the work, the stages and the direction (m,) of a claim."""
+        self.iterations += claim.iterations
+        self.work = sum_work_counts((self.work, claim.work))
+        self.stages += stages
+        if is_proof:
+            self.certificate = direction
+        elif direction is not None:
+            self.direction = direction
         if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-
-    # -- the end ---------------------------------------------------------------------------------
 
     @property
     def remaining_iterations(self) -> int:
@@ -282,10 +286,6 @@ class SolveLog:
     def time_left(self) -> float | None:
         """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
         return self.deadline.get_remaining_seconds(1e-5)
-
-    def ends_after_deadline(self, cost: float) -> bool:
-        """Return whether a step of this estimated cost [ns] would end after the deadline."""
-        return self.deadline.has_passed(1e-9 * cost)
 
     @property
     def last_stage_failed(self) -> bool:
@@ -325,39 +325,34 @@ class SolveLog:
             status = Status.TIME_LIMIT
         no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
         no_work = NO_WORK_MESSAGES.get(status, no_work)
-        message = describe_stages(self.stages) or ("" if self.failure else no_work)
+        messages = [
+            describe_stages(self.stages) or ("" if self.failure else no_work),
+            self.failure,
+            self.remark,
+        ]
+        if self.conflict is not None and self.best > self.tol:
+            if self.certificate is None:
+                messages.append("of the convex relaxation, " + self.conflict.proof.message)
+            messages.append(self.conflict.advice)
         return Claim(
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
-            "; ".join(
-                filter(None, (message, self.failure, self.remark, *self._describe_conflict_in_relaxation()))
-            ),
+            "; ".join(filter(None, messages)),
             certificate=self.direction if self.certificate is None else self.certificate,
             stages=tuple(self.stages),
             judged=self.judged,
         )
 
-    def _describe_conflict_in_relaxation(self) -> list[str]:
-        """Return messages about the conflict in the relaxation and the recommended compliance, if it is unsolved."""
-        if self.conflict is None or self.best <= self.tol:
-            return []
-        messages = []
-        if self.certificate is None:
-            messages = ["of the convex relaxation, " + self.conflict.proof.message]
-        return [*messages, self.conflict.advice]
-
 
 @dataclass
 class Recorder:
-    """Writes the records of one solve by `auto`.
+    """Writes the history of one solve: the residual after each recorded iteration of each stage.
 
-    Parameters
-    ----------
-    solve : Loop
-        The loop of the solve, which holds the records, their solvers and the time of recording.
-    watch : Stopwatch
-        Time since the beginning of the solve.
+    A stage of sweeps or of another resumable solver is recorded after 1, 2, ..., 16 iterations of the stage, and then
+    each time after an eighth more. Newton's method and `direct` are recorded at the end of their stage. The compiled
+    call is repeated with smaller limits of its estimated cost, since it returns the iterate at the limit. `solve` is
+    the loop of the solve, which holds the records. Recording does not change the result.
     """
 
     solve: Loop
@@ -366,7 +361,8 @@ class Recorder:
     @property
     def records(self) -> list[Record]:
         """The records so far."""
-        return self.solve.records or []
+        assert self.solve.records is not None
+        return self.solve.records
 
     @property
     def time(self) -> float:
@@ -375,18 +371,16 @@ class Recorder:
 
     def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
         """Append the records with more iterations than the last one."""
-        assert self.solve.records is not None
         for record in records:
-            if not self.solve.records or record[0] > self.solve.records[-1][0]:
-                self.solve.records.append(record)
+            if not self.records or record[0] > self.records[-1][0]:
+                self.records.append(record)
                 self.solve.record_solvers.append(solver)
 
     def record_impulse(
         self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
     ) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
-        time = self.time if time is None else time
-        watch = Stopwatch()
+        time, watch = self.time if time is None else time, Stopwatch()
         r = residual(self.solve.problem, impulse, "float64")
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
         self.solve.recording_time += watch.elapsed_seconds
@@ -394,27 +388,22 @@ class Recorder:
     def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
         """Append the records of a loop that began at this number of iterations and this time [s]."""
         self.solve.recording_time += loop.recording_time
-        self.append_later_records(
-            solver, [(iterations + r[0], time + r[1], *r[2:]) for r in loop.records or ()]
-        )
+        records = loop.records or ()
+        self.append_later_records(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records])
 
-    def finish(self, claim: Claim, impulse: FloatArray) -> None:
-        """Record the result, an impulse (m,) [N s], unless its number of iterations is recorded already."""
-        self.record_impulse(claim.stages[-1].solver if claim.stages else "start", claim.iterations, impulse)
-
-    def record_compiled_call(self, call: SmallCall, start: FloatArray, tol: float, claim: Claim) -> None:
+    def record_compiled_call(self, start: FloatArray, tol: float, claim: Claim) -> None:
         """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
         call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
         problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
         before = self.solve.recording_time
         while claim.iterations > self.records[-1][0]:
             watch = Stopwatch()
-            result, counts = call.solve_and_judge(problem, start, tol, cost)
+            result, counts = AUTO.solve_and_judge(problem, start, tol, cost)
             seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
             if result is not None:
-                part = call.make_claim(problem, counts, start, result.relative)
+                part = AUTO.make_claim(problem, counts, start, result.relative)
                 if part.iterations <= claim.iterations:
-                    name = part.stages[-1].solver if part.stages else call.name
+                    name = part.stages[-1].solver if part.stages else "auto"
                     self.record_impulse(name, part.iterations, result.impulse, seconds)
                 if result.relative <= tol:
                     break
@@ -422,15 +411,18 @@ class Recorder:
         self.solve.recording_time = before + excluded.elapsed_seconds
 
 
+# -- the steps of the stages -----------------------------------------------------------------------
+
+
 class Step:
-    """A solver that runs on the problem of a log.
+    """A solver that runs on the problem of a log in turns, each of which continues where the last one stopped.
 
     `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
     more than `least` iterations are still needed.
     """
 
-    over = late = slips = False
-    least = np.inf
+    over = late = False
+    least = inf
     state: Any = None
     impulse: FloatArray  # Present iterate (m,) [N s].
 
@@ -443,6 +435,7 @@ class Step:
         log, before = self.log, self.log.best
         try:
             claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, MAX_CALL_ITERATIONS)))
+            self.record_history(claim)
         except BREAKDOWN as error:
             log.failure, self.over = format_error(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
@@ -458,10 +451,9 @@ class Step:
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
         claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
         self.store_iterate_in_log(claim.judged)
-        self.record_iterate(claim)
         return claim
 
-    def record_iterate(self, claim: Claim) -> None:
+    def record_history(self, claim: Claim) -> None:
         """Record the iterate at the end of a stage, if a history is requested."""
         log = self.log
         if log.recorder is not None:
@@ -502,132 +494,7 @@ class Newton(Step):
         )
         self.has_stalled = claim.status is Status.STALLED
         self.store_iterate_in_log(claim.judged)
-        self.record_iterate(claim)
         return claim
-
-
-class Iterations(Step):
-    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
-
-    time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
-
-    def advance(self, n: int) -> Claim:
-        """Run at most n iterations and offer the last and the best iterate to the log."""
-        log, left = self.log, self.log.deadline.get_remaining_seconds()
-        if self.state is None:
-            self.prepare_and_set_start()
-        loop = Loop(
-            problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
-            deadline=None if left is None else log.deadline if self.time_fraction == 1.0
-            else Deadline(self.time_fraction * left),
-            pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
-            records=None if log.recorder is None else [],
-        )  # fmt: skip
-        begun = 0.0 if log.recorder is None else log.recorder.time
-        claim = self.run_loop_iterations(loop, n)
-        if log.recorder is not None:
-            log.recorder.append_loop_records(self.name, log.iterations, begun, loop)
-        self.store_iterate_in_log()
-        if log.best > log.tol:
-            best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]
-            if impulse is not None and best < log.best:
-                log.judge_and_store_best(impulse)
-        return claim
-
-    def prepare_and_set_start(self) -> None:
-        """Prepare the solver and start from the best impulse of the log, or from zero."""
-        start = self.log.problem._start if self.name == "admm from zero" else self.log.impulse
-        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
-
-    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
-        """Run at most n iterations."""
-        return loop.run_chunks(n)
-
-
-class Sweeps(Iterations):
-    """Sweeps that stop if more than `least` remaining sweeps are predicted.
-
-    With a time limit, they use a part of the remaining time, or all of it in `auto.sweep_until_deadline`.
-    """
-
-    time_fraction = DECISIONS.time_share
-    predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
-    n_islands = 0  # Number of islands; 0 if it is not known.
-
-    @property
-    def is_large(self) -> bool:
-        """Whether `auto` solves the convex relaxation of the problem first."""
-        return starts_relaxed(self.log.problem)
-
-    def advance(self, n: int) -> Claim:
-        """Run at most n sweeps, offer the result to the log, and predict how many remain."""
-        before = self.log.best
-        claim = super().advance(n)
-        now, tol = self.log.best, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
-        if now > tol:
-            gain = log(before / now) if now < before else 0.0
-            self.predicted = claim.iterations * log(now / tol) / gain if gain > 0.0 else np.inf
-        return claim
-
-    def prepare_and_set_start(self) -> None:
-        """Prepare the sweeps; start from the best impulse."""
-        p, deadline = self.log.problem, self.log.deadline
-        too_late = deadline.has_passed(1e-9 * get_loose_limit(p)) and deadline.has_passed(
-            1e-9 * FORMATION_COST_RATIO * estimate_formation_cost(p)
-        )
-        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
-        self.impulse = self.log.impulse.copy()
-
-    def run_loop_iterations(self, loop: Loop, n: int) -> Claim:
-        """Run at most n sweeps; predict how many remain at intervals."""
-        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
-        growth = 1.0 if self.is_large else 0.5
-        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
-        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
-            loop.tol = 0.0
-            claim = loop.run_chunks(min(n, first))
-            if claim.status is not Status.MAX_ITERATIONS:
-                return claim
-            loop.tol = self.log.tol
-        now = self.log.best
-        while True:
-            step = n - due
-            if self.least < np.inf:
-                step = min(step, max(int(growth * (done + due)), 1 if done else first))
-            due += step
-            claim = loop.run_chunks(due)
-            if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
-                return replace(claim, status=Status.MAX_ITERATIONS)
-            if claim.status is not Status.MAX_ITERATIONS or due == n:
-                return claim
-            before, now = now, self.measure_progress()
-            if self.has_solved_half():
-                return claim
-            gain = log(before / now) if 0.0 < now < before else 0.0
-            self.predicted = step * log(now / tol) / gain if now > tol and gain > 0.0 else np.inf
-            if now <= tol or self.is_hopeless(self.least):
-                return claim
-
-    def is_hopeless(self, max_remaining: float) -> bool:
-        """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
-        done = 0.0 if self.state is None else self.state.watch.total
-        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
-        return self.predicted > max_remaining and not is_early
-
-    def measure_progress(self) -> float:
-        """Return the smallest relative residual so far."""
-        if self.is_large:
-            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
-        self.store_iterate_in_log()
-        return self.log.best
-
-    def has_solved_half(self) -> bool:
-        """Return whether at least half of the blocks of a large problem belong to solved islands."""
-        if not self.is_large or self.n_islands == 1:
-            return False
-        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
-        self.n_islands = len(table)
-        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
 
 
 class RelaxedNewton(Step):
@@ -655,11 +522,149 @@ class RelaxedNewton(Step):
                 break
             system.solve.write_interior_impulse(trial)
             log.judge_and_store_best(trial)
-            self.slips = log.compare_with_relaxation(trial) < DECISIONS.slip_ratio
-            if log.best <= log.tol or self.slips:
+            if log.best <= log.tol or log.compare_with_relaxation(trial) < DECISIONS.slip_ratio:
                 break
-        self.record_iterate(claim)
         return replace(claim, iterations=done, work=work)
+
+
+class Iterations(Step):
+    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
+
+    time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the last and the best iterate to the log."""
+        log, left = self.log, self.log.deadline.get_remaining_seconds()
+        if self.state is None:
+            self.prepare_and_set_start()
+        deadline = None
+        if left is not None:
+            deadline = log.deadline if self.time_fraction == 1.0 else Deadline(self.time_fraction * left)
+        loop = Loop(
+            problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
+            deadline=deadline, records=None if log.recorder is None else [],
+            pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
+        )  # fmt: skip
+        begun = 0.0 if log.recorder is None else log.recorder.time
+        claim = self.run_loop(loop, n)
+        if log.recorder is not None:
+            log.recorder.append_loop_records(self.name, log.iterations, begun, loop)
+        self.store_iterate_in_log()
+        if log.best > log.tol:
+            best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]
+            if impulse is not None and best < log.best:
+                log.judge_and_store_best(impulse)
+        return claim
+
+    def record_history(self, claim: Claim) -> None:
+        """Do nothing: the loop has made the records."""
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the solver and start from the best impulse of the log, or from zero."""
+        start = self.log.problem._start if self.name == "admm from zero" else self.log.impulse
+        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
+
+    def run_loop(self, loop: Loop, n: int) -> Claim:
+        """Run at most n iterations."""
+        return loop.run_chunks(n)
+
+
+class Sweeps(Iterations):
+    """Sweeps that stop if more than `least` remaining sweeps are predicted.
+
+    With a time limit, they use a part of the remaining time, or all of it in `sweep_until_deadline`.
+    """
+
+    time_fraction = DECISIONS.time_share
+    predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
+    n_islands = 0  # Number of islands; 0 if it is not known.
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        super().__init__(name, log)
+        self.is_large = starts_relaxed(log.problem)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n sweeps, offer the result to the log, and predict how many remain."""
+        before = self.log.best
+        claim = super().advance(n)
+        self.predict(claim.iterations, before, self.log.best)
+        return claim
+
+    def predict(self, sweeps: int, before: float, now: float) -> None:
+        """Predict the number of remaining sweeps from the last ones and the residuals before and after them."""
+        tol = max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if now > tol:
+            gain = math.log(before / now) if now < before else 0.0
+            self.predicted = sweeps * math.log(now / tol) / gain if gain > 0.0 else inf
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the sweeps; start from the best impulse."""
+        p, deadline = self.log.problem, self.log.deadline
+        too_late = not deadline.fits(get_loose_limit(p)) and not deadline.fits(
+            FORMATION_COST_RATIO * estimate_formation_cost(p)
+        )
+        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
+        self.impulse = self.log.impulse.copy()
+
+    def run_loop(self, loop: Loop, n: int) -> Claim:
+        """Run at most n sweeps; predict how many remain at intervals."""
+        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
+        growth = 1.0 if self.is_large else 0.5
+        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
+            loop.tol = 0.0
+            claim = loop.run_chunks(min(n, first))
+            if claim.status is not Status.MAX_ITERATIONS:
+                return claim
+            loop.tol = self.log.tol
+        now = self.log.best
+        while True:
+            step = n - due
+            if self.least < inf:
+                step = min(step, max(int(growth * (done + due)), 1 if done else first))
+            due += step
+            claim = loop.run_chunks(due)
+            if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
+                return replace(claim, status=Status.MAX_ITERATIONS)
+            if claim.status is not Status.MAX_ITERATIONS or due == n:
+                return claim
+            before, now = now, self.measure_progress()
+            if self.has_solved_half():
+                return claim
+            self.predicted = inf
+            self.predict(step, before, now)
+            if now <= tol or self.is_hopeless(self.least):
+                return claim
+
+    def is_hopeless(self, max_remaining: float) -> bool:
+        """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
+        done = 0.0 if self.state is None else self.state.watch.total
+        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        return self.predicted > max_remaining and not is_early
+
+    def measure_progress(self) -> float:
+        """Return the smallest relative residual so far."""
+        if self.is_large:
+            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
+        self.store_iterate_in_log()
+        return self.log.best
+
+    def has_solved_half(self) -> bool:
+        """Return whether at least half of the blocks of a large problem belong to solved islands."""
+        if not self.is_large or self.n_islands == 1:
+            return False
+        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
+        self.n_islands = len(table)
+        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
+
+
+STEPS = {
+    "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
+    "newton on the relaxation": RelaxedNewton,
+}  # fmt: skip
+
+
+# -- the decisions ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -690,22 +695,41 @@ class Stage:
     position: int = 0
 
 
+@dataclass(eq=False)
 class DecisionTree:
     """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
 
-    The caller sets `best` to the smallest relative residual so far, and adds the cost of stages that it skips to
-    `remaining_cost`.
+    Parameters
+    ----------
+    problem : Problem
+    deadline : Deadline
+    log : SolveLog, optional
+        Its `best` is the smallest relative residual so far; None if no stage runs.
+    first_stage : int
+        Position of the first stage; earlier ones have run on a problem with more islands.
+    compiled_call_failed : bool
+        Whether the compiled call over velocities of J and M has failed.
+    started_from_zero : bool
+        Whether that call started from the zero impulse.
     """
 
+    problem: Problem
+    deadline: Deadline = NEVER
+    log: Any = None
+    first_stage: int = 1
+    compiled_call_failed: bool = False
+    started_from_zero: bool = False
     remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
-    compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
-    started_from_zero = False  # Whether the compiled call started from the zero impulse.
     sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
-    first_stage = 1  # Position of the first stage; earlier ones have run on a problem with more islands.
-    best = nan
 
-    def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
-        self.problem, self.law, self.deadline = problem, problem.law, deadline
+    @property
+    def best(self) -> float:
+        """Smallest relative residual so far; NaN if no stage runs."""
+        return nan if self.log is None else float(self.log.best)
+
+    def skip(self, stage: Stage) -> None:
+        """Return the cost of a stage that does not run to the alternation."""
+        self.remaining_cost += stage.cost
 
     @cached_property
     def sweep(self) -> float:
@@ -754,10 +778,10 @@ class DecisionTree:
         p, states = self.problem, self.states
         if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
             return False
-        if self.deadline.is_set:
-            cost = estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
-            if self.deadline.has_passed(1e-9 * cost):
-                return False
+        if self.deadline.is_set and not self.deadline.fits(
+            estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
+        ):
+            return False
         self.states = states | self.prepare_newton("newton over rows")  # pyright: ignore[reportAttributeAccessIssue]
         return len(self.states) > len(states)  # pyright: ignore[reportArgumentType]
 
@@ -777,14 +801,20 @@ class DecisionTree:
         if self.law == "linear" and self.problem.rows is not None:
             max_cost = self.min_newton_cost
         elif self.law == "lcp":
-            max_cost = DECISIONS.first_sweeps * self.sweep
+            max_cost = self.first
         else:
             return False
-        if self.formation > max_cost:
-            return False
-        return not (
-            self.deadline.is_set and self.deadline.has_passed(1e-9 * self.formation / DECISIONS.time_share)
-        )
+        return self.formation <= max_cost and self.deadline.fits(self.formation / DECISIONS.time_share)
+
+    @property
+    def law(self) -> str:
+        """Law of the problem."""
+        return self.problem.law
+
+    @cached_property
+    def first(self) -> float:
+        """Cost of the first sweeps [ns]."""
+        return DECISIONS.first_sweeps * self.sweep
 
     @cached_property
     def formation(self) -> float:
@@ -802,6 +832,13 @@ class DecisionTree:
         return min(self.solver_costs.values(), default=inf)
 
     @property
+    def unit(self) -> float:
+        """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
+        return self.newton if self.newton < inf else self.first
+
+    # -- time limits: no stage of a factorising solver starts if it is expected to end after the deadline
+
+    @property
     def is_late(self) -> bool:
         """Whether no factorising solver can return a result before the deadline."""
         return not self.has_time_for_newton()
@@ -809,7 +846,7 @@ class DecisionTree:
     def has_time_for_newton(self, before: float = 0.0) -> bool:
         """Return whether the least cost of Newton's method fits after `before` [ns]."""
         needed = before + 2.0 * get_loose_limit(self.problem)
-        if self.problem.generalized is None and not self.deadline.has_passed(1e-9 * needed):
+        if self.problem.generalized is None and self.deadline.fits(needed):
             return True  # The least cost of bodies and matrices is below the loose limit.
         return self.has_time("newton", self.min_newton_cost, before)
 
@@ -819,10 +856,33 @@ class DecisionTree:
             return True
         needed = before + cost
         if name == "newton" and "states" in vars(self):
-            return not self.deadline.has_passed(1e-9 * needed)
-        if not self.deadline.has_passed(1e-9 * (get_loose_limit(self.problem) + needed)):
+            return self.deadline.fits(needed)
+        return self.deadline.fits(get_loose_limit(self.problem) + needed) or self.deadline.fits(
+            estimate_cost(name, self.problem).setup + needed
+        )
+
+    def has_time_to_factorise_after(self, steps: dict[str, Step], cost: float) -> bool:
+        """Return whether work of this cost [ns] leaves time for a factorising solver, or all of them have ended."""
+        if "states" not in vars(self):
+            return self.has_time_for_newton(cost)
+        unfinished = [name for name in self.states if name not in steps or not steps[name].over]
+        if self.states and not unfinished and not any(steps[name].late for name in self.states):
             return True
-        return not self.deadline.has_passed(1e-9 * (estimate_cost(name, self.problem).setup + needed))
+        return bool(unfinished) and self.has_time("newton", self.newton, cost)
+
+    def leaves_time(self, stage: Stage, step: Step) -> bool:
+        """Return whether a stage of any solver but sweeps can end before the deadline."""
+        if isinstance(step, RelaxedNewton):
+            return self.has_time("newton", stage.cost)
+        if isinstance(step, Newton):
+            return self.has_time("newton", self.states[stage.solver].cost)
+        if step.name == "direct":
+            return self.has_time("direct", self.direct if self.can_pivot else stage.cost)
+        if step.state is not None:
+            return True
+        return self.deadline.fits(estimate_cost(stage.solver, self.problem).setup / DECISIONS.time_share)
+
+    # -- the stages
 
     @cached_property
     def factorises_first(self) -> bool:
@@ -831,59 +891,27 @@ class DecisionTree:
         The cost to factor a sparse A depends on its fill-in, which only an analysis computes. Before the first sweeps,
         therefore, only the costs of `direct` and of Newton's method over bodies or velocities are compared.
         """
-        p, first = self.problem, DECISIONS.first_sweeps * self.sweep
-        if self.law == "linear" or p.cones.has_round:
+        p = self.problem
+        if self.law == "linear" or p.cones.has_round or (self.can_pivot and self.direct < self.first):
             return True
-        if self.can_pivot and self.direct < first:
-            return True
-        if self.compiled_call_failed:  # Started at the same point, Newton's method would stall again.
+        # Started at the same point as a failed compiled call, Newton's method would stall again.
+        if self.compiled_call_failed or p.matrix is not None:
             return False
-        if p.matrix is not None:
-            return False
-        return self.min_newton_cost < first and self.newton < first
-
-    def iterate_relaxed_stages(self) -> Iterator[Stage]:
-        """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
-        if self.first_stage <= 1:
-            least = self.min_newton_cost
-            yield Stage(
-                "anderson", inf, least, "before any analysis", least=least / self.relaxed_sweep, position=1
-            )
-        if "newton" not in self.states:
-            return
-        state = self.states["newton"]
-        cost = ADMM_FRACTION * state.cost
-        iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
-        runs_admm = iterations >= MIN_ADMM_ITERATIONS
-        if self.first_stage <= 2:
-            why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
-            least = state.cost / self.relaxed_sweep
-            if runs_admm:
-                least = min(least, SWEEPS_PER_ADMM_ITERATION * iterations)
-            yield Stage("anderson", inf, state.cost, why, least=least, position=2)
-        if self.first_stage <= 3 and runs_admm:
-            why = f"up to {ADMM_FRACTION:g} times newton's cost"
-            yield Stage("admm from zero", iterations, cost, why, position=3)
-        if self.first_stage <= 4:
-            n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
-            yield Stage("newton on the relaxation", n, state.cost, why, position=4)
+        return self.min_newton_cost < self.first and self.newton < self.first
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
-        p, ratio = self.problem, DECISIONS.budget_ratio
+        p, ratio, first = self.problem, DECISIONS.budget_ratio, self.first
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
-        first = DECISIONS.first_sweeps * self.sweep
         relaxed = starts_relaxed(p)
         if relaxed:
             yield from self.iterate_relaxed_stages()
         max_cost = self.min_newton_cost if self.law == "linear" else first
         pivots_first = self.factorises_first and self.can_pivot and self.direct < max_cost
         if pivots_first:
-            cost = ratio * self.direct
-            yield Stage(
-                "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
-            )
+            n = ratio * DECISIONS.pivot_factorisations
+            yield Stage("direct", n, ratio * self.direct, "a narrow band: before any analysis")
         elif not (relaxed or self.factorises_first):
             yield self.sweeps(first, "the first sweeps, before any analysis")
         self.analyse_row_form_if_cheaper(ratio * self.newton if self.compiled_call_failed else self.newton)
@@ -904,6 +932,39 @@ class DecisionTree:
             yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
         yield from self.iterate_alternating_stages()
 
+    def iterate_relaxed_stages(self) -> Iterator[Stage]:
+        """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
+        if self.first_stage <= 1:
+            cost = self.min_newton_cost
+            least = cost / self.relaxed_sweep
+            yield Stage("anderson", inf, cost, "before any analysis", least=least, position=1)
+        if "newton" not in self.states:
+            return
+        state = self.states["newton"]
+        cost = ADMM_FRACTION * state.cost
+        iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
+        runs_admm = iterations >= MIN_ADMM_ITERATIONS
+        if self.first_stage <= 2:
+            why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
+            least = state.cost / self.relaxed_sweep
+            if runs_admm:
+                least = min(least, SWEEPS_PER_ADMM_ITERATION * iterations)
+            yield Stage("anderson", inf, state.cost, why, least=least, position=2)
+        if self.first_stage <= 3 and runs_admm:
+            why = f"up to {ADMM_FRACTION:g} times newton's cost"
+            yield Stage("admm from zero", iterations, cost, why, position=3)
+        if self.first_stage <= 4:
+            n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
+            yield Stage("newton on the relaxation", n, state.cost, why, position=4)
+
+    def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
+        """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
+        budget = times * self.newton
+        for name, cost in self.solver_costs.items():
+            if cost <= budget:
+                why = f"{times:.3g} times its estimated cost of {format_seconds(1e-9 * cost)}"
+                yield self.factorisation(name, times * cost, why)
+
     def iterate_alternating_stages(self) -> Iterator[Stage]:
         """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
         self.remaining_cost = DECISIONS.total_ratio * self.unit
@@ -919,29 +980,29 @@ class DecisionTree:
             if no_gain and not self.analyse_row_form_if_cheaper(DECISIONS.total_ratio * self.unit):
                 return
 
-    @property
-    def unit(self) -> float:
-        """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
-        return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
-
-    def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
-        """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
-        budget = times * self.newton
-        for name, cost in self.solver_costs.items():
-            if cost <= budget:
-                why = f"{times:.3g} times its estimated cost of {format_seconds(1e-9 * cost)}"
-                yield self.factorisation(name, times * cost, why)
+    def iterate_one_round(self, times: float) -> Iterator[Stage]:
+        """Yield one round, in which each solver may cost `times` the first budget of the factorising solvers."""
+        times *= DECISIONS.budget_ratio
+        p, cost, setup = self.problem, times * self.unit, 0.0
+        why = f"in turn, {times:g} times the cheapest factorising solver's cost"
+        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+        n = 0.5 * cost / self.sweep  # An iteration of the next two solvers costs as much as two sweeps.
+        if p.generalized is not None:
+            # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
+            setup = estimate_formation_cost(p, "newton over rows" in self.states)
+            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
+        if setup <= cost:
+            yield Stage("admm", n, cost, why)
+        yield Stage("nncg", n, cost, why)
+        if not self.sweeps_failed and not p.cones.has_round:
+            before = self.best
+            yield self.sweeps(cost, why)
+            self.sweeps_failed = self.best >= before
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
         """Return the stage of a factorising solver with the budget `cost` [ns]."""
         steps = self.states[name].steps if name in self.states else DECISIONS.pivot_factorisations
         return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
-
-    def get_stage_cost(self, stage: Stage) -> float:
-        """Return the estimated cost [ns] of a factorising solver that a stage starts, without any new analysis."""
-        if stage.solver == "direct":
-            return self.direct if self.can_pivot else stage.cost
-        return self.states[stage.solver].cost
 
     def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
         """Return a stage of sweeps with the budget `cost` [ns].
@@ -950,29 +1011,8 @@ class DecisionTree:
         """
         return Stage("anderson", cost / self.sweep, cost, why, max_remaining / self.sweep)
 
-    def iterations(self, name: str, cost: float, why: str) -> Stage:
-        """Return a stage with the budget `cost` [ns] of a solver with iterations that cost as much as two sweeps."""
-        return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
-    def iterate_one_round(self, times: float) -> Iterator[Stage]:
-        """Yield one round, in which each solver may cost `times` the first budget of the factorising solvers."""
-        times *= DECISIONS.budget_ratio
-        cost = times * self.unit
-        why = f"in turn, {times:g} times the cheapest factorising solver's cost"
-        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
-        p = self.problem
-        setup = 0.0
-        if p.generalized is not None:
-            # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
-            setup = estimate_formation_cost(p, "newton over rows" in self.states)
-            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
-        if setup <= cost:
-            yield self.iterations("admm", cost, why)
-        yield self.iterations("nncg", cost, why)
-        if not self.sweeps_failed and not self.problem.cones.has_round:
-            before = self.best
-            yield self.sweeps(cost, why)
-            self.sweeps_failed = self.best >= before
+# -- the solver ------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -1018,7 +1058,8 @@ class Auto(Solver):
         recorder = Recorder(state.loop)
         recorder.record_impulse("start", 0, impulse)
         claim = self._run(state, impulse, max_iter, tol, time_limit, recorder)
-        recorder.finish(claim, impulse)
+        last = claim.stages[-1].solver if claim.stages else "start"
+        recorder.record_impulse(last, claim.iterations, impulse)
         return claim
 
     def _run(
@@ -1033,7 +1074,7 @@ class Auto(Solver):
         """Run as `run`, and let `recorder`, if it is given, write the history."""
         problem, deadline = state.problem, Deadline(time_limit)
         if problem.has_singular_program:
-            return run_singular_program_backends(problem, impulse, max_iter, tol, deadline)
+            return run_program_backends(SolveLog(problem, tol, max_iter, deadline), impulse)
         counts: tuple[int, ...] | None = state.failed_call
         if counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL:
             fraction = get_call_time_fraction(problem, deadline.get_remaining_seconds() or inf)
@@ -1045,20 +1086,19 @@ class Auto(Solver):
                     claim = AUTO.make_claim(problem, counts, impulse, result.relative)
                     if claim.iterations <= max_iter:
                         if recorder is not None:
-                            recorder.record_compiled_call(AUTO, impulse, tol, claim)
+                            recorder.record_compiled_call(impulse, tol, claim)
                         impulse[:] = result.impulse
                         return replace(claim, judged=result)
         failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        if deadline.has_passed(1e-9 * estimate_first_sweep_cost(problem)):
+        if not deadline.fits(estimate_first_sweep_cost(problem)):
             impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
-        tree = DecisionTree(problem, deadline)
-        tree.first_stage = state.first_stage
+        log = SolveLog(problem, tol, max_iter, deadline)
+        tree = DecisionTree(problem, deadline, log, state.first_stage)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
-        log = SolveLog(problem, tol, max_iter, deadline)
         log.start_from_better_impulse(impulse)
         log.recorder = recorder
         try:
@@ -1074,59 +1114,6 @@ class Auto(Solver):
         return log.make_claim()
 
 
-def program_backends() -> list[SolverSpec]:
-    """Return the specs of the installed `PROGRAM_BACKENDS`."""
-    return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]
-
-
-@np.errstate(all="ignore")  # Results that overflow are judged.
-def run_singular_program_backends(
-    problem: Problem, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
-) -> Claim:
-    """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
-
-    If no backend reaches tol, the result with the smallest error of the program is returned.
-    """
-    log, start = SolveLog(problem, tol, max_iter, deadline), impulse.copy()
-    log.judge_and_store_best(impulse)
-    error, best = program_error(problem, log.impulse), log.impulse
-    try:
-        for spec in program_backends():
-            if log.done() and (log.status is not Status.ROUNDOFF_LIMIT or error <= tol):
-                break
-            solver, before, trial = spec.load()(), log.best, start.copy()
-            state = solver.prepare(problem)
-            claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
-            log.judge_and_store_best(trial)
-            log.record_stage(spec.name, claim, before)
-            for result in (trial, log.impulse if log.best <= tol else log.result):
-                if program_error(problem, result) < error:
-                    error, best = program_error(problem, result), result.copy()
-            if tol == 0.0:
-                break
-        if error > tol > 0.0 and not log.done():
-            certify_by_linear_programs(log)
-    except KeyboardInterrupt:
-        log.interrupted = True
-    except BREAKDOWN as failure:
-        log.failure = format_error(failure)
-    claim = log.make_claim()
-    if log.best <= tol:
-        impulse[:] = log.impulse
-    else:
-        impulse[:] = best
-        # This status belongs to the best impulse, not to this backend's.
-        if claim.status is Status.ROUNDOFF_LIMIT:
-            claim = replace(claim, status=Status.STALLED)
-    return claim
-
-
-def program_error(problem: Problem, impulse: FloatArray) -> float:
-    """Return `QPSolution.error` of x and the multipliers (n + m,); inf if it is not a number."""
-    error = float(problem.qp.solution(impulse).error)
-    return error if error == error else inf
-
-
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
@@ -1134,58 +1121,39 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         sweep_until_deadline(log, tree, steps)
         return
-    lines = iter(tree)
+    stages = iter(tree)
     # Check this first, because the tree computes costs before it yields the next stage.
     while not log.done():
-        stage = next(lines, None)
+        stage = next(stages, None)
         if stage is None:
             break
         if stage.solver == "certificate":
-            if not log.ends_after_deadline(stage.cost):
-                (
-                    certify_by_linear_programs
-                    if log.problem.generalized is None
-                    else certify_by_least_violation
-                )(log)
+            if log.deadline.fits(stage.cost):
+                is_matrix = log.problem.generalized is None
+                (certify_by_linear_programs if is_matrix else certify_by_least_violation)(log)
             continue
         step = steps.get(stage.solver)
         if step is None:
             step = steps[stage.solver] = create_solver_step(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
-                if not stage.position and not has_time_to_factorise_after(
-                    tree,
-                    steps,
-                    min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds()),
-                ):
+                cost = min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds())
+                if not stage.position and not tree.has_time_to_factorise_after(steps, cost):
                     sweep_until_deadline(log, tree, steps)
                     return
-            elif isinstance(step, RelaxedNewton):
-                step.over = step.late = not tree.has_time("newton", stage.cost)
-            elif step.name == "direct" or isinstance(step, Newton):
-                step.over = step.late = not tree.has_time(
-                    METHODS[stage.solver][0], tree.get_stage_cost(stage)
-                )
-            elif step.state is None:
-                setup = estimate_cost(stage.solver, log.problem).setup
-                step.over = step.late = log.deadline.has_passed(1e-9 * setup / DECISIONS.time_share)
-            log.timed_out = log.timed_out or step.late
-        is_hopeless = isinstance(step, Sweeps) and step.is_hopeless(stage.least)
-        if step.over or is_hopeless:
-            tree.remaining_cost += stage.cost
+            elif not tree.leaves_time(stage, step):
+                step.over = step.late = log.timed_out = True
+        if step.over or (isinstance(step, Sweeps) and step.is_hopeless(stage.least)):
+            tree.skip(stage)
         else:
             step.least = stage.least
             step.run(stage.iterations)
-            tree.best = log.best
         if stage.position and not log.done() and solve_unsolved_islands(log, stage.position + 1):
             return
     if log.timed_out and not log.done():
         sweep_until_deadline(log, tree, steps)
-    if (
-        log.best > log.tol
-        and log.certificate is None
-        and (log.remaining_iterations > 0 or log.last_stage_failed)
-    ):
+    can_continue = log.remaining_iterations > 0 or log.last_stage_failed
+    if log.best > log.tol and log.certificate is None and can_continue:
         certify_infeasibility(log)
 
 
@@ -1220,7 +1188,7 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Ste
     for k, name in enumerate((*shared, "anderson", "nncg")):
         step = steps[name] = steps.get(name) or create_solver_step(name, log, tree)
         setup = 0.0 if step.state is not None else estimate_cost(name, log.problem).setup
-        if not step.over and (name == "anderson" or not log.deadline.has_passed(1e-9 * setup)):
+        if not step.over and (name == "anderson" or log.deadline.fits(setup)):
             assert isinstance(step, Iterations)
             step.least, step.time_fraction = inf, DECISIONS.time_share if k < len(shared) else 1.0
             step.run(inf)
@@ -1228,29 +1196,67 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Ste
             return
 
 
-def has_time_to_factorise_after(tree: DecisionTree, steps: dict[str, Step], cost: float) -> bool:
-    """Return whether work of this cost [ns] leaves time for a factorising solver, or whether all of them have ended."""
-    if "states" not in vars(tree):
-        return tree.has_time_for_newton(cost)
-    unfinished = [name for name in tree.states if name not in steps or not steps[name].over]
-    if tree.states and not unfinished and not any(steps[name].late for name in tree.states):
-        return True
-    return bool(unfinished) and tree.has_time("newton", tree.newton, cost)
-
-
 def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
-    kinds = {
-        "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
-        "newton on the relaxation": RelaxedNewton,
-    }  # fmt: skip
-    step = kinds.get(name, Iterations)(name, log)
+    step = STEPS.get(name, Iterations)(name, log)
     if isinstance(step, RelaxedNewton):
         step.like = tree.states["newton"]
     if isinstance(step, Newton):
         step.state = tree.states[name]
         step.started_from_zero = name == "newton" and tree.started_from_zero
     return step
+
+
+# -- programs with a singular P --------------------------------------------------------------------
+
+
+def program_backends() -> list[SolverSpec]:
+    """Return the specs of the installed `PROGRAM_BACKENDS`."""
+    return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]
+
+
+@np.errstate(all="ignore")  # Results that overflow are judged.
+def run_program_backends(log: SolveLog, impulse: FloatArray) -> Claim:
+    """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
+
+    If no backend reaches tol, the result with the smallest error of the program is returned.
+    """
+    problem, tol, start = log.problem, log.tol, impulse.copy()
+    log.judge_and_store_best(impulse)
+    error, best = program_error(problem, log.impulse), log.impulse
+    try:
+        for spec in program_backends():
+            if log.done() and (log.status is not Status.ROUNDOFF_LIMIT or error <= tol):
+                break
+            solver, before, trial = spec.load()(), log.best, start.copy()
+            state = solver.prepare(problem)
+            claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
+            log.judge_and_store_best(trial)
+            log.record_stage(spec.name, claim, before)
+            for result in (trial, log.impulse if log.best <= tol else log.result):
+                if program_error(problem, result) < error:
+                    error, best = program_error(problem, result), result.copy()
+            if tol == 0.0:
+                break
+        if error > tol > 0.0 and not log.done():
+            certify_by_linear_programs(log)
+    except KeyboardInterrupt:
+        log.interrupted = True
+    except BREAKDOWN as failure:
+        log.failure = format_error(failure)
+    claim = log.make_claim()
+    impulse[:] = log.impulse if log.best <= tol else best
+    if log.best > tol and claim.status is Status.ROUNDOFF_LIMIT:
+        return replace(
+            claim, status=Status.STALLED
+        )  # That status belongs to the impulse with the best residual.
+    return claim
+
+
+def program_error(problem: Problem, impulse: FloatArray) -> float:
+    """Return `QPSolution.error` of x and the multipliers (n + m,); inf if it is not a number."""
+    error = float(problem.qp.solution(impulse).error)
+    return error if error == error else inf
 
 
 SPEC = SolverSpec(
