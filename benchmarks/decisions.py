@@ -41,11 +41,11 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     sys.path.insert(0, str(ROOT / "tests"))
 
     from calls import over_velocities  # type: ignore[import-not-found]
-    from random_families import drawn, wild  # type: ignore[import-not-found]
     from random_problems import general, random_generalized_problem, random_lcp, without_solution  # type: ignore[import-not-found]
 
     import lavender as lv
     from benchmarks.core_problems import forms, stacks
+    from benchmarks.random_families import drawn, wild
     from lavender.base.deadline import Deadline
     from lavender.judge.residuals import get_zero_impulse_reference
     from lavender.problem import Problem

@@ -14,7 +14,6 @@ if the derivative raises an error along this direction.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -74,8 +73,7 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
 
 def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
     """Yield (source, problem) with at most ROWS rows."""
-    sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
-    from random_families import wild
+    from benchmarks.random_families import wild
 
     for seed in range(draws):
         problem = wild(seed=seed, rows=ROWS).problem

@@ -122,7 +122,7 @@ def draw_problems(
 ) -> Iterator[tuple[str, int, Problem]]:
     """Yield (source, seed, problem): `count` problems of each source, then the files."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from random_families import drawn, wild  # type: ignore[import-not-found]
+    from benchmarks.random_families import drawn, wild
 
     sources: dict[str, Any] = {
         "wild": lambda rng, s: wild(s).problem,

@@ -1,7 +1,6 @@
 """Engines and solvers of others: what is compared is the same problem and the same scene, and losses are kept."""
 
 import importlib.util
-import itertools
 import json
 import math
 import os
@@ -54,21 +53,6 @@ def test_every_adapter_solves_the_same_problem(kind):
         least = reached(contestant, problem)
         # 1e-4: all get there at their tightest setting, some interior points no further with friction.
         assert least is None or least < 1e-4, f"{contestant.name} on {SMALL[kind]}: {least:.1e}"
-
-
-def test_own_time_is_a_part_of_the_whole(monkeypatch):
-    """Set-up and solve of a backend, without conversion, in each form: by a clock that counts how often it is read."""
-    ticks = itertools.count()
-    monkeypatch.setattr(adapters, "process_time", lambda: float(next(ticks)))
-    problem = suite.case("stack(n=4)").problem
-    pytest.importorskip("piqp", reason="backends with an interface of their own (extra: qp)")
-    own = [c for c in adapters.contestants() if "own interface" in c.name and c.refuses(problem) is None]
-    assert own
-    for contestant in own:
-        for call in itertools.islice(contestant.runs(problem, 5.0), 2):
-            begun = next(ticks)
-            spent = call()[0]
-            assert 0.0 < spent < next(ticks) - begun, contestant.name
 
 
 def test_race_keeps_times_residuals_and_sides():

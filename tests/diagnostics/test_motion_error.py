@@ -76,15 +76,6 @@ def test_asymmetry_of_heavy_bodies_beside_lighter_ones_leaves_no_energy(light):
     assert lv.motion_error(problem, np.zeros(3)).energy is None
 
 
-def test_default_reference_of_a_convex_law_is_solved_once(monkeypatch):
-    module, p = import_module("lavender.diagnostics.motion_error"), cone_problem(5)
-    first = lv.motion_error(p, p.start())
-    assert first.relative == pytest.approx(1.0)
-    monkeypatch.setattr(module, "solve", None)
-    again = lv.motion_error(p, first.reference)
-    assert again.energy == 0.0 and again.reference.tobytes() == first.reference.tobytes()
-
-
 def test_default_reference_under_coulombs_law_starts_from_the_impulse():
     problem = lv.suite.case("painleve").problem
     sticks = np.linalg.solve(problem.dense(), problem.b)

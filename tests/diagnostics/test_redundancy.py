@@ -5,7 +5,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from kkt_truth import eliminate
@@ -13,7 +12,6 @@ from random_problems import as_matrix, random_contact_problem, seeds, touching
 
 import lavender as lv
 from lavender.diagnostics.redundancy import redundancy
-from lavender.problem import operators
 
 
 def box_on_corners(mu=None, points=4):
@@ -215,35 +213,3 @@ def test_tangents_of_unlike_units_that_share_a_d_are_two_rows(form):
         )
     found = redundancy(problem)
     assert found.rank == 3 and found.impulse_is_unique.all()
-
-
-def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
-    """Of 60 boxes side by side each is small; with the columns of all, memory and time grow as their square."""
-    seen, qr = [], scipy.linalg.qr
-    monkeypatch.setattr(scipy.linalg, "qr", lambda a, **more: (seen.append(a.shape), qr(a, **more))[1])
-    one = np.random.default_rng(2).normal(size=(9, 4))
-    many = lv.Problem.from_jacobian(
-        np.kron(np.eye(60), one), np.eye(240), np.ones(240), cones=lv.Cones.free(540)
-    )
-    assert lv.redundancy(many).rank == 240
-    assert max(seen)[0] <= 5
-
-
-def test_entries_of_a_are_counted_once(monkeypatch):
-    """Rows that share all velocities of a tree meet once, not once for each of them."""
-    rng = np.random.default_rng(5)
-    jac = np.zeros((40, 30))
-    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
-    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
-    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40 + 1)
-    free = lv.Cones.free(40)
-    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
-    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
-    assert lv.redundancy(problem).rank == 1
-    twins = lv.Problem.from_jacobian(
-        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
-    )
-    assert twins.metric.entries_of_matrix == 40 * 40  # rows on two trees, too
-    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40)
-    with pytest.raises(lv.InputError, match="J and M as they are"):
-        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

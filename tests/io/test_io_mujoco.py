@@ -59,7 +59,7 @@ def test_what_solvers_here_find_is_the_acceleration_of_mujoco():
     assert np.abs(adapter.acceleration(model, data, adapter.impulse(model, data)) - data.qacc).max() < 1e-6
 
 
-def test_matrix_and_vector_are_those_of_mujoco():
+def test_matrix_and_vector_equal_the_arrays_of_mujoco():
     model, data = state(jacobian="sparse")
     problem = lv.io.from_mujoco(model, data)
     jac, mass = adapter.jacobian(model, data).toarray(), np.zeros((model.nv, model.nv))

@@ -6,11 +6,11 @@ import pytest
 from extreme_problems import build_problem, problem_data
 from hypothesis import assume, given, reject
 from invalid_values import Call, make_tests_of_calls
-from random_families import wild
 from random_problems import nearly_singular, random_contact_problem, seeds, warmed
 from worked import after
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import bench, suite
 from lavender.suite import hard
 

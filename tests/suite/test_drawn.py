@@ -4,10 +4,10 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-import random_families as drawn
-from random_families.wild import FORMS, LAWS, MASSES, STRUCTURES
 
+import benchmarks.random_families as drawn
 import lavender as lv
+from benchmarks.random_families.wild import FORMS, LAWS, MASSES, STRUCTURES
 from lavender.base.errors import UnknownName
 
 SEEDS = range(400)
@@ -16,7 +16,7 @@ LOTS = ("drawn",)  # families half of whose structures are for judging
 
 def family(name):
     """Its function, and the module with its structures and lot."""
-    return getattr(drawn, name), import_module(f"random_families.{name}")
+    return getattr(drawn, name), import_module(f"benchmarks.random_families.{name}")
 
 
 @pytest.fixture(scope="module", params=drawn.__all__)

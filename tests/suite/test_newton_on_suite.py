@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from random_families import wild
 from random_problems import as_matrix, good
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import registry, suite
 from lavender.judge.solution import Status
 from lavender.solvers.newton import Newton, NewtonState

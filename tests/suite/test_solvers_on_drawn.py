@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from calls import check
-from random_families import wild
 from random_problems import as_matrix, good
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import registry
 
 

@@ -3,11 +3,11 @@
 import math
 
 import pytest
-from random_families import wild
 from random_problems import warmed
 from worked import after
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import registry, suite
 from lavender.suite import hard
 

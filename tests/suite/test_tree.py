@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import over_velocities
-from random_families import drawn, wild
 from random_problems import as_matrix, general, random_generalized_problem, random_lcp
 
 import lavender as lv
+from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
 from lavender.solvers import costs
 from lavender.solving.auto import METHODS

@@ -11,13 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import BACKENDS, DEFINITE, installed
-from random_problems import as_matrix, random_bodies_and_contacts, random_contact_problem, spd, touching
+from random_problems import as_matrix, random_contact_problem, spd, touching
 from worked import python
 
 import lavender as lv
 from lavender import registry
 from lavender.external import as_qp, backends, qp_solver
-from lavender.external.as_qp import build_program, compute_backend_tolerance
 from lavender.external.running import Answer
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
@@ -79,16 +78,6 @@ def test_nothing_is_printed_or_looked_for_and_threads_run_one_each(name, capfd, 
     assert capfd.readouterr() == ("", "")
     with pytest.raises(KeyboardInterrupt):  # some backends handle Ctrl-C themselves while they solve
         signal.raise_signal(signal.SIGINT)
-
-
-def test_highs_takes_standard_output_from_the_process_for_its_greeting_alone(monkeypatch):
-    """At every solve what other threads printed meanwhile was lost."""
-    problem = lv.Problem.lcp(*spd(4))
-    lv.solve(problem, "highs")
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "dup2", None)
-        again = lv.solve(problem, "highs")
-    assert again.success, again
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
@@ -187,18 +176,6 @@ def test_rows_that_are_assumed_to_stay_at_their_bound_are_looked_at(name, form, 
         assert solution.success, str(solution)
 
 
-@pytest.mark.parametrize("name", installed("clarabel_cone"))
-def test_contacts_that_separate_are_taken_out_with_their_friction(name):
-    problem = random_contact_problem(3, "cone", bodies=4, contacts=8)
-    away = problem.updated(b=np.where(np.arange(problem.m) == problem.cones.ptr[-2], -1e9, problem.b))
-    rows = range(away.cones.ptr[-2], away.cones.ptr[-1])
-    for one, taken_out in ((problem, []), (away, list(rows))):
-        solution = lv.solve(one, name)
-        assert solution.success, str(solution)
-        assert build_program(one, "impulse", fix_far_rows=True).assumed.tolist() == taken_out
-    assert not solution.impulse[list(rows)].any()
-
-
 @pytest.mark.parametrize("name", BACKENDS)
 def test_nothing_to_solve(name):
     empty = lv.Problem.lcp(np.zeros((0, 0)), [])  # no row is bounded: its law is linear
@@ -212,34 +189,6 @@ def test_nothing_to_solve(name):
 
 
 # -- what ran -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_linear_problems_never_go_to_lsqr(name, monkeypatch):
-    import importlib
-
-    import scipy.sparse.linalg
-
-    def trap(*_, **__):
-        raise AssertionError("LSQR was called in place of the backend")
-
-    monkeypatch.setattr(scipy.sparse.linalg, "lsqr", trap)
-    for module in (
-        "qpsolvers.solve_unconstrained",
-        *(f"qpsolvers.solvers.{n}_" for n in ("clarabel", "scs")),
-    ):
-        try:
-            loaded = importlib.import_module(module)
-        except ImportError:
-            continue
-        for attribute in ("lsqr", "solve_unconstrained"):
-            if hasattr(loaded, attribute):
-                monkeypatch.setattr(loaded, attribute, trap)
-    problem = lv.Problem.linear(*spd(12))
-    solution = lv.solve(problem, name, tol=1e-8)
-    assert solution.success, str(solution)
-    assert solution.work["backend_calls"] >= 1
-    assert "LSQR" not in solution.message
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -484,32 +433,4 @@ def test_tol_zero_runs_at_the_tightest_tolerance():
     assert solution.residual.relative <= 1e-10
 
 
-def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
-    monkeypatch.setattr(qp_solver, "MAX_DENSE_SIZE", 8 * 10 * 10)
-    problem = lv.Problem.lcp(*spd(11))
-    with pytest.raises(lv.CapabilityError, match="dense matrices only"):
-        lv.solve(problem, "daqp")
-    assert lv.solve(problem, "osqp").success
-
-
 # -- the program that a backend is handed ---------------------------------------------------------------
-
-
-def test_units_do_not_reach_the_backend():
-    """Of mass, and of speed, by powers of two: no bit of the program is another one."""
-    rows = random_bodies_and_contacts(np.random.default_rng(5), bodies=4, joints=3, contacts=7)
-    made = [
-        lv.Problem.from_rows(
-            replace(
-                rows, inv_mass=k * rows.inv_mass, inv_inertia=k * rows.inv_inertia, v_free=s * rows.v_free
-            ),
-            0.5 * s,
-        )
-        for k, s in ((1.0, 1.0), (4.0, 8.0))
-    ]
-    for form in ("impulse", "velocity"):
-        one, two = (build_program(problem, form) for problem in made)
-        assert one.q.tobytes() == two.q.tobytes() and one.b.tobytes() == two.b.tobytes()
-        assert (one.P != two.P).nnz == 0 and (one.A != two.A).nnz == 0
-        # A residual is relative to speeds.
-        assert compute_backend_tolerance(one, 1e-6) == compute_backend_tolerance(two, 1e-6)

@@ -100,18 +100,6 @@ def test_trees_and_stars_fill_nothing():
         assert f.entries <= 8 * n  # 2 n - 1, and zeros that are held as numbers
 
 
-def grid(side):
-    """The pattern of a square grid, numbered row by row."""
-    line, one = sp.diags_array([1.0, 1.0], offsets=[-1, 1], shape=(side, side)), sp.eye_array(side)
-    return sp.csr_array(sp.kron(line, one) + sp.kron(one, line))
-
-
-def test_a_grid_fills_less_than_its_band():
-    side = 40
-    a = definite(sp.csr_array(grid(side) + sp.eye_array(side**2)))
-    assert LinearSystem(raw(a)).cost < 0.3 * 0.5 * side**4
-
-
 def factor_of(matrix, order):
     """Columns and rows of the factor when the vertices are eliminated in that order, a column at a time."""
     a = matrix[order][:, order]
@@ -140,20 +128,6 @@ def test_dissection_halves_the_work_of_minimum_degree_on_a_cube(piles):
     ]
     # The order of LinearSystem is that of minimum degree. Other software for nested dissection reaches 0.4 as well.
     assert work[0] < 0.5 * work[1]
-
-
-def test_columns_of_one_pattern_stand_beside_each_other():
-    """Places are those of a postorder: what is below a vertex and not below its parent comes right before it."""
-    matrix = grid(12)
-    order = order_for_elimination(*raw(matrix))
-    lptr, lind = factor_of(matrix, order)
-    size = np.ones(len(order), int)  # of the subtree of each
-    has_parent = np.flatnonzero(np.diff(lptr))
-    parent = lind[lptr[has_parent]]
-    for j, p in zip(has_parent, parent, strict=True):
-        size[p] += size[j]
-    first = np.arange(len(order)) - size + 1  # where a subtree begins that ends at its root
-    assert (first[parent] <= first[has_parent]).all() and (first >= 0).all()
 
 
 @pytest.mark.parametrize("lu", [False, True])

@@ -50,7 +50,7 @@ def difference(function, x, i):
 
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", CONES)
-def test_projection_and_its_derivatives_are_those_of_a_dense_twin(kind, law):
+def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
     if (kind, law) == ("round", "coulomb"):
         return
     rng, n = np.random.default_rng(5), 200

@@ -325,21 +325,6 @@ def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register
         np.testing.assert_equal(solution.residual.relative, lv.residual(problem, solution.impulse).relative)
 
 
-def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
-    class SmallCall:
-        def solve(self, problem, impulse, tol):
-            raise AssertionError("asked")
-
-    register(
-        lv.SolverSpec(
-            name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", small=SmallCall()
-        )
-    )
-    assert lv.solve(random_lcp(15), "few", max_iter=2000).success
-    assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
-    assert lv.solve(random_lcp(15), "few").iterations > 0
-
-
 # -- the floor does not excuse an impulse that ran away ------------------------------------------------
 
 

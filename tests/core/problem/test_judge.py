@@ -23,12 +23,6 @@ import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import natural_map, qp_residual, siconos_error
-from lavender.judge.residuals import (
-    find_relative_at_zero,
-    judge_impulse,
-    refine_residual,
-    reuse_or_judge_impulse,
-)
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -272,26 +266,6 @@ def test_bounds_that_are_huge_beside_the_step_are_seen():
         assert lv.residual(problem, [bound, 1.0]).relative == 0.0
         assert lv.residual(problem, [-bound, 1.0]).relative > 0.1
         assert lv.solve(problem, "pgs").impulse.tolist() == [bound, 1.0]
-
-
-def test_a_pass_serves_its_own_impulse_and_problem_alone():
-    problem = random_contact_problem(2)
-    first = np.linspace(0.1, 1.0, problem.m)
-    other = first.copy()
-    other[-1] = np.nextafter(other[-1], 2.0)
-    fresh = [lv.residual(problem, x) for x in (first, other)]
-    judged = judge_impulse(problem, first.copy())
-    assert reuse_or_judge_impulse(problem, first, judged) is judged
-    assert reuse_or_judge_impulse(random_contact_problem(2), first, judged) is not judged
-    for x, expected in ((other, fresh[1]), (first, fresh[0])):
-        found = refine_residual(problem, reuse_or_judge_impulse(problem, x, judged), 1e-6)
-        assert (found.relative, found.roundoff_floor, found.worst_row) == (
-            expected.relative, expected.roundoff_floor, expected.worst_row
-        )  # fmt: skip
-        np.testing.assert_array_equal(found.error, expected.error)
-        np.testing.assert_array_equal(found.slack, expected.slack)
-    assert find_relative_at_zero(problem, problem.start()) == lv.residual(problem, problem.start()).relative
-    assert find_relative_at_zero(problem, other) is None
 
 
 # -- nothing to do ----------------------------------------------------------------------------------

@@ -128,7 +128,7 @@ def test_a_budget_is_that_of_one_solve_where_p_is_definite():
 )
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @given(seed=seeds)
-def test_x_and_multipliers_are_those_of_qpsolvers(backend, seed):
+def test_x_and_multipliers_equal_qpsolvers(backend, seed):
     qpsolvers = pytest.importorskip("qpsolvers")
     if backend not in qpsolvers.available_solvers:
         pytest.skip(f"{backend} is not installed")

@@ -19,30 +19,6 @@ from lavender.problem.operators import Operators
 from lavender.solvers.costs import estimate_disk_cost, estimate_judge_setup_cost
 
 
-def test_set_up_is_inside(clock, monkeypatch):
-    problem, given = dense(100, "lcp"), []
-    newton = registry.get("newton").load()
-    prepare, run = newton.prepare, newton.run
-
-    def slow(self, *of):
-        clock.now += 0.6
-        return prepare(self, of[-1])
-
-    def told(self, state, impulse, max_iter, tol, time_limit=None):
-        given.append(time_limit)
-        return run(self, state, impulse, max_iter, tol, time_limit)
-
-    monkeypatch.setattr(newton, "prepare", slow)
-    monkeypatch.setattr(newton, "update", slow)
-    monkeypatch.setattr(newton, "run", told)
-    assert lv.solve(problem, "newton", time_limit=1.0).success
-    prepared = lv.prepare(problem, "newton")
-    assert prepared.solve(time_limit=1.0).success
-    assert prepared.solve(dense(100, "lcp", 1), time_limit=1.0).success
-    inside = [left < 0.5 for left in given]
-    assert inside == [True, False, True]
-
-
 @pytest.mark.parametrize("name", ["newton", "pgs", "anderson"])
 def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monkeypatch):
     """A first iteration was: of 5,000 rows 1.2 ms more under a limit of 1 ms."""

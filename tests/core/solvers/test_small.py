@@ -1,8 +1,5 @@
 """Problems of few rows take a compiled way: it must not show, but in time."""
 
-import _thread
-import sys
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -18,12 +15,10 @@ from random_problems import (
     seeds,
     side_by_side,
 )
-from scipy.sparse import block_diag, coo_array
 
 import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
-from lavender.solvers.small import SmallCall, describe_small_call
 
 
 def draw(kind, seed):
@@ -93,14 +88,6 @@ def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
         check(replace(problem, guess=near, copy=False), solver, tol=tol)
 
 
-def test_most_of_them_do_take_the_short_way():
-    took = 0
-    for kind in KINDS:
-        for seed in range(6):
-            took += registry.get("auto").small.solve_and_judge(draw(kind, seed), None, 1e-6)[0] is not None
-    assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
-
-
 @pytest.mark.parametrize("limit", [None, 10.0])
 def test_what_rounding_hides_is_no_matter_of_time(limit):
     """Two fixed impulses that cancel in a free row, whose b is 1000 times their rounding 2^-53 A lambda."""
@@ -157,15 +144,6 @@ def test_islands_of_bodies_with_joints(law, seed):
     assert found.success and "islands" in found.message
 
 
-def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
-    stack = forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone")
-    no_answer = lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone")
-    problem = side_by_side([stack, no_answer])
-    assert registry.get("auto").small.solve_and_judge(fresh(problem), None, 1e-6)[0] is None
-    found = lv.solve(problem)
-    assert found.status.name == "INFEASIBLE" and found.certificate is not None
-
-
 def test_islands_where_doing_nothing_is_right_from_a_warm_start():
     """Of nine islands one leaves the ground: nothing is to be done for it, and the solution says what was done."""
     rng = np.random.default_rng(3)
@@ -178,30 +156,6 @@ def test_islands_where_doing_nothing_is_right_from_a_warm_start():
     found = check(problem.updated(b=b), "auto", impulse=start)
     assert found.success and found.residual.relative <= found.tol
     assert not found.impulse[:12].any()
-
-
-def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
-    """Somebody looks for it between two of them."""
-    rng = np.random.default_rng(0)
-    parts = [g @ g.T + 1e-3 * np.eye(90) for g in rng.normal(size=(100, 90, 40))]
-    problem = lv.Problem.contact(
-        block_diag(list(map(coo_array, parts)), format="csr"), rng.normal(size=9000), np.full(3000, 0.5)
-    )
-    assert lv.explain(problem).small == describe_small_call(problem) != ""
-    main = threading.get_ident()
-
-    def interrupt():
-        while sys._current_frames()[main].f_code is not SmallCall.solve_and_judge.__code__:
-            pass
-        _thread.interrupt_main()
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    while (found := lv.solve(problem)).status is lv.Status.CONVERGED:
-        pass  # until the other thread had its turn in a call
-    thread.join()
-    assert found.status is lv.Status.INTERRUPTED
-    np.testing.assert_array_equal(found.impulse, problem.start())
 
 
 def wide_factor():

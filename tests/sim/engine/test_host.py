@@ -6,28 +6,6 @@ from worked import after
 
 import lavender as lv
 from lavender.sim.engine.layout import SETTING
-from lavender.sim.engine.state import State
-from lavender_ext.engine.arrays import SHAPES, compute_array_offsets
-
-
-@pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
-def test_arrays_lie_where_the_engine_has_them(name):
-    state = State.from_scene(lv.Scene(name))
-    first = compute_array_offsets(state.size)
-    total = {"real": state.real, "index": state.index, "keys": state.keys}
-    for buffer, names in SHAPES.items():
-        starts = [first[n] for n in names]
-        assert starts[0] == 0 and starts == sorted(starts)
-        ends = [*starts[1:], len(total[buffer])]
-        for n, start, end in zip(names, starts, ends, strict=True):
-            if n in state.a:
-                view = state.a[n]
-                assert view.size == end - start, n
-                if view.size:
-                    assert np.shares_memory(view, total[buffer][start:end]), n
-                    assert view.ctypes.data == total[buffer][start:].ctypes.data, n
-    named = {n for names in SHAPES.values() for n in names}
-    assert set(state.a) <= named
 
 
 @pytest.mark.parametrize("name", ["stack", "chain", "bridge", "pile"])

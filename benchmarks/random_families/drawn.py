@@ -18,15 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.errors import check_name
-from lavender.base.lazy_import import sparse as sp
-from lavender.base.lazy_import import spatial
-from lavender.problem import Problem
-from lavender.problem.cones import Cones
-from lavender.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
-from lavender.suite.case import Draft
-from lavender.suite.families import BOX, SPHERE, check_min_sizes
-from random_families.wild import (
+from benchmarks.random_families.wild import (
     FORMS,
     LARGEST_DENSE,
     LAWS,
@@ -40,6 +32,14 @@ from random_families.wild import (
     problem_of,
     tenfold,
 )
+from lavender.base.errors import check_name
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lazy_import import spatial
+from lavender.problem import Problem
+from lavender.problem.cones import Cones
+from lavender.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
+from lavender.suite.case import Draft
+from lavender.suite.families import BOX, SPHERE, check_min_sizes
 
 __all__ = ["JUDGED", "TUNED", "drawn"]
 
@@ -112,7 +112,7 @@ def cloth(rng: np.random.Generator, rows: int) -> World:
 
 
 def jelly(rng: np.random.Generator, rows: int) -> World:
-    """A block of points joined to their neighbours, half of the lowest on the floor; `foreign` softens its rows."""
+    """Draw a block of joined points, half of the lowest on the floor; `foreign` softens its rows."""
     side = max(2, round((rows / 9.0) ** (1 / 3)))
     grid = np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), -1).reshape(-1, 3)
     position = grid + 0.05 * rng.standard_normal(grid.shape)
@@ -153,7 +153,7 @@ def pegs(rng: np.random.Generator, rows: int) -> World:
 
 
 def silo(rng: np.random.Generator, rows: int) -> World:
-    """A narrow column of balls between upright walls, two to five wide: walls carry what friction gives them."""
+    """Draw a narrow column of balls between upright walls, two to five wide: walls carry what friction gives them."""
     wide = int(rng.integers(2, 6))
     high = max(1, round(rows / (4.0 * wide * wide)))
     grid = np.stack(np.meshgrid(*map(np.arange, (high, wide, wide)), indexing="ij"), -1).reshape(-1, 3)[
@@ -172,7 +172,7 @@ def silo(rng: np.random.Generator, rows: int) -> World:
 
 
 def obstacle(rng: np.random.Generator, rows: int) -> Problem:
-    """A membrane on a grid that hangs onto an obstacle: the five-point matrix, an M-matrix."""
+    """Draw a membrane on a grid that hangs onto an obstacle: the five-point matrix, an M-matrix."""
     side = max(2, round(np.sqrt(rows)))
     line = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(side, side))
     eye = sp.eye_array(side)
@@ -203,7 +203,7 @@ def network(rng: np.random.Generator, rows: int) -> Problem:
 
 
 def boxed(rng: np.random.Generator, rows: int) -> Problem:
-    """A dense matrix of given condition between bounds on both sides; some rows are free."""
+    """Draw a dense matrix of given condition between bounds on both sides; some rows are free."""
     m = min(rows, LARGEST_DENSE // 2)
     q = np.linalg.qr(rng.standard_normal((m, m)))[0]
     a = (q * tenfold(np.linspace(0.0, rng.uniform(1, 7), m))) @ q.T
@@ -214,7 +214,7 @@ def boxed(rng: np.random.Generator, rows: int) -> Problem:
 
 
 def skew(rng: np.random.Generator, rows: int) -> Problem:
-    """A monotone matrix with a skew part as large as the rest: saddle points of games; dense or with few entries."""
+    """Draw a monotone matrix with a skew part as large as the rest (saddle points of games), dense or sparse."""
     m = max(4, rows // 2 * 2)
     share = 1.0 if m < 200 and rng.random() < 0.5 else min(1.0, 6.0 / m)
     k = sp.random_array((m, m), density=share, rng=rng, data_sampler=lambda size: rng.standard_normal(size))
@@ -276,7 +276,7 @@ def kernel(rng: np.random.Generator, rows: int) -> Problem:
 
 
 def deblur(rng: np.random.Generator, rows: int) -> Problem:
-    """A signal without negative values, seen through a blur of some width: K^T K, nearly singular."""
+    """Draw a signal without negative values, seen through a blur of some width: K^T K, nearly singular."""
     m = min(max(8, rows), LARGEST_DENSE)
     wide = int(rng.integers(1, max(2, min(20, m // 4)) + 1))
     weight = map_scalar(math.exp, -0.5 * (np.arange(-2 * wide, 2 * wide + 1) / wide) ** 2)
@@ -291,7 +291,7 @@ def deblur(rng: np.random.Generator, rows: int) -> Problem:
 
 
 def beam(rng: np.random.Generator, rows: int) -> Problem:
-    """A bent beam over an obstacle: fourth differences, which are no M-matrix and badly conditioned."""
+    """Draw a bent beam over an obstacle: fourth differences, which are no M-matrix and badly conditioned."""
     m = max(4, rows)
     second = sp.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(m, m))
     stiff = tenfold(rng.uniform(0.0, 1.0) * rng.standard_normal(m))
@@ -321,7 +321,7 @@ TUNED = frozenset(STRUCTURES) - JUDGED
 
 
 def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
-    """A problem drawn by `seed` of some 8 to `rows` rows; `part`: all, tuned or judged structures.
+    """Draw a problem by `seed` of some 8 to `rows` rows; `part`: all, tuned or judged structures.
 
     Or "rolling": worlds to tune on whose contacts resist rolling, and perhaps spin.
     """

@@ -119,7 +119,7 @@ def towers(rng: np.random.Generator, rows: int) -> World:
 
 
 def wall(rng: np.random.Generator, rows: int) -> World:
-    """A running bond: each brick on two below, four points a pair; ends overhang."""
+    """Draw a running bond: each brick on two below, four points a pair; ends overhang."""
     high = max(2, round(np.sqrt(rows / 16)))
     wide = max(2, rows // (8 * high))
     row, column = (x.ravel() for x in np.meshgrid(np.arange(high), np.arange(wide), indexing="ij"))
@@ -147,7 +147,7 @@ def wall(rng: np.random.Generator, rows: int) -> World:
 
 
 def tree(rng: np.random.Generator, rows: int) -> World:
-    """A random tree of ball joints hung from the ceiling; perhaps some of its bodies lie on the floor."""
+    """Draw a random tree of ball joints hung from the ceiling; perhaps some of its bodies lie on the floor."""
     n = max(2, rows // 3)
     parent = np.array([-1, *(int(rng.integers(max(0, i - int(rng.integers(1, 9))), i)) for i in range(1, n))])
     world = _joined(rng, parent, BOX)
@@ -155,7 +155,7 @@ def tree(rng: np.random.Generator, rows: int) -> World:
 
 
 def net(rng: np.random.Generator, rows: int) -> World:
-    """A net of ball joints, held at its corners: loops, so rows that depend on each other."""
+    """Draw a net of ball joints, held at its corners: loops, so rows that depend on each other."""
     side = max(2, round(np.sqrt(rows / 6)))
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     sag = 0.3 * map_scalar(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
@@ -169,7 +169,7 @@ def net(rng: np.random.Generator, rows: int) -> World:
 
 
 def ragdolls(rng: np.random.Generator, rows: int) -> World:
-    """A crowd of small trees of ball joints, some limbs on the floor, some touching the next one's."""
+    """Draw a crowd of small trees of ball joints, some limbs on the floor, some touching the next one's."""
     size = int(rng.integers(5, 16))
     count = max(1, rows // (3 * size + size // 2))
     body = np.array([-1, *(int(rng.integers(max(0, i - 4), i)) for i in range(1, size))])
@@ -187,7 +187,7 @@ def ragdolls(rng: np.random.Generator, rows: int) -> World:
 
 
 def snake(rng: np.random.Generator, rows: int) -> World:
-    """A chain of rods along the floor, each end of it on the floor or not."""
+    """Draw a chain of rods along the floor, each end of it on the floor or not."""
     n = max(2, rows // 4)
     k = np.arange(n)
     position = np.stack(
@@ -214,7 +214,7 @@ STRUCTURES: dict[str, Structure] = {
 
 
 def wild(seed: int = 0, rows: int = 3000) -> Draft:
-    """A problem drawn by `seed`: structure, masses, law and form, of some 8 to `rows` rows, even in the logarithm."""
+    """Draw a problem by `seed`: structure, masses, law and form, of some 8 to `rows` rows, even in the logarithm."""
     check_min_sizes(8, rows=rows)
     rng = np.random.default_rng([seed, 0x77696C64])
     name = str(rng.choice(list(STRUCTURES)))
@@ -230,7 +230,7 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
 
 
 def given_as(rng: np.random.Generator, problem: Problem, form: str) -> tuple[Problem, str]:
-    """The problem in that form, or the one nearest to it that it can have; and which that is."""
+    """Return the problem in that form, or the one nearest to it that it can have; and which that is."""
     if form == "dense" and problem.m > LARGEST_DENSE:
         form = "csr"
     if form == "generalized" and problem.rows is None:

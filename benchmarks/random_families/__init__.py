@@ -6,7 +6,7 @@
 A seed gives the same bits in every version: published figures name their seeds.
 """
 
-from random_families.drawn import drawn
-from random_families.wild import wild
+from benchmarks.random_families.drawn import drawn
+from benchmarks.random_families.wild import wild
 
 __all__ = ["drawn", "wild"]
