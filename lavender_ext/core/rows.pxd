@@ -139,46 +139,48 @@ cdef inline void multiply_jacobian(const blocks_t* p, const rows_t* r, const dou
 
 cdef inline void form_contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular,
                                   double* jac) noexcept nogil:
-    """Write the rows of one contact (1 + nt + n_angular, 12) in the layout of joint rows."""
-    cdef double axis[3]
-    cdef double arm[3]
+    """Write the rows of one contact (1 + nt + n_angular, 12) in the layout of joint rows; columns of static bodies are zero."""
     cdef const double* n = r.normal + 3 * c
-    cdef int32_t row, k
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef const double* axis
+    cdef double t2[3]
+    cdef double moment[3]
+    cdef double sign
+    cdef int32_t row, side, k, first = nt + 1 + (n_angular & 1)         # first: the first row of rolling
+    if nt > 1:
+        cross(n, t1, t2)
     for row in range(1 + nt + n_angular):
-        for k in range(12):
-            jac[12 * row + k] = 0.0
-        if row > nt:                                    # Spin is about n, rolling about t1 and t2.
-            for k in range(3):
-                axis[k] = n[k] if row == nt + (n_angular & 1) else r.tangent[3 * c + k]
-            if row == nt + (n_angular & 1) + 2:
-                cross(n, r.tangent + 3 * c, axis)
-            for k in range(3):
-                jac[12 * row + 3 + k] = -axis[k]
-                jac[12 * row + 9 + k] = axis[k]
-            continue
-        if row == 0:
-            for k in range(3):
-                axis[k] = n[k]
-        elif row == 1:
-            for k in range(3):
-                axis[k] = r.tangent[3 * c + k]
-        else:
-            cross(n, r.tangent + 3 * c, axis)
-        cross(r.arm_a + 3 * c, axis, arm)
-        for k in range(3):
-            jac[12 * row + k] = -axis[k]
-            jac[12 * row + 3 + k] = -arm[k]
-            jac[12 * row + 6 + k] = axis[k]
-        cross(r.arm_b + 3 * c, axis, arm)
-        for k in range(3):
-            jac[12 * row + 9 + k] = arm[k]
-    # columns of static bodies are zero
-    for row in range(1 + nt + n_angular):
-        for k in range(6):
-            if r.contact_body[2 * c] < 0:
-                jac[12 * row + k] = 0.0
-            if r.contact_body[2 * c + 1] < 0:
-                jac[12 * row + 6 + k] = 0.0
+        # Spin is about n, rolling about t1 and t2.
+        axis = n if row == 0 or nt < row < first else t1 if row == 1 or row == first else t2
+        for side in range(2):
+            sign = 1.0 if side else -1.0
+            if r.contact_body[2 * c + side] < 0:
+                for k in range(6):
+                    jac[k] = 0.0
+            elif row > nt:
+                for k in range(3):
+                    jac[k] = 0.0
+                    jac[3 + k] = sign * axis[k]
+            else:
+                cross((r.arm_b if side else r.arm_a) + 3 * c, axis, moment)
+                for k in range(3):
+                    jac[k] = sign * axis[k]
+                    jac[3 + k] = sign * moment[k]
+            jac += 6
+
+
+cdef inline const double* get_block_jacobian(const blocks_t* p, const rows_t* r, int32_t i, double* scratch) noexcept nogil:
+    """Return the rows of J (12 each) of block i: those of a joint, or those of a contact, written to scratch (72)."""
+    if i < r.n_joints:
+        return r.jac + 12 * p.ptr[i]
+    cdef int32_t nt = count_tangent_rows(p, i), n_angular = count_angular_rows(p, i)
+    if n_angular == 0 and nt == 2:                          # The two common kinds are compiled with constant sizes.
+        form_contact_jacobian(r, i - r.n_joints, 2, 0, scratch)
+    elif n_angular == 0 and nt == 0:
+        form_contact_jacobian(r, i - r.n_joints, 0, 0, scratch)
+    else:
+        form_contact_jacobian(r, i - r.n_joints, nt, n_angular, scratch)
+    return scratch
 
 
 cdef inline void multiply_inverse_mass(const double* jac, const double* inv_mass, const double* inv_inertia, int32_t a,
