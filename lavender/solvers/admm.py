@@ -100,7 +100,7 @@ class AdmmState:
             self.factor = self._factor()
 
     def _check_deadline(self) -> None:
-        if self.deadline.has_passed(1e-9 * self.next_cost):
+        if not self.deadline.fits(self.next_cost):
             raise TooLate
 
     def _scale_problem(self) -> None:
@@ -209,7 +209,7 @@ class AdmmState:
             done = _factor_shifted_matrix(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # L U by supernodes failed, since it cannot exchange rows across supernodes: try L U of a full matrix.
-            if self.deadline.has_passed(1e-9 * RATES["full LU work"] * count_dense_work(m)):
+            if not self.deadline.fits(RATES["full LU work"] * count_dense_work(m)):
                 raise TooLate
             self.full = True
             self.matrix = matrix = matrix.toarray()

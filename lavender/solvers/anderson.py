@@ -11,11 +11,11 @@ law, unless a test shows that contacts slip (`lavender_ext/accelerate/accelerate
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lavender.base.arrays import check_int
 from lavender.solvers._accelerated import CONVEX_OPTION, MAX_MEMORY, SWEEP_OPTION, Accelerated
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.sweeping import SWEEPS
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,10 @@ class Anderson(Accelerated):
         return self.memory
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="anderson",
     factory=Anderson,
-    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    box_friction_laws=frozenset({"coulomb", "cone"}),
-    operators=frozenset({"rows", "matrix", "generalized"}),
-    order=True,
-    seed=True,
-    supports_rolling=True,
-    max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,
         "convex": CONVEX_OPTION + "; default None: from 900 rows on up to 512, until contacts slip",

@@ -18,8 +18,8 @@ from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.costs import estimate_formation_cost
-from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import (
+    SWEEPS,
     Sweeping,
     SweepState,
     choose_sweep_data,
@@ -49,17 +49,11 @@ class BlockGaussSeidel(Sweeping):
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="block_gauss_seidel",
     factory=BlockGaussSeidel,
-    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    box_friction_laws=frozenset({"coulomb", "cone"}),
-    operators=frozenset({"rows", "matrix", "generalized"}),
-    order=True,
-    seed=True,
     round_cones=True,
-    supports_rolling=True,
-    max_iter=1000,
     summary="Gauss-Seidel over contacts and joints, each solved exactly",
     reference="Jourdan, Alart, Jean 1998; Acary, Bremond, Huber 2018 (NSGS with an exact local solver)",
 )

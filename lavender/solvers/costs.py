@@ -27,43 +27,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, nan
 
-from lavender.base.rates import RATES
+from lavender.base.rates import RATES as RATES
 from lavender.problem import Problem
 from lavender.solvers.decisions import DECISIONS
 from lavender_ext.factor.sparse import bandwidth
-
-__all__ = [
-    "RATES",
-    "Cost",
-    "Count",
-    "count_dense_work",
-    "estimate_analysis_cost",
-    "estimate_band_factor_cost",
-    "estimate_dense_factor_cost",
-    "estimate_direct_cost",
-    "estimate_disk_cost",
-    "estimate_elimination_cost",
-    "estimate_factorisation_count",
-    "estimate_first_factor_cost",
-    "estimate_first_sweep_cost",
-    "estimate_formation_cost",
-    "estimate_import_cost",
-    "estimate_judge_setup_cost",
-    "estimate_matrix_setup_cost",
-    "estimate_newton_cost",
-    "estimate_order_cost",
-    "estimate_panel_factor_cost",
-    "estimate_pass_cost",
-    "estimate_refusal_cost",
-    "estimate_result_cost",
-    "estimate_row_sums_cost",
-    "estimate_sparse_work",
-    "estimate_sweep_cost",
-    "estimate_symmetry_cost",
-    "get_loose_limit",
-    "get_sweep_rate_name",
-    "is_formed",
-]
 
 SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factorisations need.
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sor import SOR
+from lavender.solvers import sor
 
 
 @dataclass(frozen=True)
-class GaussSeidel(SOR):
+class GaussSeidel(sor.SOR):
     """Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     omega: float = field(default=1.0, init=False)
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    sor.SPEC,
     name="gauss_seidel",
     factory=GaussSeidel,
-    laws=frozenset({"linear"}),
-    operators=frozenset({"matrix"}),
-    order=True,
-    seed=True,
-    max_iter=1000,
+    options={},
     bounded_hint=": 'pgs' is this method with bounds",
     bounded_variant="pgs",
     summary="Gauss-Seidel iteration of a linear system",

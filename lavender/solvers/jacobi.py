@@ -9,7 +9,7 @@ multiply the error by k - 1 in each iteration and do not converge for k >= 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,8 +17,7 @@ from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import compute_block_order
 from lavender.solvers.costs import Cost, estimate_row_sums_cost
-from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import SweepSolver, SweepState, make_order_plan
+from lavender.solvers.sweeping import SWEEPS, SweepSolver, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
 
@@ -50,14 +49,15 @@ class Jacobi(SweepSolver):
         )
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="jacobi",
     factory=Jacobi,
-    laws=frozenset({"linear", "lcp", "coulomb"}),
+    laws=SWEEPS.laws - {"cone"},
     box_friction_laws=frozenset({"coulomb"}),
     operators=frozenset({"matrix"}),
-    supports_rolling=True,
-    max_iter=1000,
+    order=False,
+    seed=False,
     options={"omega": "damping factor; the default is safe for every symmetric positive semidefinite A"},
     summary="damped Jacobi, projected",
     reference="Saad 2003, section 4.1; Tasora, Anitescu 2011 for the projected form",

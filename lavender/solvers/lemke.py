@@ -76,9 +76,7 @@ class Lemke(Solver):
         deadline = Deadline(time_limit)
         n, free = _count_dictionary_rows(state.problem)
         # Building the dictionary and eliminating the free rows cannot be interrupted.
-        if deadline.has_passed(
-            1e-9 * (RATES["dictionary entry"] + RATES["dictionary elimination"] * free) * n**2
-        ):
+        if not deadline.fits((RATES["dictionary entry"] + RATES["dictionary elimination"] * free) * n**2):
             return Claim(
                 Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
             )
@@ -137,9 +135,8 @@ def _find_certificate_by_linear_program(
     problem: Problem, tol: float, deadline: Deadline
 ) -> FloatArray | None:
     """Search a certificate (m,) by a linear program, for a problem on which Lemke's method failed; None without one."""
-    if problem.m > CERTIFICATE_ROWS or deadline.has_passed(
-        1e-9 * (RATES["linear program"] + estimate_import_cost("scipy.optimize"))
-    ):
+    cost = RATES["linear program"] + estimate_import_cost("scipy.optimize")
+    if problem.m > CERTIFICATE_ROWS or not deadline.fits(cost):
         return None
     y = find_certificate_by_linear_program(problem, deadline)
     return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None

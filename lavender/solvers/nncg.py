@@ -17,11 +17,11 @@ the slow motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lavender.base.errors import check_name
 from lavender.solvers._accelerated import CONVEX_OPTION, SWEEP_OPTION, Accelerated
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.sweeping import SWEEPS
 
 RESTARTS = ("growth", "against")
 
@@ -40,17 +40,11 @@ class NNCG(Accelerated):
         return self.restart == "against"
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="nncg",
     factory=NNCG,
-    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    box_friction_laws=frozenset({"coulomb", "cone"}),
-    operators=frozenset({"rows", "matrix", "generalized"}),
-    order=True,
-    seed=True,
     round_cones=True,
-    supports_rolling=True,
-    max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,
         "convex": CONVEX_OPTION + "; default 0",

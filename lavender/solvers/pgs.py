@@ -20,8 +20,8 @@ from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.costs import estimate_formation_cost
-from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import (
+    SWEEPS,
     Sweeping,
     SweepState,
     form_name,
@@ -52,16 +52,13 @@ class PGS(Sweeping):
         return SweepState(problem, data, order, serial.Sweeps(data, _NONE if row_by_row else blocks, *rest))
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="pgs",
     factory=PGS,
-    laws=frozenset({"linear", "lcp", "coulomb"}),
+    laws=SWEEPS.laws - {"cone"},
     box_friction_laws=frozenset({"coulomb"}),
     operators=frozenset({"matrix", "generalized"}),
-    order=True,
-    seed=True,
-    supports_rolling=True,
-    max_iter=1000,
     summary="projected Gauss-Seidel on the rows of A, or on J and M",
     reference="Cottle, Pang, Stone 1992, section 5.2; Jourdan, Alart, Jean 1998 for friction",
 )

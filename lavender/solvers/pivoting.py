@@ -124,7 +124,7 @@ class PivotState:
     def is_too_late_to_sweep(self, deadline: Deadline) -> bool:
         """Return whether the sweeps before the first factor would end after the deadline."""
         cost = self.sweeps * RATES["symmetric sweep entry"] * self.problem.csr_data.work
-        return deadline.has_passed(1e-9 * cost)
+        return not deadline.fits(cost)
 
     def run_rounds(self, deadline: Deadline, max_rounds: int) -> tuple[int, bool]:
         """Run at most `max_rounds` rounds that are expected to end before the deadline.

@@ -18,8 +18,8 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
+from lavender.solvers import pgs
 from lavender.solvers.layout import Layout, copy_problem_in_block_order, is_reordered_copy_faster
-from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
@@ -98,16 +98,11 @@ class SequentialImpulses(Sweeping):
         return claim
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    pgs.SPEC,
     name="sequential_impulses",
     factory=SequentialImpulses,
-    laws=frozenset({"linear", "lcp", "coulomb"}),
-    box_friction_laws=frozenset({"coulomb"}),
     operators=frozenset({"rows"}),
-    order=True,
-    seed=True,
-    supports_rolling=True,
-    max_iter=1000,
     summary="projected Gauss-Seidel on body velocities, matrix-free",
     reference="Catto 2005, Iterative Dynamics with Temporal Coherence; Guendelman, Bridson, Fedkiw 2003",
 )

@@ -5,15 +5,14 @@ It converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Rei
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lavender.base.arrays import check_float
 from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
+from lavender.solvers.sweeping import SWEEPS, Sweeping, SweepState, make_order_plan
 from lavender_ext.sweep import serial
 
 
@@ -43,14 +42,14 @@ class SOR(Sweeping):
         )
 
 
-SPEC = SolverSpec(
+SPEC = replace(
+    SWEEPS,
     name="sor",
     factory=SOR,
     laws=frozenset({"linear"}),
+    box_friction_laws=frozenset(),
     operators=frozenset({"matrix"}),
-    order=True,
-    seed=True,
-    max_iter=1000,
+    supports_rolling=False,
     bounded_hint=": 'pgs' is this method with bounds, at omega = 1",
     options={"omega": "relaxation factor, 0 < omega < 2; default 1.5"},
     summary="successive over-relaxation of a linear system",

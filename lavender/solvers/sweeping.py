@@ -15,10 +15,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
-from lavender.problem import Problem
+from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.problem.ordering import GIVEN, Order, compute_block_order
 from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_order_cost
-from lavender.solvers.registry import Solver
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
 from lavender_ext.sweep import serial
 
@@ -154,3 +154,17 @@ class Sweeping(SweepSolver):
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         """Build the state; `before` is the state of a problem of the same structure and order, or None."""
         return SweepState(problem, problem.csr_data, order)
+
+
+# Capabilities that sweeps share; the specs of the solvers replace what differs.
+SWEEPS = SolverSpec(
+    name="sweeps",
+    factory=Sweeping,
+    laws=frozenset(LAWS),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
+    operators=frozenset(OPERATORS),
+    order=True,
+    seed=True,
+    supports_rolling=True,
+    summary="sweeps over blocks",
+)

@@ -20,10 +20,15 @@ from lavender.solvers.costs import (
     estimate_disk_cost,
     estimate_import_cost,
     estimate_judge_setup_cost,
+    estimate_pass_cost,
     estimate_refusal_cost,
+    estimate_result_cost,
     get_loose_limit,
 )
 from lavender.solvers.registry import Solver, SolverSpec
+
+# [passes of the judge] Cost of judging `auto`'s last iterate and of selecting the best iterate of each island.
+SELECTION_PASSES = 3
 
 
 def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
@@ -37,31 +42,43 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     if (
         problem.rows is not None
         and problem.cones.has_ellipse
-        and deadline.has_passed(1e-9 * estimate_judge_setup_cost(problem))
+        and not deadline.fits(estimate_judge_setup_cost(problem))
     ):
         # Even counting the couplings of bodies, which gives the number of entries of A, would take too long.
         return True
-    refusal = estimate_refusal_cost(problem) if spec.external else 0.0
-    needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
-    if (
-        needed > 0.0
-        and problem.generalized is None
-        and deadline.has_passed(needed)
-        and estimate_import_cost("scipy.sparse")
-    ):
+    for may_import in (problem.generalized is None, False):
+        cost = estimate_disk_cost(problem) + (estimate_refusal_cost(problem) if spec.external else 0.0)
+        if cost == 0.0 or deadline.fits(cost):
+            return False
+        if not (may_import and estimate_import_cost("scipy.sparse")):
+            return True
         _import_outside_time_limit(deadline)
-        needed = 1e-9 * (estimate_disk_cost(problem) + refusal)
-    return needed > 0.0 and deadline.has_passed(needed)
+    return True
 
 
 def is_setup_too_late(solver: Solver, problem: Problem, deadline: Deadline) -> bool:
     """Return whether the solver's `prepare` would end after the deadline."""
-    if not deadline.has_passed(1e-9 * solver.cost(problem).setup):
+    if deadline.fits(solver.cost(problem).setup):
         return False
     if not (solver.needs_scipy and estimate_import_cost(*SCIPY_MODULES)):
         return True
     _import_outside_time_limit(deadline)
-    return deadline.has_passed(1e-9 * solver.cost(problem).setup)
+    return not deadline.fits(solver.cost(problem).setup)
+
+
+def reserve_time_of_judge(problem: Problem, spec: SolverSpec, has_start: bool, deadline: Deadline) -> bool:
+    """Move the deadline to leave time for the judge; return whether the judge would end too late.
+
+    The judge makes one pass for the result, and one for a start that is not zero.
+    """
+    cost = (2 if has_start or problem.guess is not None else 1) * estimate_result_cost(problem)
+    if not spec.external and not deadline.fits(estimate_judge_setup_cost(problem) + cost):
+        return True
+    deadline.reserve_seconds(1e-9 * cost)
+    selection = SELECTION_PASSES * estimate_pass_cost(problem)
+    if spec.delegates and deadline.fits(4.0 * selection):
+        deadline.reserve_seconds(1e-9 * selection)
+    return False
 
 
 def _import_outside_time_limit(deadline: Deadline) -> None:
@@ -76,7 +93,7 @@ def is_tight(problem: Problem, deadline: Deadline) -> bool:
 
     Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
     """
-    return deadline.has_passed(1e-9 * get_loose_limit(problem))
+    return not deadline.fits(get_loose_limit(problem))
 
 
 def check_time_limit(time_limit: Any) -> float:

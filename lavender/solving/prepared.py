@@ -44,15 +44,19 @@ from lavender.solvers.certify import check_infeasibility_claim
 from lavender.solvers.costs import (
     SCIPY_MODULES,
     estimate_import_cost,
-    estimate_judge_setup_cost,
-    estimate_pass_cost,
-    estimate_result_cost,
 )
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, create_unjudged, decide_empty_rows, finish, name_lost_row
-from lavender.solving.limits import check_time_limit, is_setup_too_late, is_tight, is_too_late, make_deadline
+from lavender.solving.limits import (
+    check_time_limit,
+    is_setup_too_late,
+    is_tight,
+    is_too_late,
+    make_deadline,
+    reserve_time_of_judge,
+)
 from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
@@ -63,8 +67,6 @@ if TYPE_CHECKING:
 
     from lavender.solvers.registry import SolverOptions
 
-# [passes of the judge] Cost of judging `auto`'s last iterate and of selecting the best iterate of each island.
-SELECTION_PASSES = 3
 SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
 JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
 WITHOUT_SCIPY_MESSAGE = (
@@ -279,9 +281,14 @@ class Prepared:
             check_problem(original)
         deadline = arguments.deadline
         if deadline is not None and is_tight(original, deadline):
-            unjudged = self._reserve_time_of_judge(original, arguments)
-            if unjudged is not None:
-                return unjudged
+            late = is_too_late(original, self.spec, deadline)
+            if late or reserve_time_of_judge(
+                original.disk, self.spec, arguments.impulse is not None, deadline
+            ):
+                self._replace_problem(original, deadline)
+                return create_unjudged(
+                    original, self.spec, self.options, arguments.impulse, arguments.tol, JUDGE_LATE_MESSAGE
+                )
         start = None
         if arguments.impulse is not None:
             disk = original.disk
@@ -351,29 +358,6 @@ class Prepared:
         self._original, self.problem, self._setup = original, problem, setup
         self.setup_time += perf_counter() - begin
         return setup
-
-    def _reserve_time_of_judge(self, original: Problem, arguments: SolveArguments) -> Solution | None:
-        """Move the deadline to leave time for the judge; return the start unjudged if the judge would end too late."""
-        deadline, spec = arguments.deadline, self.spec
-        assert deadline is not None
-        late = is_too_late(original, spec, deadline)
-        if not late:
-            disk = original.disk
-            # The judge makes one pass for the result, and one for a start that is not zero.
-            passes = 2 if arguments.impulse is not None or disk.guess is not None else 1
-            judge_time = 1e-9 * passes * estimate_result_cost(disk)
-            setup_time = 1e-9 * estimate_judge_setup_cost(disk)
-            late = deadline.has_passed(setup_time + judge_time) and not spec.external
-        if late:
-            self._replace_problem(original, deadline)
-            return create_unjudged(
-                original, spec, self.options, arguments.impulse, arguments.tol, JUDGE_LATE_MESSAGE
-            )
-        deadline.reserve_seconds(judge_time)
-        selection_time = 1e-9 * SELECTION_PASSES * estimate_pass_cost(disk)
-        if spec.delegates and not deadline.has_passed(4.0 * selection_time):
-            deadline.reserve_seconds(selection_time)
-        return None
 
     def _start_workers(self, setup: SetUp, deadline: Deadline) -> None:
         """Start the worker processes of a solver, without counting their start as time of the solve."""

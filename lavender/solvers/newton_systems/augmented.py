@@ -49,7 +49,7 @@ class AugmentedSystem:
         """
         deadline: Deadline | None = self.system.deadline
         if self.k is None:
-            if deadline is not None and deadline.has_passed(1e-9 * RATES["scipy calls"]):
+            if deadline is not None and not deadline.fits(RATES["scipy calls"]):
                 raise TooLate
             self.k = self._build_jacobian()
             # The system contains K twice, and block-diagonal matrices.

@@ -20,7 +20,7 @@ import lavender as lv
 from lavender import contract, registry
 from lavender.base.errors import TooLarge
 from lavender.problem import operators
-from lavender.solvers import steps
+from lavender.solving import auto
 
 OURS = lv.available(external=False)
 #: Backends that must solve every problem that they accept; others may fail if the result reports it.
@@ -253,7 +253,7 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
 
     problem = random_contact_problem(3, contacts=60, bodies=20, friction="coulomb")
     assert problem.m > registry.SMALL_ROWS
-    kinds = {steps.Newton, steps.Step, steps.Iterations, steps.Sweeps}
+    kinds = {auto.Newton, auto.Step, auto.Iterations, auto.Sweeps}
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
             monkeypatch.setattr(kind, "advance", breaks)
