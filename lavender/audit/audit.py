@@ -47,11 +47,9 @@ from lavender.base.arrays import FloatArray, check_choice, check_float, check_in
 from lavender.base.errors import InputError, check_name
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
-from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
-from lavender.io.recording import Control
-from lavender.io.states import VECTOR
-from lavender.io.stored import lock_step_folder, write_arrays
+from lavender.io.recorder import VECTOR, Control
+from lavender.io.stored import lock_step_folder, write_arrays, write_npz
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.problem import PRECISIONS, Problem
 from lavender.report.bench import machine
@@ -519,7 +517,7 @@ class Audit:
         folder = Path(folder)
         with lock_step_folder(folder / "worst", replace=True) as worst:
             for i, w in enumerate(self.worst, 1):
-                npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
+                write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
         self.save_states("worst", folder / "states.npz")
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
@@ -613,7 +611,7 @@ def audit(
         See `Runs`. Default spread: the largest of 0.1, 0.01, 0.001 and 0 m/s with which trial worlds do not diverge.
     engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
-        States in which the worlds start: see `lavender.io.states`. Default: the model's own.
+        States in which the worlds start: see `lavender.io.recorder`. Default: the model's own.
     keep : int, optional
         Number of worst steps that are kept as problems and states. Default: the worst step of each of three worlds.
     keep_contact_states : bool

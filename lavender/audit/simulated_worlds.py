@@ -28,8 +28,16 @@ from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
 from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
-from lavender.io.recording import Control, load_controls, load_model, make_controller
-from lavender.io.states import StartStates, can_sleep, read_states, without_sleep
+from lavender.io.recorder import (
+    Control,
+    StartStates,
+    can_sleep,
+    load_controls,
+    load_model,
+    make_controller,
+    read_states,
+    without_sleep,
+)
 from lavender.report.table import Table
 from lavender.report.text import format_count, format_percent
 

@@ -411,7 +411,7 @@ def explain_slip_of_states(
         No geom has one of the names.
     """
     from lavender.io import mujoco as adapter
-    from lavender.io.states import read_states, without_sleep
+    from lavender.io.recorder import read_states, without_sleep
 
     mj = adapter.import_mujoco()
     model = without_sleep(mj, model)

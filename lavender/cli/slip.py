@@ -38,8 +38,7 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
     from lavender.audit.slip import explain_slip_of_states, summarize_slip
     from lavender.audit.slip_figure import draw_slip
     from lavender.base.arrays import check_int
-    from lavender.io.recording import load_model
-    from lavender.io.states import can_sleep
+    from lavender.io.recorder import can_sleep, load_model
     from lavender.report.terminal import print_table
 
     steps = check_int("steps", steps, 1)

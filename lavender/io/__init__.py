@@ -20,7 +20,7 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError
-from lavender.io import drake, efc, fclib, mujoco, npz
+from lavender.io import drake, efc, fclib, mujoco
 from lavender.io.drake import from_drake
 from lavender.io.efc import from_efc, from_mujoco_many
 from lavender.io.engine_step import Claims, EngineStep
@@ -29,9 +29,8 @@ from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
 from lavender.io.newton_mujoco import from_newton_mujoco
 from lavender.io.pinocchio import from_pinocchio
-from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
-from lavender.io.recording import Recording, record
-from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, read_first_bytes
+from lavender.io.recorder import Recorder, Recording, StepVerdict, read_recorded_state, record
+from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, read_first_bytes, read_npz, write_npz
 from lavender.problem import Problem
 
 __all__ = [
@@ -86,7 +85,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     """
     start = read_first_bytes(path)
     if start[:2] == b"PK":
-        return npz.read(path, max_bytes=max_bytes)
+        return read_npz(path, max_bytes=max_bytes)
     if start == b"\x89HDF\r\n\x1a\n":
         return fclib.read(path, max_bytes=max_bytes)
     content = f"starts with {start!r}" if start else "is empty"
@@ -144,7 +143,7 @@ def save(
                 "form= and drop= have no effect on an .npz file, which holds everything: leave them out, "
                 "or give a path that ends with .hdf5 (FCLIB)"
             )
-        npz.write(problem, path, impulse=impulse)
+        write_npz(problem, path, impulse=impulse)
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, form=form, drop=drop)
     else:

@@ -320,7 +320,7 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
 
 def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkeypatch):
     """In the terminal, the records and the exit code, at once, found recorded, as a campaign and in a check."""
-    recording = pytest.importorskip("lavender.io.recording")
+    recording = pytest.importorskip("lavender.io.recorder")
     pytest.importorskip("mujoco")
     (tmp_path / "box.xml").write_text(ARM.format(height=0.1, kind="box"))
     true = recording.adapter.from_mujoco
@@ -352,7 +352,7 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
 
 
 def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
-    mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
+    mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recorder")
     if not hasattr(mujoco, "mju_getXMLDependencies"):
         pytest.skip("this MuJoCo does not tell what a model includes")
     model, part, played = (tmp_path / name for name in ("scene.xml", "part.xml", "played.npy"))

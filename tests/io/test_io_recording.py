@@ -7,7 +7,7 @@ import pytest
 from mujoco_scene import mj, scene, state
 
 import lavender as lv
-from lavender.io import recording
+from lavender.io import recorder
 
 PGS = 1e-6  # as in test_io_mujoco.py
 
@@ -47,7 +47,7 @@ def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypat
     def refuse(model, data, name):
         raise lv.CapabilityError(f"{name} has a constraint of an unknown type")
 
-    monkeypatch.setattr(recording.adapter, "from_mujoco", refuse)
+    monkeypatch.setattr(recorder.adapter, "from_mujoco", refuse)
     found = lv.io.record(*state(steps=1), tmp_path, 20, every=10)
     assert (len(found.files), len(found.left_out)) == (0, 2)
     assert "unknown type" in str(found)
@@ -150,4 +150,4 @@ def test_controls_of_another_thing_are_refused_by_name(tmp_path, make):
     make(path)
     path = next(tmp_path.glob("controls*"), path)  # NumPy gives an archive a suffix of its own
     with pytest.raises(lv.InputError, match="control"):
-        recording.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))
+        recorder.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))
