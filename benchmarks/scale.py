@@ -9,8 +9,9 @@ solves to `TOL` without a start: CPU time of one thread, smallest of alternating
 peak memory of the process; factorisations. Answers are judged under Coulomb's law by this checkout. A mix is a list of
 stages (solver, law, iterations), each started from the impulse of the one before, which ends as soon as Coulomb's law
 is met. Regret is the time of `auto` divided by the time of the fastest named solver or mix. If `auto` solves a problem,
-the others end after `MAX_SLOWDOWN` times its time; the regret is 1 if none of them solves the problem until then. The
-growth exponent of a structure is the slope of log time over log rows, by least squares from `MIN_GROWTH_ROWS` rows on.
+the others end after `MAX_SLOWDOWN` times its time; the regret is 1 if none of them solves it until then. Limits
+are wall times; on a loaded machine they are multiplied by the load per core. The growth exponent of a structure is the
+slope of log time over log rows, by least squares from `MIN_GROWTH_ROWS` rows on.
 """
 
 from __future__ import annotations
@@ -142,8 +143,9 @@ def measure(
         for name, python, folder, stages in tasks:
             auto = measured.get("auto")
             enough = name in CONTESTANTS and auto is not None and auto["solved"]
-            allowed = max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"]) if enough else limit
-            found = run_worker(python, folder, path, stages, min(limit, allowed))
+            allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"])) if enough else limit
+            load_per_core = os.getloadavg()[0] / (os.cpu_count() or 1)
+            found = run_worker(python, folder, path, stages, allowed * max(1.0, load_per_core))
             if found:
                 found["residual"] = float(lv.residual(problem, np.load(f"{path}.npy")).relative)
             else:
