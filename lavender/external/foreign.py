@@ -52,7 +52,7 @@ class ForeignSolver(Solver):
     def _call_optional(self, method: str, *arguments: Any) -> Any:
         return self._call_method(method, *arguments) if self._has_method(method) else None
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Return the wrapped solver's own estimate of its costs [ns]; without one, the cost of `prepare` is 0."""
         estimate = self._call_optional("cost", problem)
         if estimate is None:

@@ -48,7 +48,7 @@ class QPSolver(Solver):
             )
         check_bool("isolate", self.isolate)
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost to form the program, and to send it if the backend runs in another process."""
         entry = RATES["program entry"] + (1e9 * ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
         return Cost(lambda: RATES["program"] + entry * problem.max_entries)

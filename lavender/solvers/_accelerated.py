@@ -76,7 +76,7 @@ class Accelerated(Sweeping):
         )
         return estimate_formation_cost(problem) if over_a else 0.0
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
         setup = partial(self._estimate_setup_cost, problem)
         return Cost(setup, lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))

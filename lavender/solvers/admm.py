@@ -289,7 +289,7 @@ class ADMM(Solver):
 
     needs_scipy = True
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare`; all other set-up runs in `set_deadline` if it fits, else in `run`."""
         return Cost(partial(estimate_import_cost, *SCIPY_MODULES))
 

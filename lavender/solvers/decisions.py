@@ -6,7 +6,8 @@ nanoseconds are measured separately (`rates.json`).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 __all__ = ["DECISIONS", "NUMBERS", "Number", "describe_numbers"]
 
@@ -74,28 +75,9 @@ NUMBERS = (
 )  # fmt: skip
 
 
-class Decisions:
-    """The values of `NUMBERS` as attributes."""
-
-    small_rows: float
-    island_rows: float
-    call_cost: float
-    first_sweeps: float
-    relaxed_rows: float
-    sweep_fraction: float
-    slip_ratio: float
-    factorisations: float
-    pivot_factorisations: float
-    budget_ratio: float
-    total_ratio: float
-    time_share: float
-
-    def __init__(self) -> None:
-        for number in NUMBERS:
-            setattr(self, number.name, number.value)
-
-
-DECISIONS = Decisions()
+DECISIONS: Any = SimpleNamespace(
+    **{number.name: number.value for number in NUMBERS}
+)  # The values as attributes.
 
 
 def describe_numbers() -> str:

@@ -102,7 +102,7 @@ class Direct(Solver):
 
     needs_scipy = True
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare`, which includes the factor of a linear problem, and of exchanges."""
         setup = _estimate_linear_cost if problem.law == "linear" else estimate_matrix_setup_cost
         return Cost(partial(setup, problem), total=partial(estimate_direct_cost, problem))

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 from lavender.base.arrays import check_float
 from lavender.problem import Problem
@@ -37,7 +36,7 @@ class Jacobi(SweepSolver):
         if self.omega is not None:
             check_float("omega", self.omega, above=0.0)
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare`."""
         return Cost(partial(estimate_row_sums_cost, problem))
 

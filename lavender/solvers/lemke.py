@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,7 @@ class Lemke(Solver):
 
     needs_scipy = True
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare`."""
         return Cost(partial(estimate_matrix_setup_cost, problem))
 

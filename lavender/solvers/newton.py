@@ -151,12 +151,11 @@ class Newton(Solver):
 
     needs_scipy = True
 
-    def cost(self, problem: Problem, state: NewtonState | None = None) -> Cost:
-        """Estimate the costs; without a state, the total is a lower bound that needs no analysis of the matrix."""
-        setup = partial(self._estimate_setup_cost, problem)
-        if state is None:
-            return Cost(setup, total=partial(self._estimate_min_cost, problem))
-        return Cost(setup, lambda: state.cost / state.steps, lambda: state.cost)
+    def cost(self, problem: Problem) -> Cost:
+        """Estimate the costs; the total is a lower bound that needs no analysis of the matrix (`NewtonState.cost`)."""
+        return Cost(
+            partial(self._estimate_setup_cost, problem), total=partial(self._estimate_min_cost, problem)
+        )
 
     def _estimate_setup_cost(self, problem: Problem) -> float:
         """Estimate the cost of `prepare` [ns]."""

@@ -168,7 +168,7 @@ class BoundedRowSolver(Solver):
     def __init__(self, solver: Solver) -> None:
         self.solver, self.needs_scipy = solver, solver.needs_scipy
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the costs of the inner solver, with the conversion of the rows."""
         own = self.solver.cost(problem)
         if problem.law in ("linear", "lcp"):

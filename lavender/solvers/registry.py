@@ -58,8 +58,13 @@ class SolverOptions(TypedDict, total=False):
 class SmallCall(Protocol):
     """Compiled call that solves a small problem with the same bits as `run`, or returns None to leave it to `run`."""
 
-    pivots: bool
-    hands_over: bool
+    @property
+    def pivots(self) -> bool:  # pyright: ignore[reportReturnType]
+        """Whether the call accepts bounded rows of a matrix or of bodies."""
+
+    @property
+    def hands_over(self) -> bool:  # pyright: ignore[reportReturnType]
+        """Whether the call accepts friction on a matrix or on bodies."""
 
     @property
     def limits(self) -> Any:
@@ -128,8 +133,8 @@ class Solver:
 
     needs_scipy = False  # Whether `prepare` uses modules of SciPy that are imported at their first use.
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
-        """Estimate the costs [ns] from the size of the problem, and from the state that `prepare` returned if given.
+    def cost(self, problem: Problem) -> Cost:
+        """Estimate the costs [ns] from the size of the problem.
 
         Under a time limit, `prepare` starts only if its cost fits. `auto` compares the costs of solvers.
         """
@@ -349,7 +354,7 @@ class SolverSpec:
             Whether to compare only the kind of the problem with the spec, without computing anything from its data and
             without calling `refusal`.
         """
-        if not isinstance(problem, Problem):
+        if type(problem) is not Problem:
             check_problem(problem)
         if not self.singular_programs and problem.qp is not None and problem.qp.is_singular:
             return (

@@ -16,9 +16,10 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem
-from lavender.problem.ordering import GIVEN, Order, compute_block_order
+from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_order_cost
 from lavender.solvers.registry import Solver, SolverSpec
+from lavender_ext.core.order import GIVEN
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
 from lavender_ext.sweep import serial
 
@@ -122,7 +123,7 @@ class Sweeping(SweepSolver):
     ground: Any = None
     seed: int = 0
 
-    def cost(self, problem: Problem, state: Any = None) -> Cost:
+    def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare`."""
         return Cost(partial(self._estimate_setup_cost, problem))
 

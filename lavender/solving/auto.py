@@ -193,7 +193,8 @@ class SolveLog:
             False  # A stage was left out or ended early, because the remaining time was too short.
         )
         # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
-        self.best, self.impulse, self.judged = inf, problem._start, None
+        self.best, self.impulse = inf, problem._start
+        self.judged: Any = None
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
         self.stages: list[SolverStage] = []
@@ -669,58 +670,38 @@ STEPS = {
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the tree.
+    """One stage of the tree."""
 
-    Parameters
-    ----------
-    solver : str
-        Name in `METHODS`, or "certificate".
-    iterations : float
-        Largest number of iterations.
-    cost : float, ns
-        Estimated cost of these iterations.
-    why : str
-        Reason, for `lavender.explain`.
-    least : float
-        Sweeps stop if they predict that more than this number of sweeps is still needed.
-    position : int
-        Position among the stages after which only islands that are not solved continue; 0 for other stages.
-    """
-
-    solver: str
-    iterations: float
-    cost: float
-    why: str
-    least: float = inf
+    solver: str  # Name in `METHODS`, or "certificate".
+    iterations: float  # Largest number of iterations.
+    cost: float  # [ns] Estimated cost of these iterations.
+    why: str  # Reason, for `lavender.explain`.
+    least: float = inf  # Sweeps stop if they predict that more than this number of sweeps is still needed.
+    # Position among the stages after which only islands that are not solved continue; 0 for other stages.
     position: int = 0
 
 
-@dataclass(eq=False)
 class DecisionTree:
     """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
 
-    Parameters
-    ----------
-    problem : Problem
-    deadline : Deadline
-    log : SolveLog, optional
-        Its `best` is the smallest relative residual so far; None if no stage runs.
-    first_stage : int
-        Position of the first stage; earlier ones have run on a problem with more islands.
-    compiled_call_failed : bool
-        Whether the compiled call over velocities of J and M has failed.
-    started_from_zero : bool
-        Whether that call started from the zero impulse.
+    `log.best` is the smallest relative residual so far; without a log, no stage runs. Stages before `first_stage` have
+    run on a problem with more islands.
     """
 
-    problem: Problem
-    deadline: Deadline = NEVER
-    log: Any = None
-    first_stage: int = 1
-    compiled_call_failed: bool = False
-    started_from_zero: bool = False
+    compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
+    started_from_zero = False  # Whether that call started from the zero impulse.
     remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
     sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
+
+    def __init__(
+        self, problem: Problem, deadline: Deadline = NEVER, log: Any = None, first_stage: int = 1
+    ) -> None:
+        self.problem, self.law, self.deadline, self.log = problem, problem.law, deadline, log
+        self.first_stage = first_stage
+        self.sweep = estimate_cost("anderson", problem).iteration  # [ns] Cost of one sweep.
+        self.first = DECISIONS.first_sweeps * self.sweep  # [ns] Cost of the first sweeps.
+        # [ns] Lower bound of the cost of Newton's method, without its analysis.
+        self.min_newton_cost = estimate_cost("newton", problem).total
 
     @property
     def best(self) -> float:
@@ -732,19 +713,9 @@ class DecisionTree:
         self.remaining_cost += stage.cost
 
     @cached_property
-    def sweep(self) -> float:
-        """Cost of one sweep [ns]."""
-        return estimate_cost("anderson", self.problem).iteration
-
-    @cached_property
     def relaxed_sweep(self) -> float:
         """Cost of one sweep over the convex relaxation [ns]."""
         return estimate_cost("anderson", get_relaxation(self.problem)).iteration
-
-    @cached_property
-    def min_newton_cost(self) -> float:
-        """Lower bound of the cost of Newton's method [ns], without its analysis."""
-        return estimate_cost("newton", self.problem).total
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
@@ -805,16 +776,6 @@ class DecisionTree:
         else:
             return False
         return self.formation <= max_cost and self.deadline.fits(self.formation / DECISIONS.time_share)
-
-    @property
-    def law(self) -> str:
-        """Law of the problem."""
-        return self.problem.law
-
-    @cached_property
-    def first(self) -> float:
-        """Cost of the first sweeps [ns]."""
-        return DECISIONS.first_sweeps * self.sweep
 
     @cached_property
     def formation(self) -> float:
@@ -1017,23 +978,14 @@ class DecisionTree:
 
 @dataclass
 class AutoState:
-    """State of one solve.
-
-    Parameters
-    ----------
-    problem : Problem
-    failed_call : tuple of int or None
-        Counts of a compiled call that has failed; None if it has not been made.
-    loop : Loop or None
-        Loop of the solve, if it records a history.
-    first_stage : int
-        Position of the first stage that has not run on a problem with more islands (`Stage.position`).
-    """
+    """State of one solve."""
 
     problem: Problem
-    failed_call: tuple[int, ...] | None = None
-    loop: Loop | None = None
-    first_stage: int = 1
+    failed_call: tuple[int, ...] | None = (
+        None  # Counts of a compiled call that has failed; None without a call.
+    )
+    loop: Loop | None = None  # Loop of the solve, if it records a history.
+    first_stage: int = 1  # Position of the first stage that has not run on a problem with more islands.
 
 
 @dataclass(frozen=True)

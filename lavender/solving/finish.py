@@ -122,56 +122,28 @@ class Rule(NamedTuple):
     message: str = ""
 
 
-def _meets_tol(run: FinishedRun, judged: Residual) -> bool:
-    return judged.relative <= run.tol
-
-
-def _meets_positive_tol(run: FinishedRun, judged: Residual) -> bool:
-    return run.tol > 0.0 and judged.relative <= run.tol
-
-
 def _hides_b(run: FinishedRun, judged: Residual) -> bool:
     """Return whether the impulse is so large that float64 loses b: the floor alone exceeds tol."""
-    metric = run.problem.metric
-    return (
-        run.tol < judged.relative == judged.roundoff_floor
-        and divide_by_reference(metric, judged.energy, judged.velocity) <= run.tol
-    )
-
-
-def _met_tol_before_refinement(run: FinishedRun, judged: Residual) -> bool:
-    return judged._float64_relative <= run.tol < judged.relative
-
-
-def _is_refined_above_tol(run: FinishedRun, judged: Residual) -> bool:
-    return run.tol < judged.relative and judged._float64_relative < math.inf
-
-
-def _met_tol_as_formed(run: FinishedRun, judged: Residual) -> bool:
-    return judged.relative > run.tol and _holds_as_formed(run)
-
-
-def _met_floor_as_formed(run: FinishedRun, judged: Residual) -> bool:
-    return not judged.above_floor <= run.tol and _holds_as_formed(run)
-
-
-def _is_rounding(run: FinishedRun, judged: Residual) -> bool:
-    return judged.above_floor <= run.tol < judged.relative
+    relative = divide_by_reference(run.problem.metric, judged.energy, judged.velocity)
+    return run.tol < judged.relative == judged.roundoff_floor and relative <= run.tol
 
 
 _ILL_CONDITIONED = "M is ill-conditioned: residuals below {floor:.1e} are rounding errors of float64"
 _FORMED = "its test was met only on A as it was formed, not on the given data"
-# The rules are applied in order, each to the status that the rules before it have left.
+# The rules are applied in order, each to the status that the rules before it have left. `_float64_relative` is the
+# residual before its refinement for an ill-conditioned M.
 RULES = (
     Rule((CONVERGED, STALLED), _hides_b, DIVERGED, "next to such impulses float64 loses b"),
-    Rule((MAX_ITERATIONS, TIME_LIMIT, STALLED), _meets_positive_tol, CONVERGED),
-    Rule((CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT), _met_tol_before_refinement, STALLED, _ILL_CONDITIONED),
-    Rule((ROUNDOFF_LIMIT,), _is_refined_above_tol, STALLED, _ILL_CONDITIONED),
-    Rule((CONVERGED,), _met_tol_as_formed, STALLED, _FORMED),
-    Rule((ROUNDOFF_LIMIT,), _met_floor_as_formed, STALLED, _FORMED),
-    Rule((CONVERGED, STALLED), _is_rounding, ROUNDOFF_LIMIT),
+    Rule((MAX_ITERATIONS, TIME_LIMIT, STALLED), lambda run, r: run.tol > 0.0 and r.relative <= run.tol, CONVERGED),
+    Rule((CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT), lambda run, r: r._float64_relative <= run.tol < r.relative,
+         STALLED, _ILL_CONDITIONED),
+    Rule((ROUNDOFF_LIMIT,), lambda run, r: run.tol < r.relative and r._float64_relative < math.inf,
+         STALLED, _ILL_CONDITIONED),
+    Rule((CONVERGED,), lambda run, r: r.relative > run.tol and _holds_as_formed(run), STALLED, _FORMED),
+    Rule((ROUNDOFF_LIMIT,), lambda run, r: not r.above_floor <= run.tol and _holds_as_formed(run), STALLED, _FORMED),
+    Rule((CONVERGED, STALLED), lambda run, r: r.above_floor <= run.tol < r.relative, ROUNDOFF_LIMIT),
     # The impulse is a solution to tol, even if no exact solution exists.
-    Rule((INFEASIBLE,), _meets_tol, CONVERGED, "the impulse meets tol nevertheless"),
+    Rule((INFEASIBLE,), lambda run, r: r.relative <= run.tol, CONVERGED, "the impulse meets tol nevertheless"),
 )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.registry import Solver, State
+from lavender.solvers.registry import State
 from lavender_ext.judge.measure import are_bit_identical
 from lavender_ext.judge.stopping_test import StoppingTest
 
@@ -91,7 +91,7 @@ class Loop:
     """
 
     problem: Problem
-    solver: Solver
+    solver: Any
     state: Any
     impulse: FloatArray
     tol: float

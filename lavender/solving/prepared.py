@@ -294,7 +294,7 @@ class Prepared:
             disk = original.disk
             start = original.on_disk(disk.impulse_array(arguments.impulse))
         setup = self._setup
-        if type(setup) is NotSetUp or setup.is_used or original is not self._original:
+        if isinstance(setup, NotSetUp) or setup.is_used or original is not self._original:
             setup = self._set_up(original, deadline)
         problem = self.problem
         has_default_start = start is None and problem.guess is None
@@ -307,7 +307,7 @@ class Prepared:
             problem=problem, solver=None, state=None, impulse=start, tol=arguments.tol, deadline=deadline,
             callback=callback, records=[] if arguments.history else None,
         )  # fmt: skip
-        if type(setup) is SetUp:
+        if isinstance(setup, SetUp):
             setup.is_used = True
             loop.solver, loop.state = setup.solver, setup.state
             if deadline is not None:
@@ -341,12 +341,12 @@ class Prepared:
             # Compute the judge's reference before a solver gets the problem.
             get_zero_impulse_reference(problem)
         setup: SetUp | NotSetUp
-        solver = last.solver if type(last) is SetUp else _make_solver(spec, self.options)
+        solver = last.solver if isinstance(last, SetUp) else _make_solver(spec, self.options)
         if deadline is not None and not spec.delegates and is_setup_too_late(solver, problem, deadline):
             setup = NotSetUp(is_late=True)
         else:
             try:
-                if type(last) is SetUp and not (is_other and not same_structure(self.problem, problem)):
+                if isinstance(last, SetUp) and not (is_other and not same_structure(self.problem, problem)):
                     state = solver.update(last.state, problem)
                 else:
                     state = solver.prepare(problem)
@@ -383,9 +383,9 @@ class Prepared:
             message, certificate, impossible = proof
             claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
-        elif type(setup) is NotSetUp and setup.failure:
+        elif isinstance(setup, NotSetUp) and setup.failure:
             claim = Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
-        elif type(setup) is NotSetUp or (
+        elif isinstance(setup, NotSetUp) or (
             deadline is not None and deadline.has_passed() and not spec.external
         ):
             unjudged = self._keep_zero_impulse_unjudged(loop, setup_time)
