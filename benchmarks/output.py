@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from lavender.io.stored import check_writable, write_text
-from lavender.report.bench import machine
+from lavender.report import machine
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

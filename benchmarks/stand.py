@@ -37,7 +37,7 @@ from benchmarks.output import markdown, out_option, write_json
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import ListType
-from lavender.report.bench.machine import get_versions
+from lavender.report.machine import get_versions
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
 

@@ -20,7 +20,6 @@ import os
 import re
 import sys
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -30,23 +29,20 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))  # where examples find `panels`
 
 import docstrings
-import matplotlib
 from panels import save
 
 import lavender as lv
 import lavender_ext
 from benchmarks import stability
 from benchmarks.output import markdown as table
-from lavender import bench, registry, suite
+from lavender import registry, suite
 from lavender.base.deadline import format_seconds
 from lavender.problem import LAWS
-from lavender.report import compute_mean_times_by_law, summarize_runs_by_case, table_specs
-from lavender.report.bench import format_tolerance
-from lavender.report.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
-from lavender.report.figures import build_figures, build_work_precision
-from lavender.report.findings import Report
+from lavender.report import Plan, Report, run, tables
+from lavender.report.figures import build_overall_figure
 from lavender.report.page import render_page
-from lavender.report.plotting import assign_styles, plot_panels
+from lavender.report.plotting import assign_styles, render_svg
+from lavender.report.records import format_tolerance
 from lavender.report.text import format_residual
 from lavender.sim.scene.gallery import SCENES
 
@@ -74,7 +70,7 @@ CASES = (
     "pyramid(k=6, friction=cone)",
     "granular(n=4, friction=cone)",
 )
-PLAN = bench.Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
+PLAN = Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
 # Beside the solvers of lavender: one backend of each kind (splitting, interior point, cones).
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
@@ -86,8 +82,7 @@ ADVICE = (
     "The second table has a solver for each time: the solver that serves the largest number of cases within this\n"
     "time. A solver serves a case if its residual is at most half of the residual of the start. The number is the\n"
     "residual at the 90th percentile of the cases. *none* means that no solver serves nine cases of ten. Solvers\n"
-    f"after ≈ are equally good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
-    f"{RESIDUAL_NOISE_FACTOR:g} in residual)."
+    "after ≈ are equally good within the noise of the repetitions (in the second table: within a factor of two)."
 )
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
@@ -158,7 +153,7 @@ def measure(cache):
     ours = [name for name, spec in built_in().items() if not spec.external]
     cache.mkdir(parents=True, exist_ok=True)
     solvers = ours + [name for name in BACKENDS if registry.specs()[name].missing() is None]
-    return bench.run(CASES, solvers, PLAN, cache / f"records-{fingerprint()}.jsonl").select_latest_run()
+    return run(CASES, solvers, PLAN, cache / f"records-{fingerprint()}.jsonl")
 
 
 def fingerprint():
@@ -174,23 +169,13 @@ def fingerprint():
 # -- figures ----------------------------------------------------------------------------------------
 
 
-def law_figures(records):
-    """Law -> SVG text: error against time, a panel for each case, lines with the solver's name as id."""
-    styles = assign_styles(r.solver for r in records)
+def law_figures(report):
+    """Law -> SVG text: error against time over the cases of a law, lines with the solver's name as id."""
     out = {}
     for law in LAWS:
-        drawn = (build_work_precision(records, c) for c, info in records.cases.items() if info.law == law)
-        some = [
-            replace(figure, curves=tuple(curve.lower_front for curve in figure.curves)) for figure in drawn
-        ]
-        if some:
-            text = io.StringIO()
-            with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
-                canvas = plot_panels(some, styles)
-                for line in (line for axes in canvas.axes for line in axes.get_lines()):
-                    line.set_markeredgewidth(0.0)  # one colour, which `highlighted` can change
-                canvas.savefig(text, format="svg", metadata={"Date": None})
-            out[law] = text.getvalue()
+        figure = build_overall_figure(report, f"law-{law}", law)
+        if figure.curves:
+            out[law] = render_svg(figure, assign_styles(c.solver for c in figure.curves))
     return out
 
 
@@ -203,7 +188,7 @@ def highlighted(svg, solver):
         f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2 !important; '
         "stroke-dasharray: none !important}"
         f'[id^="{solver}--"] use {{fill: #5b2a9d !important}}'
-        "#legend {display: none}</style>"
+        "#legend_1 {display: none}</style>"
     )
     return svg.replace("</metadata>", "</metadata>" + style, 1)
 
@@ -264,30 +249,26 @@ def _times(ratio):
     return f"{ratio:.2g}" if ratio < 100.0 else f"{ratio:.0f}"
 
 
-def standing(records, solver):
+def standing(report, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
-    by_case = {}
-    for reach in summarize_runs_by_case(records, TOLERANCES):
-        by_case.setdefault(reach.case, []).append(reach)
+    times = {tolerance: tables.get_times(report.frame, tolerance) for tolerance in TOLERANCES}
+    best_residuals = tables.tabulate_runs(report).set_index(["solver", "case"])["smallest residual [-]"]
     rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
-    for case, all_reaches in by_case.items():
-        mine = next((r for r in all_reaches if r.solver == solver), None)
-        if mine is None:
+    for case in times[TOLERANCES[0]]:
+        if (solver, case) not in best_residuals.index:
             continue
         cells = [f"`{case}`"]
         for tolerance in TOLERANCES:
-            others = [r.times[tolerance] for r in all_reaches if r.solver not in (solver, "auto")]
-            fastest = min(others, default=float("inf"))
-            t = mine.times[tolerance]
-            if t == float("inf"):
+            own = times[tolerance][case]
+            fastest, t = own.drop([solver, "auto"], errors="ignore").min(), own[solver]
+            if t != t:
                 cells.append("–")
                 continue
-            if t <= NEAR * fastest:
+            if not t > NEAR * fastest:
                 best[tolerance].append(case)
-            ratio = "" if fastest == float("inf") else f" ({_times(t / fastest)} ×)"
+            ratio = "" if fastest != fastest else f" ({_times(t / fastest)} ×)"
             cells.append(f"{format_seconds(t)}{ratio}")
-        cells.append(format_residual(mine.best) + (" (floor)" if mine.at_floor else ""))
-        rows.append(cells)
+        rows.append([*cells, format_residual(best_residuals[solver, case])])
     if not rows:
         return "Not measured here: it is not installed, or accepts none of the cases."
     lines = []
@@ -312,7 +293,7 @@ def standing(records, solver):
     return f"{said}\n\n{table(head, rows)}\n\n{note}"
 
 
-def solver_page(site, spec, records, figures):
+def solver_page(site, spec, report, figures):
     """One page: formula and remarks from the module, abilities and options from the SPEC, curves from the records."""
     module = importlib.import_module(_module_of(spec))
     title = f"# {spec.name}\n\n{spec.summary[:1].upper() + spec.summary[1:]}."
@@ -322,7 +303,7 @@ def solver_page(site, spec, records, figures):
         parts += ["## Options", table(("option", "meaning"), rows)]
     parts += [
         "## When to use it",
-        standing(records, spec.name),
+        standing(report, spec.name),
         "## Error against time",
         "Its curve in colour, all other solvers of the same cases in grey; the dotted line is the floor of float64.",
     ]
@@ -443,13 +424,13 @@ def backends_page():
     )
 
 
-def solver_pages(site, records, figures):
+def solver_pages(site, report, figures):
     """Write the page of each built-in solver, and one page for the backends."""
     specs = built_in()
     ours = [s for s in specs.values() if not s.external]
     others = [s for s in specs.values() if s.external]
     for spec in ours:
-        solver_page(site, spec, records, figures)
+        solver_page(site, spec, report, figures)
     parts = [
         "# Backends of other packages",
         docstrings.markdown(sys.modules["lavender.external.backends"].__doc__),
@@ -461,41 +442,46 @@ def solver_pages(site, records, figures):
     ]
     for s in others:
         parts += [f"## {s.name}", f"{s.summary[:1].upper() + s.summary[1:]}.", abilities(s)]
-        if any(r.solver == s.name for r in records):
-            parts.append(standing(records, s.name))
+        if (report.frame["solver"] == s.name).any():
+            parts.append(standing(report, s.name))
     site.write("solvers/backends.md", "\n\n".join(parts))
 
 
 # -- measured ---------------------------------------------------------------------------------------
 
 
-def by_structure(records):
-    """Return the report's table of recommended solvers for each structure as markdown."""
+def by_structure(report):
+    """Return the report's tables of the best solver for each structure as markdown."""
 
-    def cell(c):
-        words = (f"**{c.lead}** {c.text}" if c.lead else c.text.replace(" / ", "<br>"), c.after.lstrip(", "))
-        return "<br>".join(filter(None, words))
+    def cells(row, format_number):
+        pairs = list(row)[2:]
+        for names, number in zip(pairs[::2], pairs[1::2], strict=True):
+            first, _, ties = names.partition(" ≈ ")
+            number = "" if number != number else f" {format_number(number)}"
+            yield f"**{first}**{number}" + (f"<br>≈ {ties.replace(' ≈ ', ', ')}" if ties else "")
 
-    report = Report(records)
-    found = table_specs.tabulate_recommended_solvers(report)
-    rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
-    first = 1 + len(report.tolerances)
-    to_tolerance = table(found.heads[:first], [row[:first] for row in rows])
-    in_time = table(("structure", *found.heads[first:]), [(row[0], *row[first:]) for row in rows])
-    return f"{ADVICE}\n\n{wide(to_tolerance, in_time)}"
+    found = []
+    for frame, format_number in (
+        (tables.tabulate_fastest(report), format_seconds),
+        (tables.tabulate_in_time(report), format_residual),
+    ):
+        rows = [
+            (f"{row[0].replace(' / ', '<br>')}<br>{row[1]} cases", *cells(row, format_number))
+            for row in frame.itertuples(index=False)
+        ]
+        found.append(table(("structure", *list(frame)[2::2]), rows))
+    return f"{ADVICE}\n\n{wide(*found)}"
 
 
-def measured_page(site, records, figures):
+def measured_page(site, report, figures):
     """Advice by structure and law from the records of this build, the curves behind it, and their report."""
+    records = report.records
     run = next(iter(records.runs.values()))
-    structures = f"{by_structure(records)}\n\n[A report's page](report.html) shows the same records."
-    site.write(
-        "report.html",
-        render_page(Report(records), build_figures(records), saved=False),
-    )
+    structures = f"{by_structure(report)}\n\n[A report's page](report.html) shows the same records."
+    site.write("report.html", render_page(report))
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     drawn = []
-    for law in compute_mean_times_by_law(records):
+    for law in LAWS:
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
             shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
@@ -517,19 +503,16 @@ def measured_page(site, records, figures):
     site.write("measured.md", "\n\n".join(parts))
 
 
-def by_law(records):
+def by_law(report):
     """Return the table of the three fastest solvers for each law, to each tolerance."""
-    rows = []
-    for law, by_tolerance in compute_mean_times_by_law(records).items():
-        cells = []
-        for tolerance in TOLERANCES:
-            most = max(solved for _, solved, _ in by_tolerance[tolerance].values())
-            names = sorted(
-                (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
-            )
-            cells.append(
-                "<br>".join(f"**{name}** {format_seconds(t)}" for t, name in names[:3]) if most else "none"
-            )
+    rows, times = [], tables.tabulate_times(report)
+    for law in dict.fromkeys(times["law"]):
+        own, cells = times[times["law"] == law], []
+        for target in (f"to {format_tolerance(x)}" for x in TOLERANCES):
+            solved = own[f"solved {target}"]
+            first = own[(solved == solved.max()) & (solved > 0)].sort_values(f"time {target} [s]").head(3)
+            names = zip(first["solver"], first[f"time {target} [s]"], strict=True)
+            cells.append("<br>".join(f"**{name}** {format_seconds(t)}" for name, t in names) or "none")
         rows.append((LAW_NAMES[law], *cells))
     return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
 
@@ -539,16 +522,17 @@ def wide(*tables):
     return "\n\n".join(('<div class="wide">', *tables, "</div>"))
 
 
-def measured_tables(records):
+def measured_tables(report):
     """Return the tables that are checked in, by the name of their place in a page."""
+    records = report.records
     run = next(iter(records.runs.values()))
     note = (
         f"Measured with {len(records)} runs on {len(records.cases)} cases ({run.cpu}, {run.threads} thread, Python "
         f"{run.python}) by\n`python docs/generate.py --tables`."
     )
     return {
-        "by_structure": f"{by_structure(records)}\n\n{note}",
-        "by_law": f"{by_law(records)}\n\n{note}",
+        "by_structure": f"{by_structure(report)}\n\n{note}",
+        "by_law": f"{by_law(report)}\n\n{note}",
     }
 
 
@@ -691,7 +675,6 @@ def api_page(site):
     for room in (
         "io",
         "suite",
-        "report.bench",
         "report",
         "judge.measures",
         "judge.certificates",
@@ -722,10 +705,10 @@ def write(source, cache):
     site = Site(Path(source) / "generated")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of backends that talk while they are measured
-        records = measure(Path(cache))
-    figures = law_figures(records)
-    solver_pages(site, records, figures)
-    measured_page(site, records, figures)
+        report = Report(measure(Path(cache)))
+    figures = law_figures(report)
+    solver_pages(site, report, figures)
+    measured_page(site, report, figures)
     example_page(site, cache)
     suite_page(site)
     api_page(site)

@@ -16,7 +16,7 @@ import numpy as np
 from panels import Numbers, put_legend_right, show
 
 import lavender as lv
-from lavender.report.bench import carry_impulses
+from lavender.report import carry_impulses
 from lavender.sim.engine import Simulation
 
 SCENE = "stack"

@@ -11,7 +11,7 @@ Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `kn
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide)
 Engine     `Scene`, `Simulation`
-Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
+Measuring  `report`, `suite` (built-in problems), `io` (files and other simulators)
 
 Submodules and the engine are imported at their first use.
 """
@@ -67,7 +67,6 @@ if TYPE_CHECKING:
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
     from lavender.programs.quadratic import solve_qp
-    from lavender.report import bench
     from lavender.report.check import CrossCheck, cross_check
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
@@ -97,7 +96,6 @@ _MODULE_OF_NAME = {name: module for module, names in _LAZY_NAMES.items() for nam
 
 # Public module -> its full name.
 _LAZY_MODULES = {
-    "bench": "lavender.report.bench",
     "cones": "lavender.problem.cones",
     "contract": "lavender.contract",
     "engine": "lavender.sim.engine",
@@ -154,7 +152,6 @@ __all__ = [
     "UnknownName",
     "__version__",
     "available",
-    "bench",
     "cross_check",
     "derivative",
     "derivatives",

@@ -10,7 +10,7 @@ import click
 from benchmarks.kernels.cases import CASES, Row, run
 from benchmarks.kernels.instructions import COUNTED, instructions
 from benchmarks.output import markdown
-from lavender.report.bench import machine
+from lavender.report import machine
 
 
 def _number(x: float, form: str = "{:.3g}") -> str:

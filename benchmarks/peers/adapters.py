@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from benchmarks.peers.backend_time import measure_backend_time
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
@@ -33,7 +34,6 @@ from lavender.external.running import Limits
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
-from lavender.report.bench.stopwatch import measure_backend_time
 from lavender.solving.prepared import prepare
 
 TARGETS = (1e-3, 1e-6, 1e-9)  # relative residuals to reach

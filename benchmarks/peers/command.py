@@ -18,7 +18,7 @@ from benchmarks.peers.adapters import Result, contestants, ours
 from benchmarks.peers.engines import Step
 from benchmarks.peers.problems import PROBLEMS, problems
 from benchmarks.peers.tables import engines_table, solvers_tables
-from lavender.report.bench import machine
+from lavender.report import machine
 
 PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
             "quadprog", "scs")  # fmt: skip

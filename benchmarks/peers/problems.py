@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from benchmarks.peers import engines
 from lavender.base.errors import InputError, UnknownName
 from lavender.problem import Problem
-from lavender.report.bench.cases import resolve_sources
+from lavender.report.cases import resolve_sources
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 

@@ -13,7 +13,7 @@ from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
 from lavender.external.running import capture_backend_output
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
-from lavender.report.bench.running.timing import limit_to_one_thread
+from lavender.report.timing import limit_to_one_thread
 
 REPEATS, REPEAT_TIME = 30, 0.1  # repeats of one setting: maximum number, and maximum total time [s]
 AGAIN = 4.0  # A contestant runs in later rounds if it is within this factor of the fastest of its side.

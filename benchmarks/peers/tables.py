@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import geometric_mean
 
 from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
 from lavender.base.deadline import format_seconds
-from lavender.report.bench.statistics import compute_geometric_mean
 from lavender.report.text import format_residual
 
 LARGE = 1000  # minimum rows of a large problem
@@ -149,7 +149,7 @@ def means(results: Sequence[Result]) -> list[Mean]:
                 some = [c.ratios for c in of_size if c.target == target]
                 if some:
                     columns = [[x for x in column if math.isfinite(x)] for column in zip(*some, strict=True)]
-                    ours, scratch, auto = map(compute_geometric_mean, columns)
+                    ours, scratch, auto = map(geometric_mean, columns)
                     which = f"{group}, {size}"
                     out.append(
                         Mean(

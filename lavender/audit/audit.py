@@ -52,13 +52,13 @@ from lavender.io.recorder import VECTOR, Control
 from lavender.io.stored import lock_step_folder, write_arrays, write_npz
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.problem import PRECISIONS, Problem
-from lavender.report.bench import machine
-from lavender.report.bench.running.runner import Event
-from lavender.report.bench.running.workers import check_workers, connect_backend, map_unordered
+from lavender.report import machine
 from lavender.report.figures import Curve, Figure
+from lavender.report.runner import Event
 from lavender.report.summary_page import PageSection, SummaryPage
 from lavender.report.table import Cell, Table
 from lavender.report.text import format_count, format_percent, format_size
+from lavender.report.workers import check_workers, connect_backend, map_unordered
 
 UNCONVERGED_OR_WRONG = f"{UNCONVERGED} or wrong"
 AUDIT_VERDICTS = (*VERDICTS, "not judged")

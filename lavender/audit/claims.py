@@ -26,7 +26,7 @@ from lavender.io.engine_step import EngineStep
 from lavender.io.recorder import Recorder, read_recorded_state
 from lavender.io.stored import STATES_FOLDER, write_arrays
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD
-from lavender.report.bench.running.runner import Event
+from lavender.report.runner import Event
 from lavender.report.summary_page import PageSection, SummaryPage
 from lavender.report.table import Table
 from lavender.report.text import format_count, format_percent, format_size

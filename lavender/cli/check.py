@@ -21,7 +21,7 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lavender.report.bench.cases import Item
+    from lavender.report.cases import Item
     from lavender.report.check import CrossCheck
 
 
@@ -67,9 +67,9 @@ def check(
     --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
+    from lavender import report
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
-    from lavender.report import bench
     from lavender.report.check import cross_check
     from lavender.solving.limits import check_time_limit
 
@@ -82,11 +82,11 @@ def check(
     contradicted = unsolved = unaccepted = solutions = above = unmet = 0
     errors = ErrorReporter(partial(print_escaped, style="yellow"))
     judges_stored = precision is not None or is_option_set(context, "threshold")
-    bench.select_solver_names([*(solvers or ()), reference])
+    report.select_solver_names([*(solvers or ()), reference])
     check_float("tol", tol, low=0.0)
     check_float("threshold", threshold, low=0.0)
     check_time_limit(time_limit)
-    for item in bench.resolve_sources(files):
+    for item in report.resolve_sources(files):
         with errors(item):
             comparison = cross_check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
@@ -127,7 +127,7 @@ def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
     import numpy as np
 
     from lavender import suite
-    from lavender.report.bench.cases import is_path
+    from lavender.report.cases import is_path
 
     if item.in_memory is not None or is_path(item.source):
         return None

@@ -30,7 +30,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     if files:
         _diagnose_problems(files, as_json)
         return
-    from lavender.report.bench.doctor import collect_installation_facts
+    from lavender.report.doctor import collect_installation_facts
 
     results = collect_installation_facts()
     if as_json:
@@ -52,11 +52,11 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
 
 def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
     """Print probable mistakes in the data of problems, and exit with 1 if there is one."""
+    from lavender import report
     from lavender.diagnostics import diagnose
-    from lavender.report import bench
 
     diagnostics, errors = {}, ErrorReporter()
-    for item in bench.resolve_sources(files):
+    for item in report.resolve_sources(files):
         with errors(item):
             diagnostics[item.name] = diagnose(item.problem)
             for diagnostic in () if as_json else diagnostics[item.name]:

@@ -23,7 +23,7 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
     from lavender.base.arrays import check_float
-    from lavender.report.bench.cases import resolve_sources
+    from lavender.report.cases import resolve_sources
     from lavender.solving.plan import explain as explain_problem
 
     check_float("tol", tol, above=0.0)

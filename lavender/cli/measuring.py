@@ -23,7 +23,7 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lavender.report.bench import Event, Item, Plan, Records
+    from lavender.report import Event, Item, Plan, Records
     from lavender.report.summary_page import SummaryPage
 
     P = TypeVar("P", bound=Plan)
@@ -71,7 +71,7 @@ def check_named_problems_load(items: Sequence[Item]) -> None:
     InputError
         A problem does not load. Nothing has been measured and no page changed.
     """
-    from lavender.report.bench.running.runner import describe_load_error
+    from lavender.report.runner import describe_load_error
 
     for item in items:
         if item.named:
@@ -100,9 +100,9 @@ def is_campaign(context: click.Context) -> bool:
 
 
 def measure_files(
-    context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]
+    context: click.Context, files: Sequence[str], path: Path, show_event: Callable[[Event], None]
 ) -> Measured:
-    """Measure solvers on files with a progress bar, and time the calls that a report would print.
+    """Measure solvers on files, and call `show_event` with the progress.
 
     With workers nothing is timed. `path` is the records file.
 
@@ -111,57 +111,52 @@ def measure_files(
     InputError
         A named file does not load, or the folder cannot be written or is in use by another process.
     """
-    from lavender.report import bench
-    from lavender.report.bench.candidates import time_candidates
+    from lavender import report
 
     limit_to_one_thread()
     options = context.params
-    bench.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
-    campaign, names = is_campaign(context), list(files)
+    report.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
     more: dict[str, Any] = {}
     plan: Plan
-    if campaign:
+    if is_campaign(context):
         workers = options["workers"] if is_option_set(context, "workers") else -1
         more = {"workers": workers, "backend": options["backend"]}
-        plan = make_plan({**options, "orders": options["orders"] or ()}, bench.CampaignPlan)
+        plan = make_plan({**options, "orders": options["orders"] or ()}, report.CampaignPlan)
     else:
-        plan = _make_timed_plan(options, files, sweeps)
+        plan = _make_timed_plan(options, files)
     reused = 0
-    with bench.Store(path) as store:
-        items = bench.resolve_sources(names, options["sequence"])
+    with report.Store(path) as store:
+        items = report.resolve_sources(list(files), options["sequence"])
         if is_option_set(context, "sequence_time_limit") and not any(item.sequence for item in items):
             raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
         check_named_problems_load(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         measured: list[Records] = []
-        with show_progress() as bar:
 
-            def show_event(event: Event) -> None:
-                nonlocal reused
-                reused += event.reused
-                bar(event)
+        def count_event(event: Event) -> None:
+            nonlocal reused
+            reused += event.reused
+            show_event(event)
 
-            stopped = False
-            try:
-                common: dict[str, Any] = {
-                    "watch": show_event,
-                    "reuse": not options["no_reuse"],
-                    "memory": convert_gigabytes_to_bytes(options["memory"]),
-                }
-                bench.run(items, options["solvers"], plan, store, into=measured, **common, **more)
-                if not campaign:
-                    time_candidates(items, measured[0], plan, store, **common)
-            except KeyboardInterrupt:
-                if not measured:
-                    raise
-                stopped = True
+        stopped = False
+        try:
+            memory = convert_gigabytes_to_bytes(options["memory"])
+            reuse = not options["no_reuse"]
+            report.run(
+                items, options["solvers"], plan, store, watch=count_event, memory=memory, into=measured,
+                reuse=reuse, **more,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            if not measured:
+                raise
+            stopped = True
     since = before.get(next(iter(measured[0].runs)), "") if reused else ""
     return Measured(measured[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
+def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str]) -> Plan:
     """Make the plan of a report that measures times."""
-    from lavender.report.bench import Plan
+    from lavender.report import Plan
 
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
@@ -174,8 +169,7 @@ def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: S
     limits["time_limit"] = (
         (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
     )
-    more: dict[str, Any] = {"repeats": options["repeats"], "times": options["time_budgets"], "sweeps": sweeps}
-    return make_plan(options, Plan, **limits, **more)
+    return make_plan(options, Plan, repeats=options["repeats"], **limits)
 
 
 def show_page(page: SummaryPage, folder: Path) -> None:
@@ -224,10 +218,14 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
         refresh_per_second=4,  # Drawing more often would take processor time from the measurement.
     ) as bar:
         task = bar.add_task("", total=None, what="", remaining="")
-        began = time.monotonic()
+        pace = Pace()
 
         def show_event(event: Event) -> None:
-            remaining = format_remaining_time(event, time.monotonic() - began)
+            if pace.count_event(
+                event
+            ):  # Another phase begins: its count, clock and remaining time are its own.
+                bar.reset(task)
+            remaining = pace.format_remaining_time(event)
             bar.update(
                 task,
                 completed=event.done,
@@ -241,32 +239,59 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
 
 def _print_progress_lines() -> Callable[[Event], None]:
     """Return a callback that prints a line of progress every `PROGRESS_INTERVAL` seconds."""
-    began = printed = time.monotonic()
+    pace, printed = Pace(), time.monotonic()
 
     def show_event(event: Event) -> None:
         nonlocal printed
+        pace.count_event(event)
         now = time.monotonic()
         if now - printed >= PROGRESS_INTERVAL:
             printed = now
             count = f"{event.done} of {event.total}, " if event.total else ""
-            remaining = format_remaining_time(event, now - began)
+            remaining = pace.format_remaining_time(event)
             remaining = f", {remaining}" if remaining else ""
-            click.echo(f"{count}{now - began:.0f} s{remaining}: {_format_event(event)}", err=True)
+            click.echo(f"{count}{pace.elapsed:.0f} s{remaining}: {_format_event(event)}", err=True)
 
     return show_event
 
 
-def format_remaining_time(event: Event, elapsed: float) -> str:
-    """Return a phrase such as "about 40 s remain", or an empty text if `elapsed` [s] is too short for an estimate."""
-    remaining = event.remaining
+class Pace:
+    """Clock of a phase, from which the remaining time is estimated. Reused results take no time and do not count."""
+
+    def __init__(self) -> None:
+        self.phase, self.began, self.reused_until = "", time.monotonic(), 0
+
+    @property
+    def elapsed(self) -> float:
+        """Time [s] since the phase began."""
+        return time.monotonic() - self.began
+
+    def count_event(self, event: Event) -> bool:
+        """Return whether an event begins another phase, after the first."""
+        if event.reused:
+            self.began, self.reused_until = time.monotonic(), event.done + 1
+        begins = event.phase != self.phase
+        if begins:
+            self.phase, self.began, self.reused_until = event.phase, time.monotonic(), event.done
+        return begins
+
+    def format_remaining_time(self, event: Event) -> str:
+        """Return a phrase such as "about 40 s remain", or an empty text if it is too early for an estimate."""
+        return format_remaining_time(event, self.elapsed, event.done - self.reused_until)
+
+
+def format_remaining_time(event: Event, elapsed: float, done: int | None = None) -> str:
+    """Return a phrase such as "about 40 s remain" from the time [s] in which `done` were done, by default all."""
+    remaining, done = event.remaining, event.done if done is None else done
     if remaining is None:
-        if not (event.total and event.done and elapsed >= MIN_ELAPSED):
+        if not (event.total and done > 0 and elapsed >= MIN_ELAPSED):
             return ""
-        remaining = elapsed * (event.total - event.done) / event.done
+        remaining = elapsed * (event.total - event.done) / done
     if remaining < 90.0:
         return f"about {max(1, round(remaining))} s remain"
     return f"about {round(remaining / 60.0)} min remain"
 
 
 def _format_event(event: Event) -> str:
-    return f"{event.case} {event.solver}".strip()
+    text = f"{event.case} {event.solver}".strip()
+    return f"{event.phase}: {text}" if event.phase else text

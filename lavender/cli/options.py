@@ -20,7 +20,7 @@ from lavender.cli.completion import complete_solver
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lavender.report.bench import Item
+    from lavender.report import Item
 
     # Type checkers need the generic form of click 8.2, which 8.1 does not have.
     _ParamType = click.ParamType[Any]
@@ -114,7 +114,7 @@ class ListType(_ParamType):
 def limit_to_one_thread() -> None:
     """Limit numerical libraries that are loaded later to one thread.
 
-    `lavender.report.bench.running.timing` limits libraries that are loaded already, while it measures.
+    `lavender.report.timing` limits libraries that are loaded already, while it measures.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -210,7 +210,7 @@ def reject_options_without_effect(context: click.Context, solvers: Sequence[str]
     UnknownName
         A solver does not exist.
     """
-    from lavender.report.bench.running.runner import is_third_party_solver
+    from lavender.report.runner import is_third_party_solver
     from lavender.solvers import registry
 
     if not solvers:
@@ -249,7 +249,7 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
 RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
-#: Options of the commands that measure, as fields of `lavender.report.bench.Plan`.
+#: Options of the commands that measure, as fields of `lavender.report.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": ListType(str), "shell_complete": complete_solver,
                    "help": "Solvers by name; default: all that are installed."}),
@@ -291,14 +291,14 @@ def escape_markup(text: str) -> str:
     """Return text with rich's markup escaped and control characters written as their codes."""
     from rich.markup import escape
 
-    from lavender.report.bench.record import escape_unprintable
+    from lavender.report.records import escape_unprintable
 
     return escape(escape_unprintable(text, lines=True))
 
 
 def print_escaped(text: str, err: bool = False, style: str = "") -> None:
     """Print text that may contain names of files and problems; control characters are written as their codes."""
-    from lavender.report.bench.record import escape_unprintable
+    from lavender.report.records import escape_unprintable
 
     if style:
         make_console(err).print(escape_markup(text), style=style, highlight=False, soft_wrap=True)

@@ -15,13 +15,12 @@ import click
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
-from lavender.cli.measuring import Measured, is_campaign, measure_files
+from lavender.cli.measuring import Measured, is_campaign, measure_files, show_progress
 from lavender.cli.options import (
     PATH,
     RECORDING_NAMES,
     ListType,
     MultiValueCommand,
-    is_option_set,
     make_console,
     plan_options,
     print_escaped,
@@ -65,12 +64,14 @@ from lavender.io.stored import lock_output, write_text
     type=ListType(float),
     default=(),
     metavar="S,S,...",
-    help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",
+    help="Times in seconds for which the report lists the best solver; default: three decades about the fastest.",
 )
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
-@click.option("--no-figures", is_flag=True, help="Do not write SVG and PNG files.")
+@click.option(
+    "--no-figures", is_flag=True, help="Write no figures; they take the largest part of the time of writing."
+)
 @click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
 @click.pass_context
 def report(
@@ -94,12 +95,9 @@ def report(
         reject_unused_options(context, given, "with --list")
         _list_suite()
         return
-    from lavender.report import bench
     from lavender.report.engine import read_engine_answers
-    from lavender.report.findings import Report
-    from lavender.report.terminal import print_report
+    from lavender.report.records import read
     from lavender.report.text import format_count, list_skip_reasons
-    from lavender.report.write import write
 
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -109,8 +107,7 @@ def report(
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
     files = tuple(_record_model(f, out, used_folders, not options["no_reuse"], recording) for f in files)
-    old = None if options["compare"] is None else bench.read_records(options["compare"])
-    sweeps = options["budgets"] if is_option_set(context, "budgets") else ()
+    old = None if options["compare"] is None else read(options["compare"])
     path = out / "records.jsonl"
     records_files = [f for f in files if f.endswith(".jsonl")]
     if records_files:
@@ -118,19 +115,26 @@ def report(
             raise InputError(
                 "a records.jsonl cannot be combined with problems or other records: give one file"
             )
-        measured = Measured(bench.read_records(records_files[0]), False)
-        if not (measured.records.records or measured.records.skips):
+        measured = Measured(read(records_files[0]), False)
+        if not (len(measured.records) or measured.records.skips):
             raise InputError(
                 f"{records_files[0]} has no records: measure problems with `lavender report PROBLEM` first"
             )
         if options["solvers"]:
-            measured = replace(measured, records=measured.records.of_solvers(options["solvers"]))
-    else:
-        measured = measure_files(context, files, path, sweeps)
-    engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.select_latest_run())
-    shown = Report(measured.records, old, options["time_budgets"], sweeps, engines)
-    # Write the files before printing, as a closed pipe can end the command while it prints.
-    index = write(shown, out, figures=not options["no_figures"])
+            measured = replace(measured, records=measured.records.select_solvers(options["solvers"]))
+    with show_progress() as watch:
+        if not records_files:
+            measured = measure_files(context, files, path, watch)
+        # These modules import pandas, which only a report needs.
+        from lavender.report.files import write
+        from lavender.report.findings import Report
+        from lavender.report.terminal import print_report
+
+        engines = [] if is_campaign(context) else read_engine_answers(files, measured.records)
+        shown = Report(measured.records, old, options["time_budgets"], engines)
+        # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
+        # has no figures, so that the prompt is back soon.
+        index = write(shown, out, figures=not (options["no_figures"] or measured.stopped), watch=watch)
     print_report(shown, make_console(), complete=options["tables"])
     print_escaped(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
     if measured.reuse_note:
@@ -138,7 +142,7 @@ def report(
     if measured.stopped:
         print_escaped("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if not (records_files or measured.records.records):
+    if not (records_files or len(measured.records)):
         print_escaped(
             f"nothing was measured: {'; '.join(list_skip_reasons(measured.records.skips))}", style="yellow"
         )
@@ -170,7 +174,7 @@ def _reject_unused_options(
     """Raise InputError for each option that would be ignored."""
     if any(f.endswith(".jsonl") for f in files):
         used = {
-            "files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures", "solvers"
+            "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers"
         }  # fmt: skip
         unused = [p.name for p in context.command.params if p.name and p.name not in used]
         reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
@@ -206,7 +210,7 @@ def _record_model(
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recorder import record_file
-    from lavender.report.bench.record import make_file_name
+    from lavender.report.records import make_file_name
 
     model, n = str(path.resolve()), 1
     first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")

@@ -57,14 +57,14 @@ def solve(
     at the floor of float64; with --tol 0 always). 1: the judge rejects it, or the solver crashed. 3: the problem is
     infeasible, with a certificate that the judge confirms.
     """
+    from lavender import report
     from lavender.judge.residuals import WRONG
-    from lavender.report import bench
-    from lavender.report.bench.running.worker import TaskFailed, Worker, solve_isolated
+    from lavender.report.worker import TaskFailed, Worker, solve_isolated
 
     limit_to_one_thread()
     if output is not None:
         check_writable(output)
-    (item, *more) = bench.resolve_sources([file])
+    (item, *more) = report.resolve_sources([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):

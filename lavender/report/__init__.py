@@ -1,38 +1,66 @@
-"""Write records as terminal tables, plots and a page. Nothing here solves a problem.
+"""Measure solvers on cases, and write the runs as terminal tables, figures, files and a page.
 
-records = lavender.report.bench.read_records("report/records.jsonl")
-lavender.report.summarize_runs_by_case(records)          # plain rows
-lavender.report.write(records, "report")  # records.csv, records.json, figures, index.html
-lavender.report.write(lavender.report.Report(records, earlier), "report")  # compared with an earlier run
+records = lavender.report.run(["pile.npz"], ["pgs", "osqp"])
+records.frame                                # one row for each run, a pandas DataFrame
+lavender.report.write(records, "report")     # records.csv, tables, figures, index.html
+lavender.report.read("report")               # the records again
+lavender.report.tables.tabulate_times(lavender.report.Report(records))
 """
 
-from lavender.report.bench.resampling import recommend_solvers
-from lavender.report.bench.statistics import (
-    compute_mean_times_by_law,
-    compute_order_spreads,
-    compute_profiles,
-    compute_robustness,
-    count_claims,
-    group_cases_by_family,
-    group_runs_by_pass,
-    list_failures,
-    summarize_runs_by_case,
-)
-from lavender.report.findings import Report
-from lavender.report.write import write
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lavender.report import tables
+    from lavender.report.cases import Item, classify_structure, make_sequence, resolve_sources
+    from lavender.report.files import write
+    from lavender.report.findings import Report
+    from lavender.report.plan import CampaignPlan, Plan
+    from lavender.report.records import CaseInfo, Record, Records, Run, Skip, Store, read
+    from lavender.report.runner import Event, carry_impulses, run, select_solver_names
+
+# Module -> public names in it, imported when a name is first used: tables and pages need pandas, solving does not.
+_PUBLIC_NAMES = {
+    "cases": ("Item", "classify_structure", "make_sequence", "resolve_sources"),
+    "findings": ("Report",),
+    "plan": ("CampaignPlan", "Plan"),
+    "records": ("CaseInfo", "Record", "Records", "Run", "Skip", "Store", "read"),
+    "runner": ("Event", "carry_impulses", "run", "select_solver_names"),
+    "files": ("write",),
+}
+_MODULE_OF_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 
 __all__ = [
+    "CampaignPlan",
+    "CaseInfo",
+    "Event",
+    "Item",
+    "Plan",
+    "Record",
+    "Records",
     "Report",
-    "compute_mean_times_by_law",
-    "compute_order_spreads",
-    "compute_profiles",
-    "compute_robustness",
-    "count_claims",
-    "group_cases_by_family",
-    "group_runs_by_pass",
-    "list_failures",
-    "recommend_solvers",
-    "summarize_runs_by_case",
+    "Run",
+    "Skip",
+    "Store",
+    "carry_impulses",
+    "classify_structure",
+    "make_sequence",
+    "read",
+    "resolve_sources",
+    "run",
+    "select_solver_names",
+    "tables",
     "write",
 ]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name == "tables":
+        return import_module("lavender.report.tables")
+    if name not in _MODULE_OF_NAME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF_NAME[name]}"), name)
+    globals()[name] = value
+    return value

@@ -30,7 +30,7 @@ from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
-from lavender.report.bench.running.worker import TaskFailed, Worker, solve_isolated
+from lavender.report.worker import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import check_arguments

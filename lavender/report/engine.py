@@ -1,8 +1,8 @@
 """Read and rank the answers of the engine that recorded a folder of steps.
 
 The judge computes the residuals of these answers, as of all results. The engine measures the time itself: the time
-includes neither a copy of the problem nor the judge, and the engine starts from its previous step. `rank_engine` ranks
-the engine as solvers are ranked: by the number of cases solved to a tolerance, then by the mean time.
+includes neither a copy of the problem nor the judge, and the engine starts from its previous step. The engine is
+ranked as solvers are ranked: by the number of cases solved to a tolerance, then by the mean time.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG
-from lavender.report.bench.recommendation import Choice
-from lavender.report.bench.record import escape_unprintable
-from lavender.report.bench.statistics import MEAN_TIME_SHIFT, compute_geometric_mean, get_penalty_time_of_miss
-from lavender.report.bench.store import Records
+from lavender.report.records import Records, escape_unprintable
+
+if TYPE_CHECKING:
+    from lavender.report.findings import Report
 
 _NUMERIC_KEYS = ("rows", "seconds", "relative")
 INSIDE = "inside the engine, warm-started, without copy and judge"
@@ -56,6 +57,23 @@ class EngineAnswers:
     velocity: float
     where: str
     answers: Mapping[str, tuple[float, float]]
+
+    def contains(self, source: str) -> bool:
+        """Return whether the source of a case is a file of the engine's folder."""
+        return str(Path(source).parent) == self.source
+
+    def rank(self, report: Report, cases: Sequence[str]) -> dict[str, Any] | None:
+        """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
+        from lavender.report.tables import compute_mean
+
+        sources = [report.records.cases[name].source for name in cases]
+        answers = [self.answers.get(Path(s).name) for s in sources if self.contains(s)]
+        if not cases or None in answers or len(answers) < len(cases):
+            return None
+        times = [t if x <= report.tolerance else math.inf for t, x in filter(None, answers)]
+        mean = float(compute_mean([t if math.isfinite(t) else report.limit for t in times]))
+        solved = sum(map(math.isfinite, times))
+        return {"solver": self.solver, "solved": solved, "cases": len(cases), "mean": mean}
 
 
 def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:
@@ -105,40 +123,3 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
         where=escape_unprintable(where),
         answers=answers,
     )
-
-
-def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
-    """Return the cases of the records that are files of the engine's folder."""
-    sources = {name: Path(info.source) for name, info in records.cases.items()}
-    return tuple(name for name, path in sources.items() if str(path.parent) == engine.source)
-
-
-def rank_engine(
-    engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], tolerance: float
-) -> Choice | None:
-    """Return the result of the engine that answered these cases, to be ranked with the solvers to a tolerance.
-
-    Return None if no engine answered every case.
-    """
-    answers: dict[str, tuple[float, float]] = {}
-    solvers: dict[str, None] = {}
-    for engine in engines:
-        for name in cases:
-            source = Path(records.cases[name].source)
-            if str(source.parent) == engine.source and source.name in engine.answers:
-                answers[name] = engine.answers[source.name]
-                solvers[engine.solver] = None
-    if not cases or len(answers) < len(cases):
-        return None
-    times = {name: time if relative <= tolerance else math.inf for name, (time, relative) in answers.items()}
-    limit = get_penalty_time_of_miss(records)
-    score = compute_geometric_mean(
-        [t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT
-    )
-    solved = sum(map(math.isfinite, times.values()))
-    return Choice.from_case_values(" and ".join(solvers), times, solved, score)
-
-
-def is_ranked_before(one: Choice, other: Choice) -> bool:
-    """Return whether one solver ranks before another: it solves more cases, or as many in less time."""
-    return (-one.solved, one.score) < (-other.solved, other.score)

@@ -3,84 +3,58 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.report.bench import statistics
-from lavender.report.bench.record import Record, format_tolerance
-from lavender.report.bench.store import Records
-from lavender.report.text import format_count, format_run_name, make_time_axis_title
-from lavender.solvers import registry
+from lavender.report.records import format_tolerance
+from lavender.report.text import format_count
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from lavender.report.findings import Report
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
+MAX_CURVES = 6  # Largest number of solvers in a figure, without plug-ins; more are hard to distinguish.
+GRID_SIZE = 49  # Number of points on the horizontal axis at which the residuals of all cases are evaluated.
+MAX_SEQUENCES = 4  # Largest number of sequences that have a figure.
+FLAT_LINES_NOTE = (
+    "A curve is flat after the last run of its solver, which ended at a tolerance (grey lines) or after a fixed "
+    "number of iterations."
+)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of a figure: points, each with the budget or tolerance of its run.
-
-    Parameters
-    ----------
-    solver, label : solver, and name in the figure
-    x, y : coordinates
-    notes : target of each point: "to 1e-6", "16 iterations"
-    thin : whether this is a warm start, drawn thin
-    steps : whether the line is a step function
-    points : whether points are drawn without a line
-    unmarked : whether the line has no marks at its points
-    low, high : edges of a band about the line, as `y`; empty without a band
-    """
+    """A line of a figure."""
 
     solver: str
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
-    notes: tuple[str, ...] = ()
-    thin: bool = False
-    steps: bool = False
-    points: bool = False
-    unmarked: bool = False
-    low: tuple[float, ...] = ()
+    thin: bool = False  # Drawn thin and dashed: a cold start, or a fit.
+    steps: bool = False  # A step function.
+    points: bool = False  # Points without a line.
+    unmarked: bool = False  # No marks at the points of the line.
+    low: tuple[float, ...] = ()  # Edges of a band about the line, as `y`; empty without a band.
     high: tuple[float, ...] = ()
 
     @classmethod
     def from_points(
-        cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any
+        cls, solver: str, label: str, places: Iterable[tuple[float, float]], **more: Any
     ) -> Curve:
         """Create a line through points. A residual of zero is drawn at `MIN_RESIDUAL`; nan and inf are gaps."""
-        x, y = zip(*points, strict=True)
+        x, y = zip(*places, strict=True)
         drawn = tuple(max(v, MIN_RESIDUAL) if math.isfinite(v) else math.nan for v in y)
         return cls(solver, label, tuple(map(float, x)), drawn, **more)
-
-    @property
-    def lower_front(self) -> Curve:
-        """The curve through the points that are lower than all points with smaller x."""
-        front: list[tuple[float, float]] = []
-        for x, y in sorted(zip(self.x, self.y, strict=True)):
-            if not front or y < front[-1][1]:
-                front.append((x, y))
-        xs, ys = zip(*front, strict=True) if front else ((), ())
-        return replace(self, x=xs, y=ys, notes=())
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Titles, scales and curves of a diagram.
-
-    Parameters
-    ----------
-    name : file name without suffix
-    title, x_title, y_title : title, titles of the axes
-    curves : lines
-    x_log, y_log : whether the axes are logarithmic
-    tolerances : horizontal lines
-    roundoff_floor : dotted line; nan without one
-    left_out : solvers that are not drawn because too many curves could not be distinguished
-    note : a sentence that explains the curves, for the caption
-    """
+    """Titles, scales and curves of a diagram; `name` is its file name without suffix."""
 
     name: str
     title: str
@@ -89,298 +63,155 @@ class Figure:
     curves: tuple[Curve, ...]
     x_log: bool = True
     y_log: bool = True
-    tolerances: tuple[float, ...] = ()
-    roundoff_floor: float = math.nan
-    left_out: tuple[str, ...] = ()
-    note: str = ""
+    tolerances: tuple[float, ...] = ()  # Horizontal lines.
+    note: str = ""  # A sentence that explains the curves.
 
     @property
-    def heading(self) -> str:
-        """The title, with the number of solvers that are left out."""
-        omitted = format_count(len(self.left_out), "more solver")
-        return f"{self.title}; {omitted} not drawn" if self.title and self.left_out else self.title
+    def description(self) -> str:
+        """Alternative text: the title, the axes and the names of the curves."""
+        names = ", ".join(dict.fromkeys(c.label for c in self.curves))
+        return f"{self.title}. {self.y_title} against {self.x_title}. Curves: {names}."
 
 
-def _sort_by_work(runs: list[Record]) -> list[Record]:
-    """Sort runs by iterations or by tolerance, not by time, as times of microseconds vary from run to run."""
-    if any(r.mode == "budget" for r in runs):
-        return sorted(runs, key=lambda r: (r.iterations, r.time_min))
-    return sorted(runs, key=lambda r: (-r.tol, r.time_min))
+def build_figures(report: Report) -> list[Figure]:
+    """Build the figures of a report that have a curve; none for a campaign, which has no times."""
+    if report.is_campaign or not len(report.frame):
+        return []
+    figures = [build_overall_figure(report), build_cost_figure(report), build_profile_figure(report)]
+    sequences = [name for name in report.frame["sequence"].unique() if name][:MAX_SEQUENCES]
+    figures += [build_sequence_figure(report, name) for name in sequences]
+    return [figure for figure in figures if figure.curves]
 
 
-def build_work_precision(records: Records, case: str) -> Figure:
-    """Plot error against time for every run of a case: a curve for each solver and start, in the order of work."""
-    curves, drawn = [], []
-    for (name, solver, start), group in sorted(statistics.group_runs_by_pair(records).items()):
-        runs = _sort_by_work([r for r in group if r.is_usable]) if name == case else []
-        drawn += runs
-        if runs:
-            points, targets = [(r.time_min, r.relative) for r in runs], tuple(r.target for r in runs)
-            curves.append(
-                Curve.from_points(
-                    solver, format_run_name(solver, start), points, notes=targets, thin=start != "cold"
-                )
-            )
-    return _build_case_figure("work-precision", make_time_axis_title(drawn), records, case, curves)
+def select_drawn_solvers(report: Report, frame: pd.DataFrame) -> list[str]:
+    """Select the solvers that figures show: the best of the ranking, at most `MAX_CURVES`, and all plug-ins."""
+    from lavender.report.recommendation import is_plug_in
+    from lavender.report.tables import rank_solvers
+
+    ranking = [str(name) for name in rank_solvers(frame, report.tolerance, report.limit).index]
+    plug_ins = [name for name in ranking if is_plug_in(name)]
+    return [*[name for name in ranking if name not in plug_ins][:MAX_CURVES], *plug_ins]
 
 
-def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
-    """Create a figure of a case, with the round-off floor of its best run."""
-    runs = (
-        r for (of, _, _), some in statistics.group_runs_by_pair(records).items() if of == case for r in some
-    )
-    best = min(
-        ((r.relative, r.roundoff_floor) for r in runs if r.is_usable and r.roundoff_floor > 0.0),
-        default=(0.0, math.nan),
-    )
-    return Figure(
-        f"{name} {case}", case, x_title, "relative residual [-]", tuple(curves),
-        tolerances=statistics.get_tolerances(records), roundoff_floor=best[1],
-    )  # fmt: skip
+def build_overall_figure(report: Report, name: str = "error-against-time", law: str = "") -> Figure:
+    """Plot the residual that each solver has reached by a time: median over the cases, and a band of the quartiles.
 
-
-FLAT_LINES_NOTE = (
-    "A curve is flat after the last run of its solver, which ended at a tolerance (grey lines) or after a fixed "
-    "number of iterations."
-)
-PASSES_NOTE = (
-    "A pass over A is one sweep over all blocks or one product with A, as each solver counts them; solvers that "
-    "factorise, pivot or solve linear systems, or count neither sweeps nor products, are not compared"
-)
-GRID_SIZE = 49  # Number of points on the horizontal axis at which the residuals of all cases are evaluated.
-
-
-def build_overall_figure(records: Records, measure: str = "time") -> Figure:
-    """Plot the residual that each solver has reached by a time: median over all cases, and a band of the quartiles.
-
-    A case without a result by that time counts with residual 1, as the zero impulse; so does a case that a solver
-    does not accept, which the title states. Cases are single problems from a cold start. If there are only sequences,
-    each step is a case, with carried impulses if there are any.
-
-    Parameters
-    ----------
-    records : Records
-    measure : {"time", "work"}
-        Horizontal axis. "work": number of passes over A, for solvers that do no other work.
+    A case without a result by that time counts with residual 1, as the zero impulse. Cases are single problems from a
+    cold start; if there are only sequences, each step is a case. With `law`, its cases and all solvers are drawn.
     """
-    by_work = measure == "work"
-    single = any(r.step < 0 for r in records)
-    start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
-    runs = [
-        r for r in records
-        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.interleave_group
-    ]  # fmt: skip
-    cases = sorted({r.case for r in runs})
-    excluded = statistics.find_solvers_with_other_work(runs) if by_work else set()
-    by: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for r in runs:
-        if r.is_usable and r.time_min > 0.0 and r.solver not in excluded:
-            cost = max(1.0, statistics.count_sweeps_and_products(r)) if by_work else r.time_min
-            by.setdefault(r.solver, {}).setdefault(r.case, []).append((cost, max(r.relative, MIN_RESIDUAL)))
-    times = [t for own in by.values() for some in own.values() for t, _ in some]
-    name = "work over all" if by_work else "over all"
-    if not times:
+    from lavender.report.tables import select_starts
+
+    frame = report.frame[report.frame["law"] == law] if law else report.frame
+    single = frame["step"] < 0
+    frame = frame[single] if single.any() else frame
+    runs = select_starts(frame)
+    runs = runs[np.isfinite(runs["relative"]) & (runs["time"] > 0.0)]
+    if not len(runs):
         return Figure(name, "", "", "", ())
-    grid = np.geomspace(min(times), max(times), GRID_SIZE)
+    cases, grid = (
+        list(frame["case"].unique()),
+        np.geomspace(runs["time"].min(), runs["time"].max(), GRID_SIZE),
+    )
+    number = {case: i for i, case in enumerate(cases)}
+    solvers = [str(s) for s in runs["solver"].unique()] if law else select_drawn_solvers(report, frame)
     curves = []
-    for solver, own in sorted(by.items()):
+    for solver in sorted(solvers) if law else solvers:
+        own = runs[runs["solver"] == solver]
+        if not len(own):
+            continue
         reached = np.ones((len(cases), GRID_SIZE))
-        for row, case in zip(reached, cases, strict=True):
-            for t, x in own.get(case, ()):
-                np.minimum(row, x, out=row, where=grid * (1.0 + 1e-9) >= t)
-        bands = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-        # The curve starts after the last time at which half of the cases have no result.
-        first = max(np.flatnonzero(bands[0] == 1.0), default=0)
-        across, lower, middle, upper = (tuple(x[first:].tolist()) for x in (grid, *bands))
-        # A solver may not accept every case.
-        label = solver if len(own) == len(cases) else f"{solver} ({len(own)} of {len(cases)})"
-        curves.append(Curve(solver, label, across, middle, low=lower, high=upper))
-    over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
-    if any(len(own) < len(cases) for own in by.values()):
-        over += "; no result counts as 1 (the legend gives the number of cases with results)"
+        places = np.minimum(np.searchsorted(grid * (1.0 + 1e-9), own["time"]), GRID_SIZE - 1)
+        np.minimum.at(
+            reached, (own["case"].map(number).to_numpy(int), places), own["relative"].clip(MIN_RESIDUAL)
+        )
+        bands = np.quantile(
+            np.minimum.accumulate(reached, axis=1), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"
+        )
+        first = int(
+            np.searchsorted(-bands[1], -1.0, side="right")
+        )  # From here on, half of the cases have a result.
+        if first == GRID_SIZE:
+            continue
+        across, low, middle, high = (tuple(x[first:].tolist()) for x in (grid, *bands))
+        n = own["case"].nunique()
+        label = solver if n == len(cases) else f"{solver} ({n} of {len(cases)} cases)"
+        band = {"low": low, "high": high} if not curves and not law and len(cases) > 1 else {}
+        curves.append(Curve(solver, label, across, middle, steps=len(cases) == 1, unmarked=True, **band))
+    over = (
+        f", median over {format_count(len(cases), 'case' if single.any() else 'step')}"
+        if len(cases) > 1
+        else ""
+    )
     note = FLAT_LINES_NOTE
-    if by_work:
-        names = f" ({', '.join(sorted(excluded))})" if excluded else ""
-        note = f"{PASSES_NOTE}{names}. {note}"
-    return Figure(
-        name, f"Error against {'work' if by_work else 'time'}{over if len(cases) > 1 else ''}",
-        "passes over A" if by_work else make_time_axis_title(runs), "relative residual [-]", tuple(curves),
-        tolerances=statistics.get_tolerances(records), note=note,
-    )  # fmt: skip
+    if len(cases) > 1:
+        note = f"The band holds the middle half of the cases. A case without a result counts as 1. {note}"
+    return Figure(name, f"Error against time{over}", "time of a call [s]", "relative residual [-]", tuple(curves),
+                  tolerances=report.tolerances, note=note)  # fmt: skip
 
 
-def build_budget_figure(records: Records, case: str) -> Figure:
-    """Plot the residual against exact iteration budgets, cold and warm."""
+def build_cost_figure(report: Report) -> Figure:
+    """Plot the time to the middle tolerance against the number of rows, with the fitted power of each solver."""
+    from lavender.report.tables import get_times, tabulate_costs
+
+    fits, target = tabulate_costs(report), format_tolerance(report.tolerance)
+    times, curves = get_times(report.frame, report.tolerance), []
+    drawn = select_drawn_solvers(report, report.frame)
+    for fit in fits.to_dict("records"):
+        if fit["solver"] in drawn:
+            own = times.loc[fit["solver"]].dropna()
+            rows = np.array([report.records.cases[c].rows for c in own.index], float)
+            solver, ends = fit["solver"], np.array([rows[rows > 0].min(), rows.max()])
+            line = fit["fit at 1000 rows [s]"] * (ends / 1000.0) ** fit["exponent of rows"]
+            label = f"{solver}, rows^{fit['exponent of rows']:.2f}"
+            curves.append(Curve.from_points(solver, label, zip(ends, line, strict=True), unmarked=True))
+            curves.append(Curve.from_points(solver, "", zip(rows, own, strict=True), points=True))
+    note = "Each point is a case; a line is the power of the number of rows that fits a solver's points best."
+    return Figure("cost-against-rows", f"Time to {target} against the number of rows", "rows", "time of a call [s]",
+                  tuple(curves), note=note)  # fmt: skip
+
+
+def build_profile_figure(report: Report) -> Figure:
+    """Plot a Dolan-More performance profile: share of cases solved within a multiple of the fastest solver's time.
+
+    A case that a solver misses or does not accept counts with an infinite multiple.
+    """
+    from lavender.report.tables import get_times
+
+    times = get_times(report.frame, report.tolerance)
+    n, target = len(times.columns), format_tolerance(report.tolerance)
+    title = f"Performance profile to {target}, {format_count(n, 'case')}"
+    ratios = times / times.min()
     curves = []
-    for (name, solver, start), points in sorted(statistics.group_runs_by_budget(records).items()):
-        if name == case:
-            curves.append(
-                Curve.from_points(solver, format_run_name(solver, start), points, thin=start != "cold")
-            )
-    # The axis is titled "sweeps" only if every solver's iteration is a sweep; an iteration of admm, for example, is
-    # not.
-    swept = all("sweeps" in r.work for r in records if r.mode == "budget" and r.case == case and r.is_usable)
-    title = "sweeps" if swept else "iterations, each solver's own unit"
-    return _build_case_figure("budget", title, records, case, curves)
+    for solver in select_drawn_solvers(report, report.frame) if n > 1 else ():
+        own = np.sort(ratios.loc[solver].dropna().to_numpy(float))
+        if len(own):
+            steps = [(1.0, 100.0 * np.sum(own <= 1.0) / n)]
+            steps += [(r, 100.0 * np.sum(own <= r) / n) for r in np.unique(own) if r > 1.0]
+            curves.append(Curve.from_points(solver, solver, steps, steps=True, unmarked=True))
+    note = "Left: the share of cases on which a solver is the fastest. Right: the share that it solves in any time."
+    return Figure("performance-profile", title, "time / fastest time", "cases solved [%]", tuple(curves),
+                  y_log=False, note=note)  # fmt: skip
 
 
-# Largest number of curves of a profile. More are hard to distinguish and mislead about ranks below 1.
-MAX_CURVES = 5
-MIN_COMPARED = 2  # At least this many built-in solvers are drawn, however many plug-ins are.
+def build_sequence_figure(report: Report, name: str) -> Figure:
+    """Plot the time of all steps so far of a sequence to the middle tolerance, carried and cold (thin)."""
+    runs = report.frame[(report.frame["sequence"] == name) & (report.frame["mode"] == "tol")]
+    curves: list[Curve] = []
+    for solver in select_drawn_solvers(report, runs) if len(runs) else ():
+        own = runs[(runs["solver"] == solver) & (runs["tol"] <= report.tolerance)]
+        own = own[own["tol"] == own["tol"].max()]
+        for start in ("carried", "cold"):
+            some = own[own["start"] == start].sort_values("step")
+            if len(some):
+                cold = start == "cold" and (own["start"] == "carried").any()
+                points = zip(some["step"], some["time"].cumsum(), strict=True)
+                label = f"{solver} (cold)" if cold else solver
+                curves.append(Curve.from_points(solver, label, points, thin=bool(cold), unmarked=True))
+    title = f"{name}: time of all steps so far, to {format_tolerance(report.tolerance)}"
+    return Figure(f"sequence-{name}", title, "step", "time of all steps so far [s]", tuple(curves), x_log=False,
+                  note="Solid: impulses carried from step to step. Dashed: cold.")  # fmt: skip
 
 
-def is_plug_in(solver: str) -> bool:
-    """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
-    spec = registry.specs().get(solver)
-    return spec is None or not spec.builtin
-
-
-def select_drawn_solvers(ranked: Sequence[str], always: Sequence[str] = ()) -> list[str]:
-    """Select the solvers that a figure shows, from `ranked`, best first.
-
-    All plug-ins, the solvers in `always` and the best other solvers are shown: `MAX_CURVES` in all, unless there are
-    many plug-ins.
-    """
-    plug_ins = [name for name in ranked if is_plug_in(name)]
-    required = [name for name in ranked if name in always and name not in plug_ins]
-    others = [name for name in ranked if name not in (*plug_ins, *required)]
-    n_others = max(MAX_CURVES - len(plug_ins), MIN_COMPARED) - len(required)
-    return [*plug_ins, *others[: max(n_others, 1)], *required]
-
-
-def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
-    """Plot the steps of a sequence at one target, carried and cold (thin), for a few solvers.
-
-    With a budget: the residual of each step. To a tolerance: the time of all steps so far, because the times of single
-    steps are noise.
-    """
-    timed = passes[0].mode == "tol"
-
-    def get_sort_key(w: statistics.Pass) -> tuple[float, float, str]:
-        return (
-            -len(w.times[w.start]),
-            w.total_times[w.start] if timed else w.get_median_residual(w.start),
-            w.solver,
-        )
-
-    ranked = [w.solver for w in sorted(passes, key=get_sort_key)]
-    drawn = set(select_drawn_solvers(ranked))
-    curves = []
-    for w in passes:
-        for start, residuals in sorted(w.residuals.items()) if w.solver in drawn else ():
-            values = np.cumsum(w.times[start]).tolist() if timed else residuals
-            cold = start == "cold" and len(w.residuals) > 1
-            label = f"{w.solver} (cold)" if cold else w.solver
-            curves.append(
-                Curve.from_points(w.solver, label, zip(w.numbers[start], values, strict=True), thin=cold)
-            )
-    target = passes[0].target
-    return Figure(
-        f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
-        "time of all steps so far [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
-        left_out=tuple(sorted(set(ranked) - drawn)),
-    )  # fmt: skip
-
-
-def build_profile_figure(profile: statistics.Profile) -> Figure:
-    """Plot a Dolan-More profile of the plug-ins and of the solvers that solve the largest number of cases fastest."""
-
-    def get_sort_key(name: str) -> tuple[float, float, str]:
-        steps = profile.curves[name]
-        last = steps[-1][1] if steps else 0.0
-        return (
-            -last,
-            sum(r * (s - t) for (r, s), t in zip(steps, (0.0, *(s for _, s in steps)), strict=False)),
-            name,
-        )
-
-    ranked = sorted(profile.curves, key=get_sort_key)
-    drawn = set(
-        select_drawn_solvers([name for name in ranked if get_sort_key(name)[0] < 0.0 or is_plug_in(name)])
-    )
-    shown = [name for name in ranked if name in drawn]
-    curves = [
-        Curve.from_points(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True)
-        for name in shown
-    ]
-    left_out = tuple(sorted(set(profile.curves) - set(shown)))
-    by_work = profile.measure == "work"
-    name = f"{'work profile' if by_work else 'profile'} {profile.law} {format_tolerance(profile.tolerance)}"
-    cases = format_count(profile.cases, "case")
-    return Figure(
-        name,
-        f"{profile.law}, to {format_tolerance(profile.tolerance)} ({cases}){', by work' if by_work else ''}",
-        "passes over A / fewest passes" if by_work else "time / fastest time",
-        "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
-    )  # fmt: skip
-
-
-Group = Mapping[str, tuple[Figure, ...]]  # Figures by case, law or sequence.
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Every figure of a report that has a curve, by its place on the page.
-
-    Parameters
-    ----------
-    over : figure over all cases, under the key "all"
-    profiles : performance profiles by law, one for each tolerance: by time, then by work
-    sequences : figures by sequence
-    cases : error against time and residual against iterations, by case
-    """
-
-    over: Group = field(default_factory=dict)
-    profiles: Group = field(default_factory=dict)
-    sequences: Group = field(default_factory=dict)
-    cases: Group = field(default_factory=dict)
-
-    @property
-    def groups_by_section(self) -> dict[str, Group]:
-        """The groups of figures by the name of their section."""
-        return dict(vars(self))
-
-    def __iter__(self) -> Iterator[Figure]:
-        for group in self.groups_by_section.values():
-            for some in group.values():
-                yield from some
-
-
-def build_figures(records: Records) -> Figures:
-    """Build the figures of records; none for a campaign."""
-    if statistics.is_campaign(records):
-        return Figures()
-    parts: dict[str, Records] = {}  # Records by case.
-    for r in records:
-        if r.step < 0:
-            parts.setdefault(r.case, Records(records.runs)).add(r)
-    profiles: dict[str, list[Figure]] = {}
-    for profile in (*statistics.compute_profiles(records), *statistics.compute_profiles(records, "work")):
-        if profile.cases > 1 and (profile.measure == "time" or len(profile.curves) > 1):
-            profiles.setdefault(profile.law, []).append(build_profile_figure(profile))
-    over = _select_drawn_figures(build_overall_figure(records))
-    return Figures(
-        over={"all": over} if over else {},
-        profiles={law: _select_drawn_figures(*some) for law, some in profiles.items()},
-        sequences={
-            name: _build_pass_figures(name, passes)
-            for name, passes in statistics.group_passes_by_sequence(records).items()
-        },
-        cases={
-            c: _select_drawn_figures(build_work_precision(part, c), build_budget_figure(part, c))
-            for c, part in parts.items()
-        },
-    )
-
-
-def _select_drawn_figures(*some: Figure) -> tuple[Figure, ...]:
-    return tuple(figure for figure in some if figure.curves)
-
-
-def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figure, ...]:
-    # Draw each sequence at the middle budget and at the middle tolerance.
-    budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
-    middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
-    tolerances = sorted({w.tol for w in passes if w.mode == "tol"}, reverse=True)
-    to_tolerance = [w for w in passes if w.mode == "tol" and w.tol == tolerances[len(tolerances) // 2]]
-    return tuple(build_pass_figure(name, some) for some in (middle, to_tolerance) if some)
+def list_solvers(figures: Sequence[Figure]) -> list[str]:
+    """Return the names of the curves of all figures, in their order."""
+    return list(dict.fromkeys(c.solver for figure in figures for c in figure.curves))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lavender.io.stored import make_folder, write_text
-from lavender.report.figures import Figure
+from lavender.report.figures import Figure, list_solvers
 from lavender.report.page import create_environment
-from lavender.report.plotting import PAGE_WIDTH, number_styles, plot_for_page, save_figures
+from lavender.report.plotting import draw_figures, number_styles
 from lavender.report.table import Table
 from lavender.report.terminal import print_table
 
@@ -67,38 +67,23 @@ class SummaryPage:
     stopped: bool = False
     warning: str = ""
 
-    @property
-    def _curve_names(self) -> list[str]:
-        """Names of the curves of all figures, in their order."""
-        curves = (c for part in self.sections for f in part.figures for c in f.curves)
-        return list(dict.fromkeys(c.solver for c in curves))
-
-    def render_html(self) -> str:
-        """Return one file without external parts; every text is escaped."""
-        names = self._curve_names
-        number = {name: i for i, name in enumerate(names)}
-        shown = [part for part in self.sections if part.is_shown]
+    def render_html(self, folder: Path | None = None) -> str:
+        """Return one file without external parts; every text is escaped. With `folder`, also write figures there."""
+        figures = [f for part in self.sections for f in part.figures if f.curves]
+        styles = number_styles(list_solvers(figures))
         sections = [
-            (
-                part,
-                [
-                    (plot_for_page(f, number, names, width=PAGE_WIDTH), plot_for_page(f, number, names))
-                    for f in part.figures
-                    if f.curves
-                ],
-            )
-            for part in shown
+            (part, draw_figures([f for f in part.figures if f.curves], styles, folder))
+            for part in self.sections
+            if part.is_shown
         ]
         template = create_environment().get_template("summary_page.html.j2")
-        return str(template.render(page=self, sections=sections, number=number))
+        return str(template.render(page=self, sections=sections))
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
-        """Write `index.html`, `numbers.json` and `figures/*.svg, *.png`; return the path of the page."""
+        """Write `index.html`, `numbers.json` and `figures/*.svg`; return the path of the page."""
         folder = make_folder(folder)
-        write_text(folder / "index.html", self.render_html())
+        write_text(folder / "index.html", self.render_html(folder / "figures"))
         write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
-        figures = (f for part in self.sections for f in part.figures if f.curves)
-        save_figures(figures, folder / "figures", number_styles(self._curve_names))
         return folder / "index.html"
 
     def print_short(self, console: Console) -> None:
@@ -111,7 +96,7 @@ class SummaryPage:
                 console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
             if part.code and part.note:
                 console.print(part.note, highlight=False, markup=False)
-            tables = [replace(t, rows=t.rows[: part.short]) for t in part.tables[:1]]
+            tables = [t.with_rows(part.short) for t in part.tables[:1]]
             for table in tables if part.terminal_table is None else [part.terminal_table]:
                 if table.rows:
                     console.print()

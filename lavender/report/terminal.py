@@ -5,24 +5,15 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from lavender.report.bench import statistics
-from lavender.report.bench.record import escape_unprintable
-from lavender.report.findings import Report
-from lavender.report.table import COLOURS, Cell, Table
-from lavender.report.table_specs import (
-    NOT_COMPARED,
-    build_short_table,
-    list_cases_solved_at_zero,
-    list_sections,
-)
-from lavender.report.text import format_count, format_residual, list_cases_not_loaded, list_diagnostics
+from lavender.report.table import Table
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table as RichTable
+
+    from lavender.report.findings import Report
 
 MAX_LINES = 25  # Largest number of lines of a short report, including the lines that the command adds.
 # Number of lines that the command adds: a blank line, page, reused runs, cases that did not load.
@@ -35,43 +26,45 @@ MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
 def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
     """Print a table within the width of the terminal. Its texts are not read as markup.
 
-    In a table that is too wide, heads and words fold and numbers stay whole. If that is not enough, or if the table
-    `folds`, each cell becomes a line below the first cell of its row. With `cut`, a row is one line and its first cell
-    is shortened instead. `grouped` shows the first cell only if it differs from the row above, and separates such
-    groups. Columns without any text are left out.
+    In a table that is too wide, heads and words fold and numbers stay whole. If that is not enough, each cell becomes
+    a line below the first cell of its row; with `cut`, the last columns are left out instead. `grouped` shows the
+    first cell only if it differs from the row above, and separates such groups. Columns without any text are left out.
     """
+    texts = table.cell_texts
+    empty = [head for i, head in enumerate(table.heads) if texts and not any(row[i] for row in texts)]
+    table = table.without_columns(*empty)
+    grid = _make_grid(table, grouped)
+    is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
+    while is_wide and _fold_words(grid, table) > console.width:
+        if not cut or len(table.heads) <= 2:
+            _print_rows_as_lines(console, table)
+            return
+        table = table.without_columns(table.heads[-1])
+        grid = _make_grid(table, grouped)
+        is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
+    console.print(grid, highlight=False)
+
+
+def _make_grid(table: Table, grouped: bool) -> RichTable:
+    """Make rich's table, in which no text folds."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    empty = [
-        head
-        for i, head in enumerate(table.heads)
-        if table.rows and not any(row[i] for row in table.cell_texts)
-    ]
-    table = table.without_columns(*empty)
     grid = RichTable(box=None, pad_edge=False, header_style="bold")
     for head in table.heads:
         grid.add_column(
-            Text(head), justify="right" if table.is_numeric_column(head) else "left", no_wrap=not table.folds
+            Text(head), justify="right" if table.is_numeric_column(head) else "left", no_wrap=True
         )
-    grid.columns[0].no_wrap = not (table.folds or cut)
     above = ""
-    for i, row in enumerate(table.rows):
-        cells = [Text(str(c), style=COLOURS.get(c.mark, "") if isinstance(c, Cell) else "") for c in row]
-        if cut:
-            cells[0].no_wrap, cells[0].overflow = True, "ellipsis"
-        first = str(row[0])
-        if grouped and first == above:
+    for row in table.cell_texts:
+        cells = [Text(text) for text in row]
+        if grouped and row[0] == above:
             cells[0] = Text("")
         elif grouped and above:
             grid.add_section()
-        grid.add_row(*cells, style=COLOURS.get(table.marks[i], "") if table.marks else "")
-        above = first
-    is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
-    if is_wide and not cut and (table.folds or _fold_words(grid, table) > console.width):
-        _print_rows_as_lines(console, table)
-        return
-    console.print(grid, highlight=False)
+        grid.add_row(*cells, style="red" if any("✗" in text for text in row) else "")
+        above = row[0]
+    return grid
 
 
 def _fold_words(grid: RichTable, table: Table) -> int:
@@ -86,7 +79,8 @@ def _fold_words(grid: RichTable, table: Table) -> int:
             smallest = max(map(len, [*texts, *lines]))
             column.header = Text("\n".join(lines))
         else:
-            smallest = min(MIN_WORD_WIDTH, max(len(word) for text in (head, *texts) for word in text.split()))
+            words = [word for text in (head, *texts) for word in text.split()]
+            smallest = min(MIN_WORD_WIDTH, max(map(len, words), default=1))
             column.min_width, column.no_wrap, column.overflow = smallest, False, "fold"
         width += smallest
     return width
@@ -109,37 +103,28 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
     """
     from rich.text import Text
 
+    from lavender.report.recommendation import recommend
+
     lines: list[Text] = []
-    for i, statement in enumerate(report.verdict.statements):
-        if complete or i == 0 or statement.requested or statement.one_line:
-            cut = statement.one_line and not complete
-            lines.append(
-                Text(
-                    statement.text,
-                    style="" if i else "bold",
-                    no_wrap=cut,
-                    overflow="ellipsis" if cut else None,
-                )
-            )
-            hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
-            code = statement.code if complete else (statement.call_line + hint,) * bool(statement.call_line)
-            lines += [Text(f"    {line}") for line in code]
-    warnings = (report.stopped_warning, report.busy_warning or report.load_warning)
-    lines += [Text(warning, style="yellow") for warning in warnings if warning]
-    notes = [
-        Text.assemble((text, style)) for text, style in _list_notes(report, MAX_NOTES if complete else 1)
-    ]
+    statements = recommend(report)
+    for statement in statements:
+        lines.append(Text(statement.text, style="bold" if statement is statements[0] else ""))
+        hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
+        code = statement.code if complete else (statement.call_line + hint,) * bool(statement.call_line)
+        lines += [Text(f"    {line}") for line in code]
+    if report.busy_warning:
+        lines.append(Text(report.busy_warning, style="yellow"))
     for text in lines:
-        console.print(text, highlight=False, no_wrap=text.no_wrap, overflow=text.overflow)
+        console.print(text, highlight=False)
+    notes = [Text(text, style=style) for text, style in _list_notes(report, MAX_NOTES if complete else 1)]
     if complete:
-        for section in list_sections(report):
-            note = f" ({section.note})" if section.table.rows else f": {section.empty}"
+        for section in report.sections.values():
+            note = f" {section.note}" if section.note else ""
             console.print(Text.assemble("\n", (section.title, "bold"), note))
-            if section.table.rows:
-                print_table(console, section.table, grouped=section.grouped)
+            print_table(console, section.table, grouped=section.file in ("runs", "sequences", "times"))
     else:
         used = sum(len(text.wrap(console, console.width)) for text in lines)
-        print_first_rows(console, build_short_table(report), MAX_LINES - COMMAND_LINES - used - len(notes))
+        print_first_rows(console, report.overview.table, MAX_LINES - COMMAND_LINES - used - len(notes))
     for text in notes:
         console.print(
             text, highlight=False, no_wrap=not complete, overflow="fold" if complete else "ellipsis"
@@ -148,35 +133,37 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 
 def print_first_rows(console: Console, table: Table, height: int) -> None:
     """Print a blank line, as many rows as fit into `height` lines, and the number of rows left out."""
-    if not table.rows:
-        return
-    rows = table.rows if len(table.rows) <= height - 2 else table.rows[: max(1, height - 3)]
-    console.print()
-    print_table(console, replace(table, rows=rows), cut=True)
-    if len(rows) < len(table.rows):
-        console.print(f"{len(table.rows) - len(rows)} more: --tables", highlight=False, style="dim")
+    n = len(table.rows)
+    if n:
+        shown = n if n <= height - 2 else max(1, height - 3)
+        console.print()
+        print_table(console, table.with_rows(shown), cut=True)
+        if shown < n:
+            console.print(f"{n - shown} more: --tables", highlight=False, style="dim")
 
 
-def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
-    """Yield (note, style): at most `most` notes of each kind; if there are more, a line has their number."""
-    records = report.ranked_records
-    false_claims = [
-        f"{r.case}, {r.solver}: {r.status_conflict}"
-        for r in statistics.list_failures(records)
-        if r.status_conflict
-    ]
+def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
+    """Yield (note, style): at most `longest` notes of each kind; if there are more, a note has their number."""
+    from lavender.report.tables import select_failures
+    from lavender.report.text import format_count, format_residual, list_cases_not_loaded, list_diagnostics
+
+    records = report.records
+    failures = select_failures(report) if len(report.frame) else report.frame
+    false = failures[failures["status_conflict"].astype(str) != ""]
     kinds = {
-        "false claim": ("red", false_claims),
-        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
-        "same answer without an iteration": (
-            "yellow",
-            [f"{d.case}: {', '.join(d.same)}" for d in statistics.compute_difficulties(records) if d.same],
+        "false claim": (
+            "red",
+            [
+                f"{c}, {s}: {x}"
+                for c, s, x in zip(false["case"], false["solver"], false["status_conflict"], strict=True)
+            ],
         ),
-        "left out": ("yellow", [f"{what}: {reason}" for what, reason in list_cases_not_loaded(records)]),
+        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
+        "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(records)]),
     }
     for kind, (style, texts) in kinds.items():
-        for i, text in enumerate(texts[:most], 1):
-            place = f" ({i} of {len(texts)})" if most > 1 else f", the first of {len(texts)}"
+        for i, text in enumerate(texts[:longest], 1):
+            place = f" ({i} of {len(texts)})" if longest > 1 else f", the first of {len(texts)}"
             yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
     skipped = [s.reason.partition(":")[0] for s in records.skips if s.solver]
     replacements = Counter(pair for pair in skipped if " → " in pair)
@@ -186,18 +173,14 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     refused = len(skipped) - replacements.total()
     if refused:
         pairs = format_count(refused, "pair")
-        yield f"{pairs} of case and solver not run, or not to the end: the page says why", "dim"
-    if report.earlier_run is not None:
-        changes = statistics.compare_times(report.earlier_run, records)
-        by_kind = Counter(c.kind for c in changes if c.kind != "same")
-        text = ", ".join(f"{n} {kind}" for kind, n in sorted(by_kind.items()))
-        text = text or ("nothing beyond noise" if changes else NOT_COMPARED)
-        yield f"Against {escape_unprintable(report.earlier_run.source)}: {text}", ""
-    idle = list_cases_solved_at_zero(report.newest_run)
-    if idle:
-        case, _, solver, velocity, _ = max(idle, key=lambda entry: entry[3])
-        cases, speed = format_count(len(idle), "case"), format_residual(velocity)
-        yield (
-            f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver or 'no solver'} on {case}",
-            "dim",
-        )
+        yield f"{pairs} of case and solver not run, or not to the end: the page has the reasons", "dim"
+    if "changes" in report.sections:
+        section = report.sections["changes"]
+        counts = sorted(Counter(section.frame["change"].astype(str)).items())
+        text = ", ".join(f"{n} {kind}" if "target" in section.frame else kind for kind, n in counts)
+        yield f"{section.title}: {text} ({section.note})", ""
+    if "idle" in report.sections:
+        frame = report.sections["idle"].frame
+        case, _, solver, velocity, _ = frame.iloc[-1]
+        cases, speed = format_count(len(frame), "case"), format_residual(velocity)
+        yield f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {case}", "dim"

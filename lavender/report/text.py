@@ -5,26 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from lavender.report.bench.record import Record, Skip
-from lavender.report.bench.store import Records
+from lavender.report.records import Records, Skip
 
 TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
-
-
-#: By `Record.timing_mode`: title of an axis for these times.
-TIMED_CODE = {
-    "call": "time of a call [s]",
-    "steps": "time of a call [s]",
-    "batch": "time per problem [s]",
-    "": "time of set-up and solve [s]",
-}
-
-
-def make_time_axis_title(runs: Iterable[Record]) -> str:
-    """Return the title of an axis for the times of some runs."""
-    titles = {TIMED_CODE[r.timing_mode] for r in runs if r.is_usable}
-    return titles.pop() if len(titles) == 1 else "time [s]"
 
 
 def format_residual(x: float) -> str:
@@ -148,13 +132,3 @@ def format_percent(part: int, whole: int, digits: int = 0) -> str:
         digits += 1
     tenths = 100 * 10**digits * part // whole
     return f"{tenths / 10**digits:.{digits}f} %"
-
-
-def format_solved_share(solved: int, cases: int) -> str:
-    """Return the number of solved cases of all cases as "(7/8)"; empty if all are solved."""
-    return "" if solved == cases else f" ({solved}/{cases})"
-
-
-def format_run_name(solver: str, start: str) -> str:
-    """Return a solver's name with its start in parentheses, as in "newton (warm)"; a cold start is not named."""
-    return solver if start == "cold" else f"{solver} ({start})"

@@ -4,13 +4,6 @@ import pytest
 from stacks import stack
 
 from lavender import cli, io
-from lavender.report.bench.running import alternating
-
-
-@pytest.fixture(autouse=True)
-def timed_once(monkeypatch):
-    """Lines of a report take one turn: more of them, for seconds, make its times sure, which no test reads."""
-    monkeypatch.setattr(alternating, "MAX_REPETITIONS", 1)
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import bench, cli, io, registry
+from lavender import cli, io, registry, report
 from lavender.cli import entry
-from lavender.report.bench.record import Skip, to_json
+from lavender.report.records import Skip, to_json
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
@@ -272,7 +272,7 @@ def test_a_line_without_end_is_refused(tmp_path):
     with path.open("wb") as stream:
         stream.truncate(2**27)
     with pytest.raises(lv.InputError, match="has a line of more than"):
-        bench.read_records(path)
+        report.read(path)
 
 
 @pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
@@ -281,7 +281,7 @@ def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, reasons, tail):
     entries = [to_json(Skip("run", f"case {i}", "", reason)) for i, reason in enumerate(reasons)]
     head = b"".join(json.dumps(entry).encode() + b"\n" for entry in entries)
     (tmp_path / "a.jsonl").write_bytes(head + tail)
-    with bench.Store(tmp_path / "a.jsonl") as store:
+    with report.Store(tmp_path / "a.jsonl") as store:
         assert [skip.reason for skip in store.records.skips] == reasons
     assert (tmp_path / "a.jsonl").read_bytes() == head
 
@@ -364,12 +364,12 @@ def _must_not_begin(*_, **__):
         ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
-        ("solve toy_stack --output {}/x.npz", "lavender.report.bench.resolve_sources"),
+        ("solve toy_stack --output {}/x.npz", "lavender.report.resolve_sources"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.export.library.source"),
         ("web page {}/sub", "lavender.sim.web.pages.get_or_build_module"),
-        ("report toy_stack --out {}/sub", "lavender.report.bench.resolve_sources"),
-        ("report toy_stack --workers 1 --out {}/sub", "lavender.report.bench.resolve_sources"),
+        ("report toy_stack --out {}/sub", "lavender.report.resolve_sources"),
+        ("report toy_stack --workers 1 --out {}/sub", "lavender.report.resolve_sources"),
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
@@ -455,7 +455,7 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     ("call", "message"),
     [
         ("import lavender.cli", "the command line needs click, rich: pip install click rich"),
-        ("lv.bench.run(['granularF(n=3)'], ['pgs'])", "a measurement needs joblib: pip install joblib"),
+        ("lv.report.run(['granularF(n=3)'], ['pgs'])", "a measurement needs joblib: pip install joblib"),
         ("lv.solve(lcp, 'pgs', history=True).history.plot()", "History.plot needs matplotlib: pip install"),
         ("lv.suite; print(lv.cross_check(lcp, ['pgs', 'direct']))", "agrees"),
     ],

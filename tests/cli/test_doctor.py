@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from lavender.cli.entry import cli
-from lavender.report.bench import doctor, machine
+from lavender.report import doctor, machine
 
 NEEDED = {
     "lavender",

@@ -24,7 +24,7 @@ from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import bench, cli, io
+from lavender import cli, io, report
 from lavender.io.stored import (
     FOLDER_LOCK,
     TEMPORARY_NAME,
@@ -33,12 +33,13 @@ from lavender.io.stored import (
     write_atomically,
     write_text,
 )
-from lavender.report.bench import machine
-from lavender.report.bench.record import KINDS, Skip, make_file_name, to_json
-from lavender.report.bench.store import Records, Store
-from lavender.report.bench.timed_call import format_call
+from lavender.report import machine
+from lavender.report.files import summarise
 from lavender.report.findings import Report
+from lavender.report.page import render_page
+from lavender.report.records import KINDS, Skip, Store, make_file_name, to_json
 from lavender.report.terminal import print_report
+from lavender.report.timing import format_call
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import save_picture
 
@@ -54,7 +55,7 @@ READERS = {
     "load film": (".film", lambda results, path: lv.engine.Film.load(path)),
     "load snapshot": (".snap", lambda results, path: lv.Snapshot.load(path)),
     "load state": (".snap", lambda results, path: lv.Simulation("stack").load(path)),
-    "read records": (".jsonl", lambda results, path: bench.read_records(path)),
+    "read records": (".jsonl", lambda results, path: report.read(path)),
 }
 
 
@@ -80,8 +81,6 @@ WRITERS = {
     "figure": (".svg", lambda results, path: results["trace"].plot(path)),
     "snapshot": (".snap", lambda results, path: results["state"].save(path)),
     "records": (".jsonl", lambda results, path: Store(path).close()),
-    "records as CSV": (".csv", lambda results, path: bench.write_csv(Records(), path)),
-    "records as JSON": (".json", lambda results, path: bench.write_json(Records(), path)),
     "text": (".txt", lambda results, path: write_text(path, "abc")),
 }
 needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
@@ -323,17 +322,19 @@ def test_a_clock_that_jumps_does_not_remove_the_file_of_a_running_writer(tmp_pat
 
 def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
     path = tmp_path / "records.jsonl"
-    with bench.Store(path) as store:
+    with report.Store(path) as store:
         for _ in range(2):  # The first refusal releases nothing.
             with pytest.raises(lv.InputError, match="is being written by another command"):
-                bench.Store(path)
-        other = python("-c", f"from lavender import bench; bench.Store({str(path)!r})", status=1)
+                report.Store(path)
+        other = python("-c", f"from lavender import report; report.Store({str(path)!r})", status=1)
         assert "is being written by another command" in other.stderr
         store.close()
-        bench.Store(path).close()
-    killed = f"import os; from lavender import bench; s = bench.Store({str(path)!r}); os.kill(os.getpid(), 9)"
+        report.Store(path).close()
+    killed = (
+        f"import os; from lavender import report; s = report.Store({str(path)!r}); os.kill(os.getpid(), 9)"
+    )
     python("-c", killed, status=-9)
-    bench.Store(path).close()
+    report.Store(path).close()
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -445,9 +446,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         import os, sys
         from lavender import cli
         from lavender.io.stored import TEMPORARY_NAME
-        from lavender.report.bench.running import alternating
         from lavender.sim.web import pages
-        alternating.MAX_REPETITIONS = 1
         pages.module = lambda say, name: b"a module"
         here, opened = os.getcwd(), set()
 
@@ -526,7 +525,7 @@ def test_the_name_of_a_plug_in_is_printed_as_text(lavender, register):
 def test_long_names_that_differ_at_the_end_have_different_file_names():
     names = ["n" * 300 + str(i) for i in range(3)]
     assert len({make_file_name(name) for name in names}) == 3
-    items = bench.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    items = report.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
     assert len({make_file_name(item.name).lower() for item in items}) == len(items)
 
 
@@ -650,7 +649,7 @@ def test_a_reader_that_raises_costs_its_own_case(tmp_path, monkeypatch):
         return load(path, **more)
 
     monkeypatch.setattr(io, "load", load_or_raise)
-    records = bench.run([tmp_path], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1))
+    records = report.run([tmp_path], ["pgs"], report.Plan(tolerances=(1e-3,), budgets=(), repeats=1))
     assert {r.case for r in records} == {"good"}
     assert ["RecursionError: [/x]" in s.reason for s in records.skips] == [True]
 
@@ -663,7 +662,7 @@ def test_a_report_with_workers_takes_files_and_folders(lavender, tmp_path):
     more = (*QUICK[:6], "--workers", 1)
     code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
     assert (code, err.strip()) == (0, "")
-    cases = {r.case for r in bench.read_records("lavender-report")}
+    cases = {r.case for r in report.read("lavender-report")}
     assert cases == {"x", "y", "z", "z #2", "random_spd(n=4)"}
     code, _, err = lavender("report", "nothing.npz", *more)
     assert code == 2 and "no such file" in err
@@ -689,7 +688,7 @@ def test_a_description_of_a_recording_by_anybody_is_harmless(lavender, tmp_path,
         os.mkfifo(folder / "engine.jsonl")
     else:
         (folder / "engine.jsonl").write_text(text)
-    items = bench.resolve_sources(folder)
+    items = report.resolve_sources(folder)
     assert items[0].problem.m == 4 and len(items) <= 2
     assert all(item.name.isprintable() for item in items)
     code = lavender("report", folder, *QUICK, "--no-figures")[0]
@@ -708,10 +707,10 @@ HOSTILE = [
 @pytest.fixture(scope="module")
 def entries():
     """The entries of a small report with a sequence and a skip."""
-    plan = bench.Plan(tolerances=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
-    cases = [stack(name="one"), *bench.make_sequence([stack(), stack()], "walk")]
-    records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
-    kinds = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
+    plan = report.Plan(tolerances=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
+    cases = [stack(name="one"), *report.make_sequence([stack(), stack()], "walk")]
+    records = report.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
+    kinds = [*records.runs.values(), *records.cases.values(), *records.skips, *records]
     return [to_json(e) for e in kinds]
 
 
@@ -723,17 +722,13 @@ def show_all(records):
     """Make everything that is shown of records, but the files of figures, in memory."""
     from rich.console import Console
 
-    from lavender.report.figures import build_figures
-    from lavender.report.markdown import summarise_report
-    from lavender.report.page import render_page
-
-    shown = records.select_latest_run()
-    report = Report(shown, shown)
-    print_report(report, Console(file=streams.StringIO(), width=140))
-    for record in shown.records:  # The fastest, which is shown, differs from run to run.
+    shown = Report(records, records)
+    for complete in (False, True):
+        print_report(shown, Console(file=streams.StringIO(), width=140), complete=complete)
+    for record in records:  # The fastest, which is shown, differs from run to run.
         assert format_call(record)
-    render_page(report, build_figures(shown)).encode("utf-8")
-    summarise_report(report).encode("utf-8")
+    render_page(shown).encode("utf-8")
+    summarise(shown).encode("utf-8")
 
 
 def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
@@ -747,7 +742,7 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
         ]
         write_entries(path, changed)
         try:
-            return bench.read_records(path)
+            return report.read(path)
         except lv.InputError:
             return None
 
@@ -784,7 +779,7 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
 def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
     (tmp_path / "records.jsonl").write_text(f"{text}\n")
     with pytest.raises(lv.InputError, match="line 1"):
-        bench.read_records(tmp_path)
+        report.read(tmp_path)
 
 
 def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
@@ -792,17 +787,18 @@ def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
     with pytest.raises(
         lv.InputError, match="line 4: the record belongs to a case that no earlier line describes"
     ):
-        bench.read_records(tmp_path)
+        report.read(tmp_path)
 
 
 def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, monkeypatch):
-    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
+    plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
     path = tmp_path / "records.jsonl"
-    bench.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
+    report.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
     monkeypatch.setattr(machine, "get_cpu_name", lambda: "another")
-    bench.run([stack(name="a")], ["pgs"], plan, path)
+    report.run([stack(name="a")], ["pgs"], plan, path)
     monkeypatch.undo()
-    bench.run([stack(8, name="b")], ["pgs"], plan, path)  # the first run again; b has changed
-    newest = bench.read_records(path).select_latest_run()
-    assert sorted((r.case, newest.cases[r.case].rows) for r in newest) == [("a", 6), ("b", 8)]
+    report.run([stack(8, name="b")], ["pgs"], plan, path)  # the first run again; b has changed
+    newest = report.read(path)
+    frame = newest.latest_frame
+    assert sorted(zip(frame["case"], frame["rows"], strict=True)) == [("a", 6), ("b", 8)]
     show_all(newest)

@@ -127,9 +127,7 @@ def test_the_lock_file_names_what_the_package_asks_for():
         re.findall(r"^([\w-]+)==(\S+)$", (ROOT / "docs" / "versions.txt").read_text("utf-8"), re.MULTILINE)
     )
     extras = project["optional-dependencies"]
-    needed = asked | {
-        re.split(r"[<>=]", x)[0] for name in ("qp", "fclib", "frame", "mujoco") for x in extras[name]
-    }
+    needed = asked | {re.split(r"[<>=]", x)[0] for name in ("qp", "fclib", "mujoco") for x in extras[name]}
     assert needed <= set(lock)
 
 
@@ -166,7 +164,7 @@ def declared(table):
 
 def test_every_import_is_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
-    known = declared("dependencies") | declared("fclib") | declared("qp") | declared("frame")
+    known = declared("dependencies") | declared("fclib") | declared("qp")
     known |= (
         declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     )
@@ -183,7 +181,6 @@ def test_every_import_is_declared():
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
-    known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()
     for tree in syntax_of_package().values():

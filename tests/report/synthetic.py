@@ -6,10 +6,8 @@ import json
 
 from rich.console import Console
 
-from lavender import bench
-from lavender.report.bench.record import CaseInfo, Record, Run
+from lavender.report import CaseInfo, Record, Records, Report, Run, Skip
 from lavender.report.engine import read_engine_answers
-from lavender.report.findings import Report
 from lavender.report.terminal import print_report
 
 TOLERANCES = (1e-3, 1e-6)
@@ -25,40 +23,35 @@ def info(case, law="lcp", structure=("stack",), **more):
 
 
 def record(case, solver, time, relative, **more):
+    """A record of three repetitions, the smallest of which took `time`."""
     values = {
-        "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "options": {}, "start": "cold",
-        "mode": "tol",
-        "tol": 1e-6, "max_iter": 0, "time_limit": 2.0, "order": "given", "seed": 0, "relative": relative,
-        "energy": relative, "velocity": relative, "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True,
-        "time_min": time, "time_median": time, "setup_min": time / 2, "solve_min": time / 2, "setup_median": time / 2,
-        "solve_median": time / 2, "repeats": 1, "success": relative <= more.get("tol", 1e-6),
+        "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "start": "cold", "mode": "tol",
+        "tol": 1e-6, "max_iter": 0, "time_limit": 2.0, "relative": relative, "energy": relative, "velocity": relative,
+        "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True, "times": (1.02 * time, time, 1.04 * time),
+        "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
     }  # fmt: skip
     return Record(**(values | more))
 
 
-def records_of(*made, structure=None, law=None):
-    found = bench.Records()
-    versions, plan = {"numpy": "2"}, {"tolerances": list(TOLERANCES)}
-    found.add(Run("run", "2026-01-01", "0.1", "3.11", "linux", "a cpu", 2, 1, versions, plan))
+def records_of(*made, structure=None, law=None, rows=None, whole=True):
+    found = Records()
+    plan = {"tolerances": list(TOLERANCES), "solvers": sorted({r.solver for r in made})}
+    found.add(
+        Run("run", "2026-01-01", "0.1", "3.11", "linux", "a cpu", 2, 1, {"numpy": "2"}, plan, whole=whole)
+    )
     for case in dict.fromkeys(r.case for r in made):
-        found.add(info(case, (law or {}).get(case, "lcp"), (structure or {}).get(case, ("stack",))))
+        words = (structure or {}).get(case, ("stack",))
+        more = {"rows": rows[case]} if rows else {}
+        found.add(info(case, (law or {}).get(case, "lcp"), words, **more))
     for r in made:
         found.add(r)
     return found
 
 
-def interleaved(made, case, solver, time, relative, **more):
-    """Add a run alone and the same interleaved with others, 1.25 times as long."""
-    made.append(record(case, solver, time, relative, **more))
-    slow = 1.25 * time
-    run = {"timing_mode": "call", "interleave_group": "one", "times": (slow,) * 5, "calibration_time": 1e-4}
-    made.append(record(case, solver, slow, relative, **(run | more)))
-
-
-def shown(found, width=200, **more):
-    """What the terminal shows of a report."""
+def shown(report, width=200, **more):
+    """The text of a report in the terminal."""
     out = io.StringIO()
-    print_report(found, Console(file=out, width=width), **more)
+    print_report(report, Console(file=out, width=width), **more)
     return out.getvalue()
 
 
@@ -68,10 +61,8 @@ def example(folder):
     crashed = {"status": "CRASHED (SIGSEGV)", "claims": False}
     for i, case in enumerate(("pile", EVIL)):
         size = 1e-3 * (1 + i)
-        interleaved(made, case, "auto", size, 1e-9, solution_hash="a")
-        interleaved(made, case, "direct", 2.0 * size, 1e-13, solution_hash="b")
-        interleaved(made, case, "nncg", 9.0 * size, 1e-7)
-        made.append(record(case, "osqp", 3.0 * size, 1e-8, backend_time_min=0.5 * size))
+        for solver, ratio, relative in (("auto", 1.0, 1e-9), ("direct", 2.0, 1e-13), ("osqp", 3.0, 1e-8)):
+            made.append(record(case, solver, ratio * size, relative, load=6.0))
         made.append(record(case, "pgs", size, 9e-4, tol=1e-3, iterations=40))
         made += [record(case, "pgs", 1e-4, (1 + 3 * k) * 1e-2, order=order, **BUDGET) for k, order in
                  enumerate(("given", "reverse"))]  # fmt: skip
@@ -79,35 +70,29 @@ def example(folder):
             record(case, "liar", 0.1 * size, 0.5, message="done", worst_name="<b>row 3", **FALSE_CLAIM)
         )
         if case == "pile":
-            made.append(record(case, "dead", float("nan"), float("inf"), **crashed))
+            made.append(record(case, "dead", 1.0, float("inf"), **{**crashed, "times": ()}))
     made.append(record("idle", "pgs", 1e-5, 1.0, velocity=3e-12))
     for step in range(2):
         for start, left in (("cold", 1e-1), ("carried", 1e-2)):
-            steps = {"start": start, "step": step, "timing_mode": "steps"}
+            steps = {"start": start, "step": step}
             made.append(record(f"walk[{step}]", "pgs", 1e-3, left, **steps, **BUDGET))
-            interleaved(made, f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps)
+            made.append(record(f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps))
     found = records_of(*made, structure={EVIL: ("stack", "friction")}, law={EVIL: "coulomb"})
+    source = str(folder / "pile.npz")
     change = {
-        "pile": {
-            "source": str(folder / "pile.npz"),
-            "stored": 1e-4,
-            "diagnostics": ("duplicate rows: two of <3>",),
-        },
-        EVIL: {"source": "chains/one.npz", "guess": "answer", "condition": 41.0},
+        "pile": {"source": source, "stored": 1e-4, "diagnostics": ("duplicate rows: two of <3>",)},
+        EVIL: {"source": "chains/one.npz", "guess": "answer"},
         "idle": {"nothing_to_do": True},
-        **{f"walk[{k}]": {"sequence": "walk", "step": k, "structure": ("chain",)} for k in range(3)},
+        **{f"walk[{k}]": {"sequence": "walk", "step": k, "structure": ("chain",)} for k in range(2)},
     }
-    found.add(info("walk[2]"))
     for case, values in change.items():
         found.add(dataclasses.replace(found.cases[case], **values))
-    found.add(bench.Skip("run", "torn", "", "did not load: torn: it is <empty>"))
-    found.add(bench.Skip("run", "walk 3", "", "did not load: of another problem", sequence="walk"))
-    found.add(bench.Skip("run", "pile", "sor", "takes laws linear"))
-    (run,) = found.runs.values()
-    found.add(dataclasses.replace(run, load=6.0, whole=False))
+    found.add(Skip("run", "torn", "", "did not load: torn: it is <empty>"))
+    found.add(Skip("run", "walk 3", "", "did not load: of another problem", sequence="walk"))
+    found.add(Skip("run", "pile", "sor", "takes laws linear"))
     answer = {"file": "pile.npz", "rows": 8, "seconds": 5e-4, "relative": 1e-7, "solver": "NEWTON", "verdict": "wrong",
               "velocity": 0.1, "worst": "contact 2"}  # fmt: skip
     (folder / "engine.jsonl").write_text(json.dumps(answer) + "\n" + json.dumps({"left_out": 1}) + "\n")
     old = records_of(record("pile", "auto", 0.3e-3, 1e-9), record("pile", "pgs", 1.0, 1e-1))
     old.source = "earlier.jsonl"
-    return Report(found, old, [2e-4, 4e-3], [8], read_engine_answers([], found))
+    return Report(found, old, [2e-4, 4e-3], read_engine_answers([], found))

@@ -234,7 +234,7 @@ def test_suite_cases_have_a_reference_and_every_solver_agrees_with_it(case):
         assert row.distance is None or row.distance <= row.allowed
 
 
-def test_a_method_of_free_rows_is_its_method_with_bounds_where_there_are_bounds():
+def test_cross_check_method_of_free_rows_runs_its_bounded_variant():
     table = lv.cross_check(
         lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), ["gauss_seidel", "sor", "pgs"]
     )
@@ -276,7 +276,7 @@ def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
         assert len(asked) == before + 1
 
 
-def test_where_nothing_is_solved_nobody_agrees_and_there_is_no_reference():
+def test_cross_check_unsolved_problem_has_no_reference():
     ray = np.array([[-0.2], [-0.7], [0.6], [2.0]])  # two contacts along it: no impulse meets both
     problem = lv.Problem.contact(ray @ ray.T, [0.2, -1.1, 1.4, -1.9], [0.3, 0.6])
     found = {row.verdict for row in lv.cross_check(problem, lv.available(problem, external=False))}
@@ -291,7 +291,7 @@ def test_an_impulse_no_better_than_none_is_excused_by_nobody():
     assert lv.cross_check(problem, ["pgs"]).agreed == ()
 
 
-def test_cross_check_does_not_pass_an_impulse_that_is_wrong_where_nothing_was_to_do(plug_in):
+def test_cross_check_wrong_impulse_of_an_idle_problem_does_not_pass(plug_in):
     idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0])
 
     def run(problem, impulse):
@@ -303,7 +303,7 @@ def test_cross_check_does_not_pass_an_impulse_that_is_wrong_where_nothing_was_to
     assert row.contradicted and row.verdict != "nothing to do"
 
 
-def test_cross_check_neither_agrees_nor_fails_where_there_is_nothing_to_do():
+def test_cross_check_idle_problem_neither_agrees_nor_fails():
     table = lv.cross_check(lv.Problem.lcp(np.eye(2), [-1.0, -1.0]), ["pgs", "direct"])
     assert [row.verdict for row in table] == ["nothing to do"] * 2
     assert "m/s" in table["pgs"].note

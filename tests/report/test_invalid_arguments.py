@@ -11,7 +11,7 @@ from worked import after
 
 import lavender as lv
 from benchmarks.random_families import wild
-from lavender import bench, suite
+from lavender import report, suite
 from lavender.suite import hard
 
 A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
@@ -36,24 +36,24 @@ CALLS = {
     ),
     "motion_error": Call(lv.motion_error, {"problem": LCP, "impulse": B, "reference": B}),
     "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
-    "bench.Plan": Call(
-        bench.Plan,
+    "report.Plan": Call(
+        report.Plan,
         {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
-         "orders": ("given",), "times": (), "warm": True, "campaign": True},
+         "orders": ("given",), "warm": True, "campaign": True},
     ),
-    "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
-    "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
-    "bench.resolve_sources": Call(
-        bench.resolve_sources, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
+    "report.Plan, a tolerance": Call(lambda tolerance: report.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
+    "report.Plan, a budget": Call(lambda budget: report.Plan(budgets=[budget]), {"budget": 3}),
+    "report.resolve_sources": Call(
+        report.resolve_sources, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
         accepts={"sequences": ("None",)},
     ),
-    "bench.resolve, a problem": Call(lambda case: bench.resolve_sources([case]), {"case": LCP}),
-    "bench.make_sequence": Call(bench.make_sequence, {"problems": [LCP], "name": "walk"}),
-    "bench.select_solver_names": Call(lambda solvers: bench.select_solver_names(solvers), {"solvers": ["pgs"]}),
-    "bench.carry_impulses": Call(
-        bench.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
+    "report.resolve, a problem": Call(lambda case: report.resolve_sources([case]), {"case": LCP}),
+    "report.make_sequence": Call(report.make_sequence, {"problems": [LCP], "name": "walk"}),
+    "report.select_solver_names": Call(lambda solvers: report.select_solver_names(solvers), {"solvers": ["pgs"]}),
+    "report.carry_impulses": Call(
+        report.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
     ),
-    "bench.classify_structure": Call(bench.classify_structure, {"problem": LCP}),
+    "report.classify_structure": Call(report.classify_structure, {"problem": LCP}),
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),

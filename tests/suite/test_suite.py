@@ -11,7 +11,7 @@ from enumeration import enumerate_lcp
 import lavender as lv
 from lavender import suite
 from lavender.judge.certificates import check_certificate
-from lavender.report.bench.cases import hash_problem
+from lavender.report.cases import hash_problem
 from lavender.suite import hard
 from lavender.suite.case import load_references
 

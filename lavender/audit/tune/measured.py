@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.report.bench import machine
-from lavender.report.bench.running.runner import Event
+from lavender.report import machine
+from lavender.report.runner import Event
 
 ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
 # After the first round, a setting is no longer timed if it takes more than this multiple of the present setting's

@@ -310,9 +310,8 @@ class Tuning:
         """Figure of error over time: every setting, a line through the Pareto front, and the model's own setting."""
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
-            notes = tuple(m.setting.option_line for m in settings)
             places = [(m.mean_step_time, m.worst_error) for m in settings]
-            return replace(Curve.from_points(name, name, places, notes=notes), **more)
+            return replace(Curve.from_points(name, name, places), **more)
 
         solvers = dict.fromkeys(m.solver for m in self.measured)
         by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}

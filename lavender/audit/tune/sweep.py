@@ -34,8 +34,8 @@ from lavender.base.errors import InputError, check_name
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recorder import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
-from lavender.report.bench import machine
-from lavender.report.bench.running.runner import Event
+from lavender.report import machine
+from lavender.report.runner import Event
 
 TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
 # After this many rounds of timing, variants of the settings near the Pareto front are tried.

@@ -22,8 +22,8 @@ from typing import Any
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.problem import Problem, check_problem
-from lavender.report.bench import machine
-from lavender.report.bench.cases import (
+from lavender.report import machine
+from lavender.report.cases import (
     Item,
     Source,
     describe_case,
@@ -31,12 +31,21 @@ from lavender.report.bench.cases import (
     resolve_item,
     resolve_sources,
 )
-from lavender.report.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
-from lavender.report.bench.running.plan import CampaignPlan, Plan, list_passes
-from lavender.report.bench.running.timing import CallSpec, Task, limit_to_one_thread, measure_task
-from lavender.report.bench.running.worker import Worker
-from lavender.report.bench.running.workers import check_workers, connect_backend, map_unordered
-from lavender.report.bench.store import Records, Store, open_store
+from lavender.report.plan import CampaignPlan, Plan, list_passes
+from lavender.report.records import (
+    CaseInfo,
+    Entry,
+    Record,
+    Records,
+    Run,
+    Skip,
+    Store,
+    describe_target,
+    open_store,
+)
+from lavender.report.timing import LONG_TIME, Task, limit_to_one_thread, measure_task
+from lavender.report.worker import Worker
+from lavender.report.workers import check_workers, connect_backend, map_unordered
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
@@ -45,6 +54,12 @@ UNGUARDED_TIME_RATIO = 0.05
 # Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies
 # less.
 MAX_REPEATED_STEPS = 20
+# A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
+NEAR_TIME_RATIO = 1.6
+MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
+AGAIN_TIME = (
+    1.0  # [s] Solvers are timed again on a case until this time has passed; every solver at least once.
+)
 MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
 
 Watch = Callable[["Event"], Any]
@@ -61,6 +76,7 @@ class Event:
     record : the record that was made last
     reused : whether this record was not measured now
     remaining : estimate of the remaining time [s]; None if only the counts are known
+    phase : the present phase, such as "measuring"
     """
 
     done: int
@@ -70,6 +86,7 @@ class Event:
     record: Record | None = None
     reused: bool = False
     remaining: float | None = None
+    phase: str = ""
 
 
 def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
@@ -82,8 +99,7 @@ def remove_times(record: Record, time_limit: float) -> Record:
     """Return the record without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
     nan = math.nan
     return replace(
-        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-        calibration_time=None, load=None, backend_time_min=None, time_limit=time_limit,
+        record, times=(), setup_time=nan, solve_time=nan, calibration_time=None, load=None, time_limit=time_limit
     )  # fmt: skip
 
 
@@ -141,7 +157,7 @@ def run(
         Number of processes; 1: this one, -1: one for each core. A cluster determines its own number.
     backend : str
         Backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client, or of
-        DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster.
+        DASK_SCHEDULER_ADDRESS); "dask=ADDRESS" connects to a cluster.
     watch : callable (Event), optional
     isolate : bool
         Run third-party solvers in another process; workers always do.
@@ -178,7 +194,7 @@ def run(
         items = [replace(item, sequence="", step=-1) for item in items]
     names = select_solver_names(solvers)
     packages = {module for name in names for module in registry.specs()[name].requires}
-    this = machine.describe_run(plan.as_dict(), packages)
+    this = machine.describe_run({**plan.as_dict(), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         if into is not None:
@@ -222,13 +238,13 @@ class Runner:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
         self.specs = registry.specs()
-        self.out = Records(source=str(store.path) if store else "")
+        self.out = Records(str(store.path) if store else "")
         self.done = 0
         self.total = 0
         stored = Records() if store is None or not reuse else store.records
         self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
-        # A campaign reuses stored descriptions of cases: many take longer to describe than to load.
-        self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
+        # Many cases take longer to describe than to load.
+        self.described = {n: i for n, i in stored.cases.items() if i.run == this.run}
 
     def add_entry(self, entry: Entry) -> None:
         """Add an entry to the returned records and to the store."""
@@ -243,7 +259,13 @@ class Runner:
         if self.watch is not None:
             self.watch(
                 Event(
-                    done=self.done, total=self.total, case=case, solver=solver, record=record, reused=reused
+                    done=self.done,
+                    total=self.total,
+                    case=case,
+                    solver=solver,
+                    record=record,
+                    reused=reused,
+                    phase="measuring",
                 )
             )
 
@@ -356,11 +378,47 @@ class Runner:
             self.add_entry(info)
         else:
             info = self.load_case(item)
+        records: list[Record] = []
         for name in self.names:
             if info is not None:
                 self.report_progress(item.name, name)
-                self.measure_solver(info, item.problem, name)
+                records += self.measure_solver(info, item.problem, name)
             self.done += 1
+        if not self.plan.campaign and self.plan.repeats > 1:
+            self.repeat_near_best(item, records)
+
+    def repeat_near_best(self, item: Item, records: list[Record]) -> None:
+        """Time the fastest solvers to the middle tolerance again, alternately, and store their records again.
+
+        Disturbances of the machine then affect these solvers equally. Each gets `2 repeats + 1` times in all.
+        """
+        if not self.plan.tolerances:
+            return
+        tolerance, best = self.plan.tolerances[len(self.plan.tolerances) // 2], dict[str, Record]()
+        to_tolerance = [r for r in records if r.mode == "tol" and r.start == "cold"]
+        reached = [r for r in to_tolerance if max(r.relative, r.tol) <= tolerance]
+        for r in sorted(reached, key=lambda r: r.time):
+            best.setdefault(r.solver, r)
+        near = [r for r in best.values() if r.time <= NEAR_TIME_RATIO * min(r.time for r in best.values())]
+        near, wanted = near[:MAX_NEAR], 2 * self.plan.repeats + 1
+        if len(near) < 2 or any(self.was_timed_again(r) for r in near):
+            return
+        changed, begun = dict[str, Record](), perf_counter()
+        while any(len(r.times) < wanted for r in near) and (
+            perf_counter() - begun < AGAIN_TIME or not changed
+        ):
+            for i, r in enumerate(near):
+                if len(r.times) < wanted:
+                    self.report_progress(item.name, f"{r.solver}, again")
+                    task = Task.of_record(r, self.plan.time_limit)
+                    new = self.make_record(item.problem, task, self.specs[r.solver], None)[0]
+                    near[i] = changed[r.solver] = replace(r, times=(*r.times, *(new.times or (math.inf,))))
+        for record in changed.values():
+            self.add_entry(record)
+
+    def was_timed_again(self, record: Record) -> bool:
+        """Whether a record has more times than its first measurement takes."""
+        return len(record.times) > (1 if max(record.times, default=0.0) > LONG_TIME else self.plan.repeats)
 
     def measure_sequence(self, items: list[Item]) -> None:
         """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
@@ -376,19 +434,20 @@ class Runner:
         for name in self.names:
             spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
-                for call in list_passes(self.plan, spec):
+                for mode, tol, max_iter, start in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    self.measure_pass(steps, spec, call)
+                    repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
+                    limit = self.plan.time_limit
+                    tasks = [
+                        Task.of_case(info, spec.name, mode, tol, max_iter, start, limit, repeats)
+                        for _, info in steps
+                    ]
+                    self.measure_pass([item for item, _ in steps], spec, tasks)
             self.done += len(items)
 
-    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: CallSpec) -> None:
+    def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Task]) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
-        repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
-        tasks = [
-            Task.from_call_spec(info, call, repeats=repeats, time_limit=self.plan.time_limit)
-            for _, info in steps
-        ]
-        problems = [item for item, _ in steps]
+        call = tasks[0]
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
             record = self.known.get(task.key)
@@ -409,7 +468,7 @@ class Runner:
             if (
                 record is not None
                 and record.times
-                and record.time_median < UNGUARDED_TIME_RATIO * self.plan.time_limit
+                and max(record.times) < UNGUARDED_TIME_RATIO * self.plan.time_limit
             ):
                 task = replace(task, guarded=False)
             record, before = self.measure_step(problems[made].problem, task, spec, before)
@@ -459,12 +518,12 @@ class Runner:
         )
         return other
 
-    def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
-        """Measure one solver on one case, at every budget and tolerance."""
+    def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> list[Record]:
+        """Measure one solver on one case, at every budget and tolerance; return the records."""
         spec = self.select_solver(info.case, name, [problem])
         if spec is None:
-            return
-        name = spec.name
+            return []
+        name, records = spec.name, list[Record]()
 
         def measure_task(task: Task) -> Record:
             """Measure one task, or return its record if an earlier run stored it."""
@@ -476,9 +535,11 @@ class Runner:
                 record = self.make_record(problem, task, spec, None)[0]
                 self.add_entry(record)
             self.report_progress(info.case, name, record, reused)
+            records.append(record)
             return record
 
         self.plan.measure_solver(info, problem, spec, measure_task)
+        return records
 
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
@@ -496,8 +557,7 @@ class Runner:
 
 def _get_elapsed_time(record: Record) -> float:
     """Return the time [s] that a record took, from its fields, so that a resumed pass ends at the same step."""
-    spent = record.time_median * record.repeats
-    return spent if math.isfinite(spent) else record.time_limit
+    return sum(record.times) if record.times else record.time_limit
 
 
 def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
@@ -588,4 +648,4 @@ def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
         runner.measure_case(item, info)
     out = runner.out
     _last_case = key, item, out.cases.get(pair.case)
-    return pair.index, [*out.cases.values(), *out.skips, *out.records]
+    return pair.index, [*out.cases.values(), *out.skips, *out]

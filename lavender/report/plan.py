@@ -10,8 +10,8 @@ from lavender.base.arrays import check_bool, check_float, check_int, check_seque
 from lavender.base.errors import InputError, UnknownName
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
-from lavender.report.bench.record import CaseInfo, Record
-from lavender.report.bench.running.timing import CallSpec, Task
+from lavender.report.records import CaseInfo, Record
+from lavender.report.timing import Task
 from lavender.solvers.registry import SolverSpec
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
@@ -31,8 +31,9 @@ class Plan:
     budgets : sequence of int
         Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
     repeats : int
-        Number of solves of each kind, of which minimum and median are recorded. Repeats end when they have taken
-        `time_limit` together. Steps of sequences of more than twenty steps are solved once.
+        Number of solves of each kind, of which minimum and median are recorded. A solve of more than 50 ms is not
+        repeated, and steps of sequences of more than twenty steps are solved once. The fastest solvers of a case are
+        then repeated alternately, until each has twice as many solves and one more.
     time_limit : float, s
         Limit of one solve.
     sequence_time_limit : float, s
@@ -43,10 +44,6 @@ class Plan:
     orders : sequence of str
         Sweep orders in addition to "given", each at the middle budget, for solvers with a sweep order; "random:3" is
         random with seed 3.
-    times : sequence of float, s
-        Time budgets for which the report recommends a solver.
-    sweeps : sequence of int
-        Budgets for which the report recommends a solver.
 
     Raises
     ------
@@ -62,21 +59,15 @@ class Plan:
     time_limit: float = 1.0
     sequence_time_limit: float = DEFAULT_SEQUENCE_TIME_LIMIT
     warm: bool = True
-    orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
+    orders: Sequence[str] = ()
     campaign: bool = False
-    times: Sequence[float] = ()
-    sweeps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        for name in ("tolerances", "budgets", "orders", "times", "sweeps"):
+        for name in ("tolerances", "budgets", "orders"):
             entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(entries))
-        for name, values in (
-            ("tolerance", self.tolerances),
-            ("time budget", self.times),
-        ):
-            for value in values:
-                check_float(name, value, above=0.0)
+        for value in self.tolerances:
+            check_float("tolerance", value, above=0.0)
         if not self.tolerances and not self.budgets:
             raise InputError(
                 "the plan has no tolerances and no budgets, so there is nothing to run: give at least one "
@@ -100,13 +91,9 @@ class Plan:
         object.__setattr__(
             self, "tolerances", tuple(sorted({float(x) for x in self.tolerances}, reverse=True))
         )
-        for name in ("budgets", "sweeps"):
-            counts = {check_int("budget", n, 1) for n in getattr(self, name)}
-            object.__setattr__(self, name, tuple(sorted(counts)))
-        object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
+        counts = {check_int("budget", n, 1) for n in self.budgets}
+        object.__setattr__(self, "budgets", tuple(sorted(counts)))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
-
-    timing_mode = "call"  # Value of `Record.timing_mode` for single problems.
 
     def get_max_iterations(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""
@@ -127,13 +114,12 @@ class Plan:
         budgets, then runs in other sweep orders at the middle budget.
         """
 
-        def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
-            """Make one measurement."""
-            call_spec = CallSpec(
-                spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
+        def measure_one(mode: str, tol: float, max_iter: int, start: str, order: str = "given") -> Record:
+            """Make one measurement; a fixed number of iterations is timed once."""
+            repeats = 1 if mode == "budget" else self.repeats
+            return make(
+                Task.of_case(info, spec.name, mode, tol, max_iter, start, self.time_limit, repeats, order)
             )
-            more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
-            return make(Task.from_call_spec(info, call_spec, **more))
 
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
@@ -152,12 +138,9 @@ class Plan:
         if spec.order and self.budgets and not spec.exact:
             middle = self.budgets[len(self.budgets) // 2]
             for word in self.orders:
-                name, _, seed = word.partition(":")
-                if name in ("bottom_up", "top_down") and problem.rows is None:
+                if word in ("bottom_up", "top_down") and problem.rows is None:
                     continue  # Both orders sort blocks by the height of bodies, which are not known.
-                measure_one(
-                    "budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {})
-                )
+                measure_one("budget", 0.0, middle, "cold", word)
 
 
 @dataclass(frozen=True)
@@ -178,26 +161,21 @@ class CampaignPlan(Plan):
     time_limit: float = HANG_LIMIT
     cap: int = 20_000
     campaign: bool = True
-    timing_mode = ""  # No times are measured.
 
     def get_max_iterations(self) -> int:
         """Return `cap`."""
         return self.cap
 
 
-def list_passes(plan: Plan, spec: SolverSpec) -> list[CallSpec]:
-    """Return the calls that run over a whole sequence: each budget and tolerance, cold and with carried impulses."""
+def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str]]:
+    """Return (mode, tol, max_iter, start) of each pass over a sequence, cold and with carried impulses."""
     max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
     tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
     targets = [("tol", tolerance, max_iterations) for tolerance in tolerances]
     if spec.resumable and not spec.exact:
         targets = [*(("budget", 0.0, n) for n in plan.budgets), *targets]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
-    return [
-        CallSpec(spec.name, *target, timing_mode="steps", start=start)
-        for start in starts
-        for target in targets
-    ]
+    return [(*target, start) for start in starts for target in targets]
 
 
 def _rules_out_tighter_tolerances(record: Record) -> bool:

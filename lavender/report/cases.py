@@ -25,11 +25,11 @@ from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.report.bench.record import CaseInfo, escape_unprintable, make_file_name
+from lavender.report.records import CaseInfo, escape_unprintable, make_file_name
 from lavender.suite import Case
 
 MAX_RANK_ROWS = 300  # The rank of A is computed up to this many rows, in a fraction of a second.
-# Singular values up to this fraction of the largest count as zero; condition numbers in practice stay below 1e12.
+# Singular values up to this fraction of the largest count as zero.
 ZERO_SINGULAR_VALUE_TOL = 1e-12
 # Up to this many contacts with equal couplings count as contacts of one pair of bodies.
 MAX_MANIFOLD_BLOCKS = 8
@@ -38,7 +38,7 @@ LARGE_MASS_RATIO = 1e3
 # A matrix with a larger relative asymmetry is not the A of bodies; recorded contact problems stay below 0.01.
 MAX_MECHANICAL_ASYMMETRY = 0.1
 
-# Archives in the folder of an audit that are no problems.
+# Archives in the folder of an audit that do not hold problems.
 AUDIT_RESULTS = ("records.npz", "states.npz")
 DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
 
@@ -90,7 +90,7 @@ class Item:
     def judge_stored_answer(
         self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
     ) -> Residual | None:
-        """Judge the answer stored with the problem; return None if there is none, or if it does not have m entries."""
+        """Judge the answer stored with the problem; return None without one, or if it does not have m entries."""
         impulse = self.load_stored()
         if impulse is None or impulse.shape != (self.problem.m,):
             return None
@@ -414,6 +414,7 @@ def describe_case(item: Item, run: str) -> CaseInfo:
     p = item.problem
     contacts = int(np.count_nonzero(p.cones.is_contact))
     answer = item.judge_stored_answer()
+    structure, islands = _classify_structure_and_count_islands(p)
     return CaseInfo(
         run=run,
         case=item.name,
@@ -426,7 +427,7 @@ def describe_case(item: Item, run: str) -> CaseInfo:
         bodies=p.rows.n_bodies if p.rows is not None else 0,
         nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz),
         mass_ratio=compute_mass_ratio(p),
-        structure=classify_structure(p),
+        structure=structure,
         symmetric=p.is_symmetric,
         reason=item.reason,
         sequence=item.sequence,
@@ -436,7 +437,7 @@ def describe_case(item: Item, run: str) -> CaseInfo:
         nothing_to_do=is_solved_by_zero(p),
         diagnostics=tuple(map(str, diagnose(p))),
         guess=_classify_guess(item),
-        condition=compute_condition_number(p),
+        islands=islands,
     )
 
 
@@ -503,12 +504,18 @@ def classify_structure(problem: Problem) -> tuple[str, ...]:
       no word for its graph or masses.
     """
     check_problem(problem)
+    return _classify_structure_and_count_islands(problem)[0]
+
+
+def _classify_structure_and_count_islands(problem: Problem) -> tuple[tuple[str, ...], int]:
+    """Return the words of `classify_structure`, and the number of islands; 0 for a matrix that is not mechanical."""
     if problem.m == 0:
-        return ("empty",)
-    features = []
+        return ("empty",), 0
+    features, islands = [], 0
     mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
     if mechanical:
-        features.append(_classify_coupling_graph(problem))
+        word, islands = _classify_coupling_graph(problem)
+        features.append(word)
     if _has_redundant_rows(problem):
         features.append("redundant")
     if problem.law in ("coulomb", "cone"):
@@ -519,28 +526,29 @@ def classify_structure(problem: Problem) -> tuple[str, ...]:
         features.append("large mass ratio")
     if not problem.is_symmetric:
         features.append("asymmetric")
-    return tuple(features)
+    return tuple(features), islands
 
 
-def _classify_coupling_graph(problem: Problem) -> str:
-    """Return the word for the largest connected component of the coupling graph."""
+def _classify_coupling_graph(problem: Problem) -> tuple[str, int]:
+    """Return the word for the largest connected component of the coupling graph, and the number of components."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     n, i, j = _build_body_graph(problem) if problem.rows is not None else _build_block_graph(problem)
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    component = connected_components(graph, directed=False)[1]
+    count, component = connected_components(graph, directed=False)
+    count = int(count)
     largest = np.bincount(component).argmax()
     size = np.count_nonzero(component == largest)
     neighbours = 2.0 * np.count_nonzero(component[i] == largest) / size
     bilateral = _is_bilateral(problem)
     if size == 1:
-        return "separate"
+        return "separate", count
     if neighbours <= 2.0:
-        return "chain" if bilateral else "stack"
+        return "chain" if bilateral else "stack", count
     if problem.rows is None and size > MAX_MANIFOLD_BLOCKS and neighbours > 0.5 * (size - 1):
-        return "dense"
-    return "mesh" if bilateral else "pile"
+        return "dense", count
+    return "mesh" if bilateral else "pile", count
 
 
 def _is_bilateral(problem: Problem) -> bool:
@@ -602,22 +610,10 @@ def _has_redundant_rows(problem: Problem) -> bool:
     """Whether there are fewer independent rows than rows, by the counts or by the singular values."""
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
-    values = _compute_singular_values(problem)
-    return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])
-
-
-def compute_condition_number(problem: Problem) -> float | None:
-    """Compute the condition of A, scaled to a unit diagonal, on its range; None for A = 0 or too many rows."""
-    values = _compute_singular_values(problem)
-    nonzero = values[values > ZERO_SINGULAR_VALUE_TOL * values.max(initial=0.0)]
-    return float(f"{nonzero[0] / nonzero[-1]:.1e}") if len(nonzero) else None
-
-
-def _compute_singular_values(problem: Problem) -> NDArray[Any]:
-    """Compute the singular values of A, scaled to a unit diagonal; empty above MAX_RANK_ROWS rows."""
     if problem.m > MAX_RANK_ROWS:
-        return np.zeros(0)
+        return False
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(problem.d)
         a = problem.dense() * scale[:, None] * scale[None, :]
-    return np.linalg.svd(a, compute_uv=False) if np.isfinite(a).all() else np.zeros(0)
+    values = np.linalg.svd(a, compute_uv=False) if np.isfinite(a).all() else np.zeros(0)
+    return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])

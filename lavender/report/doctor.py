@@ -14,7 +14,7 @@ import numpy as np
 from lavender._version import __version__
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
-from lavender.report.bench.machine import (
+from lavender.report.machine import (
     describe_build,
     get_cpu_name,
     get_load_average,

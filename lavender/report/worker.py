@@ -18,10 +18,10 @@ from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
-from lavender.report.bench.cases import hash_problem
-from lavender.report.bench.machine import get_memory_per_process
-from lavender.report.bench.record import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
-from lavender.report.bench.running.timing import (
+from lavender.report.cases import hash_problem
+from lavender.report.machine import get_memory_per_process
+from lavender.report.records import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
+from lavender.report.timing import (
     Outcome,
     Task,
     judge_outcome,
@@ -65,7 +65,7 @@ class Worker:
     def measure_task(
         self, problem: Problem, task: Task, impulse: Any = None
     ) -> tuple[Record, FloatArray | None]:
-        """Make one measurement in the worker; equivalent to `lavender.report.bench.running.timing.measure_task`."""
+        """Make one measurement in the worker; equivalent to `lavender.report.timing.measure_task`."""
         try:
             return judge_outcome(problem, task, self._run_task(problem, task, impulse))
         except TaskFailed as failure:
@@ -94,7 +94,7 @@ class Worker:
             except ProcessEnded as error:
                 cause = f"the worker process ended: {error}"
                 raise TaskFailed(f"{CRASHED} (did not start)", cause) from None
-        # Guarded solve and repeats each take at most the limit, and the last repeat may start just before it: three
+        # The first call takes at most the limit, and the last repeat, which has none, may start just before it: three
         # limits. Some backends read the clock only every few seconds: add GRACE_TIME.
         limit = 3.0 * task.time_limit + GRACE_TIME
         start_time = time.monotonic()
@@ -222,18 +222,11 @@ def parse_outcome(
         outcome = Outcome(*arrays, **values)
     except TypeError as error:
         raise ValueError(str(error)) from None
-    parts = (*outcome.setups, *outcome.solves)
-    if not parts or len(outcome.setups) != len(outcome.solves):
+    times = [outcome.setup_time, outcome.solve_time, *(t - lead for t in outcome.times)]
+    if not outcome.times or not all(0.0 <= t <= elapsed for t in times):
         raise ValueError(
-            f"the worker returned {len(outcome.setups)} setup and {len(outcome.solves)} solve times; equal "
-            "numbers of at least 1 are needed"
+            f"the worker returned no times, negative times, or times longer than the call of {elapsed:.3g} s"
         )
-    times = [t - lead for t in outcome.times]
-    valid = all(t >= 0.0 for t in (*parts, *times))
-    if not valid or not max(math.fsum(parts), math.fsum(times)) <= elapsed:
-        raise ValueError(
-            f"the worker returned negative times, or times longer than the call of {elapsed:.3g} s"
-        )
-    if not all(t is None or t <= elapsed for t in (outcome.calibration_time, outcome.backend_time)):
-        raise ValueError(f"calibration_time or backend_time is longer than the call of {elapsed:.3g} s")
+    if math.fsum(times[2:]) > elapsed or (outcome.calibration_time or 0.0) > elapsed:
+        raise ValueError(f"the worker returned times that add up to more than the call of {elapsed:.3g} s")
     return outcome

@@ -1,9 +1,8 @@
-"""Call a function on many workers with joblib: processes of this machine, or a dask or ray cluster."""
+"""Call a function on many workers with joblib: processes of this machine, or a dask cluster."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import signal
 import threading
@@ -17,7 +16,6 @@ from typing import Any
 from lavender.base.errors import InputError, require_packages
 
 MAX_WORKERS = 4096  # [processes] More than any machine has cores.
-CALLS_PER_ROUND = 256  # Calls submitted together to a backend that returns only complete lists.
 CONNECT_TIMEOUT = 10.0  # [s] Time for a scheduler to answer.
 PARENT_CHECK_INTERVAL = 0.5  # [s] Time between two checks of a worker that its parent still runs.
 
@@ -58,14 +56,7 @@ def map_unordered(
             joblib.delayed(_call_in_worker)(parent, function, call_arguments) for call_arguments in arguments
         )
         try:
-            try:
-                parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-            except ValueError:
-                # The ray backend returns only complete lists: yield results after each round.
-                parallel = joblib.Parallel(batch_size=1)
-                while some := list(itertools.islice(calls, CALLS_PER_ROUND)):
-                    yield from parallel(some)
-                return
+            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
             with _ignore_sigint() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
                 results = parallel(calls)
             try:
@@ -129,12 +120,9 @@ def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[A
     name, _, address = spec.partition("=")
     if name == "dask":
         return name, _connect_dask(address)
-    if name == "ray":
-        _connect_ray(address)
-    elif name not in BACKENDS or address:
+    if name not in BACKENDS or address or name == "ray":
         raise InputError(
-            f"joblib has no backend {spec!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
-            "'ray' or 'ray=ADDRESS' a cluster"
+            f"joblib has no backend {spec!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' a cluster"
         )
     return name, contextlib.nullcontext()
 
@@ -161,18 +149,3 @@ def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
             "distributed.Client first"
         ) from None
     return contextlib.nullcontext()
-
-
-def _connect_ray(address: str) -> None:
-    """Register Ray as a joblib backend, and connect to the cluster at `address` if it is given."""
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ImportError:
-        raise InputError("backend 'ray' needs ray: pip install 'ray[default]'") from None
-    if address and not ray.is_initialized():
-        try:
-            ray.init(address=address)
-        except (ConnectionError, ValueError) as error:
-            raise InputError(f"no ray cluster answers at {address!r} ({error}); start one there") from None
-    register_ray()

@@ -20,7 +20,7 @@ from typing import Any
 
 from lavender._version import __version__
 from lavender.base.errors import require_packages
-from lavender.report.bench.record import Run
+from lavender.report.records import Run
 from lavender_ext.sweep import serial
 
 # The processes of backends may use this fraction of the machine's memory together.
@@ -189,7 +189,7 @@ def get_processor_clock() -> dict[str, str]:
 @cache
 def describe_build() -> dict[str, str]:
     """Describe the build: commit of a checkout, hash of the kernels, compiler, flags, BLAS."""
-    package = Path(__file__).resolve().parents[2]
+    package = Path(__file__).resolve().parents[1]
     library = Path(str(serial.__file__))
     found = {"commit": commit} if (commit := get_commit(package.parent)) else {}
     kernels = hashlib.sha256()

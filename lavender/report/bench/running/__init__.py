@@ -1,1 +1,0 @@
-"""Run solvers on cases: plans, time measurement, isolated processes, distribution to workers."""

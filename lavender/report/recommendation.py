@@ -1,0 +1,165 @@
+"""Build the sentences of a report: the recommended solver with its call, ties, misses, the load of the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from lavender.base.deadline import format_seconds
+from lavender.io.stored import SUFFIXES
+from lavender.report.engine import INSIDE
+from lavender.report.findings import Report
+from lavender.report.records import format_tolerance
+from lavender.report.tables import STRUCTURE_ORDER, rank_solvers, select_ranked_runs
+from lavender.report.text import format_count, format_left_out_count, format_residual
+from lavender.report.timing import format_call
+from lavender.solvers import registry
+from lavender.suite import FAMILIES
+
+MAX_NAMED = 2  # A sentence names up to this many ties, misses or plug-ins.
+PLURALS = {"mesh": "meshes"}
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A sentence, and the lines of Python that it describes, as they were timed."""
+
+    text: str
+    code: tuple[str, ...] = ()
+
+    @property
+    def call_line(self) -> str:
+        """The line of `code` with the call, without the lines of a loop around it; empty if there is no code."""
+        return next((line.strip() for line in self.code if "lv.solve" in line), "")
+
+
+def is_plug_in(solver: str) -> bool:
+    """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
+    spec = registry.specs().get(solver)
+    return spec is None or not spec.builtin
+
+
+def recommend(report: Report) -> tuple[Statement, ...]:
+    """Recommend a solver for all single cases together, then for the steps of all sequences.
+
+    A campaign, which has no times, has no recommendation.
+    """
+    if report.is_campaign:
+        return ()
+    if not len(report.frame):
+        stopped = report.is_stopped and len(report.records)
+        return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
+    single = report.frame["step"] < 0
+    return tuple(
+        _recommend_for(report, some) for some in (report.frame[single], report.frame[~single]) if len(some)
+    )
+
+
+def _recommend_for(report: Report, frame: pd.DataFrame) -> Statement:
+    """Recommend the first solver of the ranking on some cases, and name ties, misses, engine and plug-ins."""
+    ranking = rank_solvers(frame, report.tolerance, report.limit)
+    cases = list(frame["case"].unique())
+    named = _describe_cases(report, cases)
+    reached = f"down to {format_tolerance(report.tolerance)} of the error of the zero impulse"
+    engine = next((rank for e in report.engines if (rank := e.rank(report, cases)) is not None), None)
+    if not len(ranking) or not ranking["solved"].iloc[0]:
+        stopped = "Stopped: no" if report.is_stopped else "No"
+        return Statement(_add_engine(f"{stopped} solver brings {named} {reached}.", engine, None))
+    solver, first = str(ranking.index[0]), ranking.iloc[0]
+    runs = select_ranked_runs(frame)
+    own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
+    start = "warm from the previous step" if (own["start"] == "carried").any() else "cold"
+    misses = int(first["cases"] - first["solved"])
+    solved = f"{first['solved']} of " if misses else ""
+    time = format_seconds(first["mean"]) + (" on average" if first["cases"] > 1 else "")
+    if misses:
+        time += f" (a miss counted as {format_seconds(report.limit)})"
+    elif first["worst"] > 3.0 * first["mean"]:
+        time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
+    use = f"Stopped: {solver} solves" if report.is_stopped else f"Use {solver}: it solves"
+    sentences = [f"{use} {solved}{named} in {time}, {start}, {reached}."]
+    ties = [f"{s} ({format_seconds(t)})" for s, t in ranking.loc[ranking["tie"], "mean"].iloc[1:].items()]
+    if ties:
+        sentences.append(f"As fast within the noise of the repetitions: {_shorten_list(ties)}.")
+    if misses:
+        sentences.append(_describe_misses(report, runs, cases, solver))
+    sentences += _describe_plug_ins(ranking, solver)
+    record = _find_record(report, own)
+    guessed = any(report.records.cases[c].guess for c in cases)
+    return Statement(_add_engine(" ".join(sentences), engine, first), format_call(record, guessed))
+
+
+def _find_record(report: Report, runs: pd.DataFrame) -> Any:
+    """Return the record of the loosest run to a tolerance that took the largest number of iterations."""
+    loosest = runs[runs["tol"] == runs["tol"].max()]
+    row = runs.loc[loosest["iterations"].idxmax()]
+    return next(
+        r for r in report.records
+        if (r.run, r.case, r.solver, r.start, r.mode, r.tol, r.max_iter, r.order)
+        == tuple(row[["run", "case", "solver", "start", "mode", "tol", "max_iter", "order"]])
+    )  # fmt: skip
+
+
+def _describe_misses(report: Report, runs: pd.DataFrame, cases: Sequence[str], solver: str) -> str:
+    """Return the sentence on the cases that the recommended solver misses, each with its smallest residual."""
+    own = runs[runs["solver"] == solver]
+    left = own.groupby("case", observed=True)["relative"].min().reindex(list(cases))
+    texts = [
+        f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})"
+        for case, x in left[~(left <= report.tolerance)].items()
+    ]
+    return f"It misses {_shorten_list(texts)}."
+
+
+def _describe_plug_ins(ranking: pd.DataFrame, first: str) -> list[str]:
+    """Return the sentence on place and time of plug-ins other than the recommended solver."""
+    texts = [
+        f"{name}: place {place} of {len(ranking)}, {row['solved']} of {row['cases']} solved"
+        + (f" in {format_seconds(row['mean'])}" if row["solved"] else "")
+        for place, (name, row) in enumerate(ranking.iterrows(), 1)
+        if is_plug_in(str(name)) and name != first
+    ]
+    return [f"Plug-in {_shorten_list(texts, '; ')}."] if texts else []
+
+
+def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
+    """Join up to `MAX_NAMED` texts, and the number of the others."""
+    more = len(texts) - MAX_NAMED
+    return separator.join(texts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _describe_cases(report: Report, names: Sequence[str]) -> str:
+    """Return words for cases: steps of sequences, built-in problems, or the structure that all of them have."""
+    infos, lost = [report.records.cases[c] for c in names], report.records.left_out
+    sequences = list(dict.fromkeys(i.sequence for i in infos if i.sequence))
+    if sequences:
+        of = sequences[0] if len(sequences) == 1 else f"your {format_count(len(sequences), 'sequence')}"
+        n_lost = sum(len(lost.get(name, ())) for name in sequences)
+        return f"the {format_count(len(names), 'step')} of {of}{format_left_out_count(n_lost)}"
+    left_out = format_left_out_count(len(lost.get("", ())))
+    many, n = len(names) > 1, len(names)
+    if report.is_stopped:
+        return f"the {format_count(n, 'problem')} measured so far{left_out}"
+    if all(
+        c.partition("(")[0] in FAMILIES and not i.source.endswith(SUFFIXES)
+        for c, i in zip(names, infos, strict=True)
+    ):
+        return (f"the {n} built-in problems" if many else names[0]) + left_out
+    common = set.intersection(*(set(i.structure) for i in infos))
+    shape = next((s for s in STRUCTURE_ORDER[1:5] if s in common), "problem")
+    return (f"your {format_count(n, shape, PLURALS.get(shape, ''))}" if many else f"your {shape}") + left_out
+
+
+def _add_engine(text: str, engine: Any, first: Any) -> str:
+    """Add the engine's own solver to the sentence: at its beginning if it ranks first, else at its end."""
+    if engine is None:
+        return text
+    if not engine["solved"]:
+        return f"{text} The engine's own {engine['solver']} solves none of them to that tolerance."
+    solves = f"solves {engine['solved']} of {engine['cases']} in {format_seconds(engine['mean'])}, {INSIDE}"
+    if first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"]):
+        return f"First is the engine's own {engine['solver']}: it {solves}. {text}"
+    return f"{text} The engine's own {engine['solver']} {solves}."

@@ -1,0 +1,691 @@
+"""Hold the runs of a report: one line of a file for each run while it is measured, and one row of a DataFrame after.
+
+A file `records.jsonl` has one JSON object per line, appended and flushed as each is made: runs, cases, pairs that did
+not run, and machines. A measurement that was killed leaves at most one incomplete line, the last one, which is
+removed before the next line is written. One process writes a file, under the lock of `lavender.io.stored.lock_output`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from lavender.base.arrays import format_html_table
+from lavender.base.errors import InputError, require_packages
+from lavender.io.stored import MAX_BYTES, as_path, lock_output, make_folder, resolve_destination
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+# Statuses of a run that returned no solution, in addition to the statuses of a solve.
+ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
+MAX_LINE_BYTES = 2**26  # A longer line is not a record; the longest records have a few thousand bytes.
+SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the records of this time, a killed process none.
+MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
+
+
+def format_tolerance(tolerance: float) -> str:
+    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03."""
+    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
+    mantissa = mantissa.rstrip("0").rstrip(".")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def describe_target(mode: str, tol: float, max_iter: int) -> str:
+    """Describe the target of a run: "to 1e-6", or "16 iterations"."""
+    return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
+
+
+def make_file_name(name: str) -> str:
+    """Convert a name to one that every file system and URL fragment accepts; a hash keeps long names distinct."""
+    short = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
+    if len(short) <= MAX_FILE_NAME_LENGTH:
+        return short
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
+    return f"{short[: MAX_FILE_NAME_LENGTH - 13]}-{digest}"
+
+
+#: Characters that no text of a report contains: controls, lone surrogates, line ends, marks of writing direction.
+_UNPRINTABLE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+_ESCAPE_SEQUENCES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+
+
+def escape_unprintable(text: str, lines: bool = False) -> str:
+    """Replace characters that a terminal, file or page cannot show by their codes.
+
+    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With
+    `lines`, line ends and tabs are kept, as in messages; without, the result is one line.
+    """
+    if text.isprintable():
+        return text
+
+    def escape(match: re.Match[str]) -> str:
+        if lines and match[0] in "\n\t":
+            return match[0]
+        code = ord(match[0])
+        if 0xDC80 <= code <= 0xDCFF:
+            code -= 0xDC00
+        return _ESCAPE_SEQUENCES.get(match[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+
+    return _UNPRINTABLE.sub(escape, text)
+
+
+def _make_printable(value: Any, lines: bool = False) -> Any:
+    """Make all texts in a value printable."""
+    if isinstance(value, str):
+        return escape_unprintable(value, lines)
+    if isinstance(value, Mapping):
+        return {_make_printable(k): _make_printable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(_make_printable, value))
+    return value
+
+
+class _PrintableEntry:
+    """Base of entries: their texts are made printable; only messages may have several lines."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, (str, tuple, Mapping)):
+                object.__setattr__(self, name, _make_printable(value, name == "message"))
+
+
+@dataclass(frozen=True)
+class Run(_PrintableEntry):
+    """One machine, one set of versions and one plan, to which records refer by `run`."""
+
+    run: str  # Identity: equal if machine, versions and plan are equal.
+    started: str  # ISO 8601, UTC.
+    lavender: str
+    python: str
+    platform: str
+    cpu: str
+    cores: int
+    threads: int  # Threads of BLAS and OpenMP while times are measured.
+    versions: Mapping[str, str]
+    plan: Mapping[str, Any]
+    build: Mapping[str, str] = field(
+        default_factory=dict
+    )  # Commit, hash of the kernels, compiler, BLAS, clock.
+    load: float | None = None  # Mean number of runnable processes in the minute before the run.
+    whole: bool = True  # Whether all measurements of the run were made; False while it runs.
+
+
+@dataclass(frozen=True)
+class CaseInfo(_PrintableEntry):
+    """Description of a case for a report, without its problem."""
+
+    run: str
+    case: str
+    source: str  # Path, or name in the suite.
+    sha: str  # Hash of the numbers: a file with changed numbers is another case.
+    law: str
+    rows: int
+    blocks: int
+    contacts: int
+    bodies: int  # 0 if only a matrix is known.
+    nonzeros: int  # Nonzeros of A, or of J if A is not formed.
+    mass_ratio: float  # Largest over smallest body mass, or entry of A's diagonal.
+    structure: tuple[str, ...]  # "stack", "chain", "pile", "redundant", "friction", "large mass ratio", ...
+    symmetric: bool
+    reason: str = ""  # Property that the case tests.
+    stored: float = math.nan  # Relative residual of the answer stored with the problem, such as an engine's.
+    sequence: str = ""  # Sequence of which it is a step.
+    step: int = -1
+    nothing_to_do: bool = False  # The zero impulse is a solution: the case is not ranked.
+    identity: str = ""  # Hash of the numbers of all steps of its sequence.
+    stored_verdict: str = ""  # Verdict on a stored answer in float32.
+    diagnostics: tuple[str, ...] = ()  # Likely mistakes in its data.
+    guess: str = ""  # Kind of the problem's guess, "", "start" or "answer"; no run starts from an "answer".
+    islands: int = 0  # Number of islands: sets of blocks connected through moving bodies or entries of A.
+
+
+@dataclass(frozen=True)
+class Skip(_PrintableEntry):
+    """A solver that did not run on a case, or, with an empty `solver`, a case that did not load.
+
+    `sequence` is the sequence of a step that did not load.
+    """
+
+    run: str
+    case: str
+    solver: str
+    reason: str
+    sequence: str = ""
+
+
+@dataclass(frozen=True)
+class Record(_PrintableEntry):
+    """One run: one solver on one case with one budget or tolerance. Its fields are columns of `Records.frame`."""
+
+    run: str
+    case: str
+    sha: str  # Hash of the case's numbers.
+    solver: str
+    start: str  # "cold": from the zero impulse; "warm": the problem's guess; "carried": the step before.
+    mode: str  # "tol": to the residual `tol`; "budget": exactly `max_iter` iterations.
+    tol: float
+    max_iter: int
+    time_limit: float  # [s]
+    order: str = "given"  # Sweep order; "random:3" is random with seed 3.
+    step: int = -1  # Step of a sequence; -1 for a single case.
+    status: str = ""  # Name of a Status, ERROR, KILLED or CRASHED.
+    relative: float = math.inf  # Relative residual by the judge, as the next three fields are.
+    energy: float = math.inf  # [sqrt J] Residual in the energy norm.
+    velocity: float = math.inf  # [m/s] Largest velocity error of a row.
+    roundoff_floor: float = math.nan  # Relative residual that rounding alone can cause.
+    worst_row: int = -1
+    worst_name: str = ""
+    success: bool = False  # By the judge, relative <= tol; False for a budget.
+    claims: bool = False  # The solver claims a solution: CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE.
+    claim_check: str = CONFIRMED  # "confirmed", "not proven" or "contradicted", as in a Solution.
+    status_conflict: str = ""  # Reason why the judge contradicts the status; empty if it does not.
+    iterations: int = 0
+    work: Mapping[str, int] = field(default_factory=dict)
+    form: str = ""
+    message: str = ""
+    times: tuple[float, ...] = ()  # [s] Time of each repetition of the call; empty if no times are measured.
+    setup_time: float = (
+        math.nan
+    )  # [s] Of the last repetition, without judge and checks, as the next field is.
+    solve_time: float = math.nan
+    calibration_time: float | None = (
+        None  # [s] Time of a loop of fixed work, which measures the machine's speed.
+    )
+    load: float | None = None  # Number of runnable processes when the record was made, including this one.
+    solution_hash: str = ""  # Hash of the answer: equal for answers with equal bits.
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Key that is equal for records of the same measurement."""
+        return make_measurement_key(self)
+
+    @property
+    def target(self) -> str:
+        """Budget or tolerance, and the sweep order if it is not "given"."""
+        order = "" if self.order == "given" else f", order {self.order}"
+        return describe_target(self.mode, self.tol, self.max_iter) + order
+
+    @property
+    def time(self) -> float:
+        """Smallest time of a repetition [s]; nan without times."""
+        return min(self.times, default=math.nan)
+
+
+def make_measurement_key(m: Any) -> tuple[Any, ...]:
+    """Return the key of a measurement from its `Task` or its `Record`."""
+    return (m.case, m.sha, m.solver, m.start, m.mode, m.tol, m.max_iter, m.time_limit, m.order)
+
+
+Entry = Run | CaseInfo | Skip | Record
+KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
+_FIELD_NAMES = [f.name for f in fields(Record)]
+#: Columns of a case and of a machine in a frame.
+CASE_COLUMNS = (
+    "law", "rows", "blocks", "islands", "contacts", "mass_ratio", "sequence", "nothing_to_do", "symmetric"
+)  # fmt: skip
+RUN_COLUMNS = ("started", "cpu", "cores", "threads", "platform", "python", "lavender")
+
+
+def to_json(entry: Entry) -> dict[str, Any]:
+    """Convert an entry to a dictionary that JSON can hold: inf and nan become strings."""
+    kind = next(name for name, cls in KINDS.items() if isinstance(entry, cls))
+    return {"kind": kind, **{f.name: to_jsonable(getattr(entry, f.name)) for f in fields(entry)}}
+
+
+def from_json(line: Any) -> Entry:
+    """Convert a dictionary back to an entry; unknown fields are ignored.
+
+    Raises
+    ------
+    ValueError
+        It is not an entry of a records file: a field is missing, has another type or is out of its range.
+    """
+    if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
+        raise ValueError(
+            f"not an entry of a records file; a JSON object with a kind is needed, one of {', '.join(KINDS)}"
+        )
+    cls = KINDS[line["kind"]]
+    try:
+        return cls(**parse_fields(cls, line))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the line is not a valid entry of kind {line['kind']!r}: {error}") from None
+
+
+def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a data class that a line of JSON contains, converted and checked.
+
+    Raises
+    ------
+    ValueError
+        A field has another type than declared, or is out of its range.
+    """
+    values = {}
+    for name, (needed, is_valid), is_float, is_tuple in _list_rules(cls):
+        if name not in line:
+            continue
+        value = line[name]
+        if is_float and (_is_integer(value) or (isinstance(value, str) and value in ("inf", "-inf", "nan"))):
+            value = float(value)
+        elif is_tuple and isinstance(value, list):
+            value = tuple(map(_to_float, value) if is_tuple == "float" else value)
+        if not is_valid(value):
+            raise ValueError(f"{name} is {value!r:.60}; {needed} is needed")
+        values[name] = value
+    return values
+
+
+@cache
+def _list_rules(cls: Any) -> list[tuple[str, _Rule, bool, str]]:
+    """Return (name, rule, whether it is a float, kind of the entries of a tuple) for each field of a data class."""
+    rules = []
+    for f in fields(cls):
+        kind = str(f.type)
+        if kind in _TYPES:
+            rule = _RANGES.get((cls.__name__, f.name), _RANGES.get(("", f.name), _TYPES[kind]))
+            entries = "float" if kind == "tuple[float, ...]" else "str"
+            rules.append(
+                (f.name, rule, kind.startswith("float"), entries if kind.startswith("tuple") else "")
+            )
+    return rules
+
+
+def _to_float(value: Any) -> Any:
+    """Convert an integer, or "inf" or "nan", to float; return other values unchanged."""
+    return float(value) if _is_integer(value) or value in ("inf", "nan") else value
+
+
+def _is_integer(value: Any) -> bool:
+    """Whether a value is a 64-bit integer."""
+    return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
+
+
+def _is_size(value: Any) -> bool:
+    """Whether a value is a float that is not negative; nan is accepted."""
+    return isinstance(value, float) and not value < 0.0
+
+
+def _is_flat(value: Any) -> bool:
+    """Whether a value is a number, a string, None or a list of these, as plans hold."""
+    if isinstance(value, list):
+        return all(_is_flat(v) and not isinstance(v, list) for v in value)
+    return value is None or isinstance(value, (bool, str, float)) or _is_integer(value)
+
+
+def _is_mapping(value: Any, is_valid: Callable[[Any], bool]) -> bool:
+    """Whether a value is a mapping from strings to values that `is_valid` accepts."""
+    return isinstance(value, Mapping) and all(isinstance(k, str) and is_valid(v) for k, v in value.items())
+
+
+def _is_string(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_count(value: Any) -> bool:
+    return _is_integer(value) and value >= 0
+
+
+def _is_positive(value: Any) -> bool:
+    """Whether a value is a finite positive number."""
+    return (_is_integer(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
+
+
+def _is_valid_plan(plan: Any) -> bool:
+    """Whether a value is a plan with positive tolerances."""
+    tolerances = plan.get("tolerances", []) if isinstance(plan, Mapping) else None
+    return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
+
+
+_Rule = tuple[str, Callable[[Any], bool]]
+_COUNT: _Rule = ("a whole number of 0 or more", _is_count)
+#: Description and test of the values of each declared type in a file.
+_TYPES: dict[str, _Rule] = {
+    "str": ("a text", _is_string),
+    "int": ("a whole number", _is_integer),
+    "float": ("a number of 0 or more", _is_size),
+    "float | None": ("a number of 0 or more, or nothing", lambda v: v is None or _is_size(v)),
+    "bool": ("true or false", lambda v: isinstance(v, bool)),
+    "tuple[float, ...]": (
+        "a list of numbers of 0 or more",
+        lambda v: isinstance(v, tuple) and all(map(_is_size, v)),
+    ),
+    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_string, v))),
+    "Mapping[str, Any]": ("a table of numbers and words", lambda v: _is_mapping(v, _is_flat)),
+    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, _is_string)),
+    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _is_count)),
+}
+#: Description and test of the range of a field of one class, or of all classes.
+_RANGES: dict[tuple[str, str], _Rule] = {
+    ("Run", "plan"): ("a plan with positive tolerances", _is_valid_plan),
+    ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
+    ("Record", "mode"): ("tol or budget", lambda v: v in ("tol", "budget")),
+    ("Record", "claim_check"): ("confirmed, not proven or contradicted", lambda v: v in CLAIM_CHECKS),
+    ("Record", "tol"): ("a finite number of 0 or more", lambda v: _is_size(v) and v < math.inf),
+    ("Record", "time_limit"): ("a positive number of seconds", _is_positive),
+    ("", "max_iter"): _COUNT,
+    ("", "iterations"): _COUNT,
+}
+
+
+def to_jsonable(value: Any) -> Any:
+    """Convert a value to one that JSON can hold: inf and nan become strings."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {str(k): to_jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_jsonable(v) for v in value]
+    if isinstance(value, (bool, int, str)) or value is None:
+        return value
+    return to_jsonable(value.tolist()) if hasattr(value, "tolist") else str(value)
+
+
+class Records:
+    """Runs of one or more measurements, with their machines, cases and pairs that did not run.
+
+    Iteration gives a `Record` for each run, `frame` a DataFrame with one row for each run.
+    """
+
+    def __init__(self, source: str = "") -> None:
+        self.source = source
+        self.runs: dict[str, Run] = {}
+        self.cases: dict[str, CaseInfo] = {}  # The latest description of each case.
+        self._skips: dict[tuple[str, str, str], Skip] = {}
+        self._sequences: dict[str, str] = {}  # The identity of each sequence in its latest description.
+        self._columns: dict[str, list[Any]] = {name: [] for name in _FIELD_NAMES}
+        self._places: dict[tuple[Any, ...], int] = {}  # Place of each measurement in the columns.
+        self._frame: DataFrame | None = None
+
+    @property
+    def skips(self) -> list[Skip]:
+        """Pairs that did not run, and cases that did not load."""
+        return list(self._skips.values())
+
+    @property
+    def left_out(self) -> dict[str, list[Skip]]:
+        """Cases that did not load, by sequence ("" for single cases). No number of a report counts them."""
+        skips: dict[str, list[Skip]] = {}
+        for skip in self._skips.values():
+            if not skip.solver:
+                skips.setdefault(skip.sequence, []).append(skip)
+        return skips
+
+    def add(self, entry: Entry) -> None:
+        """Add one entry. It replaces an earlier entry on the same machine, case, pair or measurement."""
+        self._frame = None
+        if isinstance(entry, Run):
+            self.runs.pop(entry.run, None)  # Insert the run again at the end, where the newest run is.
+            self.runs[entry.run] = entry
+        elif isinstance(entry, CaseInfo):
+            if (
+                entry.sequence
+                and self._sequences.setdefault(entry.sequence, entry.identity) != entry.identity
+            ):
+                # Another sequence of the same name: remove the steps of the earlier one.
+                self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
+                self._sequences[entry.sequence] = entry.identity
+            self.cases[entry.case] = entry
+            # Remove an earlier note that the case does not load.
+            self._skips.pop((entry.run, entry.case, ""), None)
+        elif isinstance(entry, Skip):
+            self._skips[entry.run, entry.case, entry.solver] = entry
+        else:
+            place = self._places.setdefault((entry.run, *entry.key), len(self))
+            for name, column in self._columns.items():
+                value = getattr(entry, name)
+                if name == "work":
+                    value = json.dumps(dict(value))
+                if isinstance(value, str):
+                    value = sys.intern(value)  # Most texts occur many times.
+                if place < len(column):
+                    column[place] = value
+                else:
+                    column.append(value)
+
+    def __len__(self) -> int:
+        return len(self._columns["run"])
+
+    def __iter__(self) -> Iterator[Record]:
+        for values in zip(*self._columns.values(), strict=True):
+            found = dict(zip(_FIELD_NAMES, values, strict=True))
+            yield Record(**{**found, "work": json.loads(found["work"])})
+
+    @property
+    def frame(self) -> DataFrame:
+        """One row for each run: fields of `Record`, its case and its machine; docs/report.md lists the columns."""
+        if self._frame is None:
+            require_packages("a table of runs", "pandas")
+            import pandas as pd
+
+            columns: dict[str, Any] = dict(self._columns)
+            times = columns.pop("times")
+            columns["time"] = [min(t, default=math.nan) for t in times]
+            columns["time_median"] = [median(t) if t else math.nan for t in times]
+            columns["repetitions"] = list(map(len, times))
+            frame = pd.DataFrame(columns)
+            for name in ("relative", "energy", "velocity", "calibration_time", "load"):
+                frame[name] = frame[name].astype(float)
+            cases = {n: {c: getattr(i, c) for c in CASE_COLUMNS} for n, i in self.cases.items()}
+            for n, info in self.cases.items():
+                cases[n]["structure"] = ", ".join(info.structure)
+            runs = {n: {c: getattr(r, c) for c in RUN_COLUMNS} for n, r in self.runs.items()}
+            for n, run in self.runs.items():
+                runs[n]["versions"] = ", ".join(f"{name} {v}" for name, v in run.versions.items())
+            for key, table, names in (
+                ("case", cases, (*CASE_COLUMNS, "structure")),
+                ("run", runs, (*RUN_COLUMNS, "versions")),
+            ):
+                for name in names:
+                    values = {k: entry[name] for k, entry in table.items()}
+                    frame[name] = frame[key].map(values)
+            for name in _TEXT_COLUMNS & set(frame):
+                frame[name] = frame[name].astype("category")
+            self._frame = frame
+        return self._frame
+
+    @property
+    def latest_frame(self) -> DataFrame:
+        """The rows of the run that wrote last, of cases with unchanged numbers.
+
+        Times are compared only within one run, and a file that has changed is another problem.
+        """
+        frame = self.frame
+        if not len(frame) or not self.runs:
+            return frame
+        numbers = frame["case"].map({name: info.sha for name, info in self.cases.items()}).astype(str)
+        same = (frame["sha"].astype(str) == numbers) & frame["case"].isin(list(self.cases))
+        return frame[same & (frame["run"] == list(self.runs)[-1])]
+
+    def select_solvers(self, names: Iterable[str]) -> Records:
+        """Return the records of some solvers, with the notes about them and all cases.
+
+        Raises
+        ------
+        InputError
+            There are no records of a solver.
+        """
+        wanted = list(names)
+        known = sorted({*self._columns["solver"], *(s.solver for s in self.skips if s.solver)})
+        for name in wanted:
+            if name not in known:
+                raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
+        selection = Records(self.source)
+        for entry in (*self.runs.values(), *self.cases.values(), *self.skips, *self):
+            if getattr(entry, "solver", "") in ("", *wanted):
+                selection.add(entry)
+        return selection
+
+    def __repr__(self) -> str:
+        return f"<Records: {len(self)} runs of {len(self.cases)} cases, {self.source or 'in memory'}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the numbers of runs and cases, for notebooks."""
+        solvers = sorted(set(self._columns["solver"]))
+        facts = {"runs": len(self), "cases": len(self.cases), "solvers": ", ".join(solvers)}
+        return format_html_table(facts, self.source or "Records")
+
+
+#: Columns of texts that occur many times.
+_TEXT_COLUMNS = {
+    "run", "case", "sha", "solver", "start", "mode", "order", "status", "worst_name", "claim_check", "status_conflict",
+    "work", "form", "message", "law", "sequence", "structure", "started", "cpu", "platform", "python", "lavender",
+    "versions",
+}  # fmt: skip
+
+
+class Store:
+    """Appends entries to a `.jsonl` file, which no other process can write while it is open.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written, another process writes it, or it has other content.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path, self._real = as_path(path), resolve_destination(path)
+        make_folder(self.path.parent)
+        with contextlib.ExitStack() as held:
+            held.enter_context(lock_output(self.path))
+            try:
+                self.records = read(self.path) if self.path.exists() else Records()
+                _remove_incomplete_last_line(self.path)
+                self.file = self.path.open("a", encoding="utf-8")
+            except OSError as error:
+                raise InputError(
+                    f"cannot write {self.path} ({error.strerror or error}): give a folder that you may write to"
+                ) from None
+            self._lock = held.pop_all()
+        self._synced = time.monotonic()
+
+    def add(self, entry: Entry) -> None:
+        """Write one entry and flush it to the operating system before returning.
+
+        Raises
+        ------
+        InputError
+            The disk is full (earlier entries are stored), or the file was removed.
+        """
+        line = json.dumps(to_json(entry), allow_nan=False)
+        try:
+            self.file.write(line + "\n")
+            self.file.flush()
+            if time.monotonic() - self._synced > SYNC_INTERVAL:
+                os.fsync(self.file.fileno())
+                self._synced = time.monotonic()
+                if not self._real.exists():
+                    raise InputError(
+                        f"{self.path} was removed, with its contents, while it was being written: run the "
+                        "command again in another folder"
+                    )
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.path} ({error.strerror or error}): free disk space and run the same command "
+                "again; it continues after the last record"
+            ) from None
+        self.records.add(entry)
+
+    def close(self) -> None:
+        """Close the file and release its lock. Errors of the disk are ignored here: `add` has raised them."""
+        with contextlib.suppress(OSError):
+            self.file.close()
+        self._lock.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def open_store(store: Store | str | Path | None) -> Iterator[Store | None]:
+    """Yield a store, or open the store of a path and close it at the end."""
+    if store is None or isinstance(store, Store):
+        yield store
+        return
+    with Store(store) as made:
+        yield made
+
+
+def _remove_incomplete_last_line(path: Path) -> None:
+    """Remove a last line without a line end, which an interrupted run leaves."""
+    if not path.exists():
+        return
+    with path.open("rb+") as f:
+        whole = sum(len(line) for line in f if line.endswith(b"\n"))
+        if whole != f.tell():
+            f.truncate(whole)
+
+
+def read(path: str | Path) -> Records:
+    """Read a file `records.jsonl`, or the one in a folder, without an incomplete last line.
+
+    Raises
+    ------
+    InputError
+        The file does not exist, or a line is not a record.
+    """
+    path = as_path(path)
+    if path.is_dir():
+        path = path / "records.jsonl"
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is not a file; a records.jsonl is needed")
+    records = Records(source=str(path))
+    for number, line in enumerate(_read_lines(path), 1):
+        if not line.strip():
+            continue
+        try:
+            entry = from_json(json.loads(line))
+        except (ValueError, RecursionError) as error:
+            raise InputError(
+                f"{path}, line {number}: {error}. Give a records.jsonl that `lavender report` wrote, or "
+                "remove this line"
+            ) from None
+        if isinstance(entry, Record) and not (entry.case in records.cases and entry.run in records.runs):
+            missing = "case" if entry.run in records.runs else "run"
+            raise InputError(
+                f"{path}, line {number}: the record belongs to a {missing} that no earlier line describes; a "
+                "complete records.jsonl is needed: copy the whole file"
+            )
+        records.add(entry)
+    return records
+
+
+def _read_lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a file without byte order marks, and without an incomplete last line."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(
+                f"{path} holds {size} bytes, more than the limit of {MAX_BYTES}; measure fewer cases in one "
+                "folder"
+            )
+        with path.open("rb") as f:
+            while line := f.readline(MAX_LINE_BYTES):
+                if not line.endswith(b"\n"):
+                    if len(line) == MAX_LINE_BYTES:
+                        raise InputError(
+                            f"{path} has a line of more than {MAX_LINE_BYTES} bytes; a records.jsonl is needed"
+                        )
+                    return
+                yield line[:-1].decode("utf-8", errors="replace").removeprefix("\ufeff")
+    except OSError as error:
+        raise InputError(
+            f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
+        ) from None

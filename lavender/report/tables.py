@@ -1,0 +1,406 @@
+"""Make the tables of a report: group-bys of its frame of runs, with units in the names of columns.
+
+The time of a solver to a tolerance on a case is the shortest time of its runs to this or a tighter tolerance whose
+judged residual is at most the tolerance. Runs with a fixed budget do not count, since a reader cannot choose the budget
+in advance. Single cases count from a cold start, steps of a sequence with carried impulses if the solver takes a start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from lavender.base.deadline import format_seconds
+from lavender.judge.residuals import at_floor
+from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
+from lavender.report.records import Skip, describe_target, format_tolerance
+from lavender.report.text import format_count, format_residual
+
+if TYPE_CHECKING:
+    from lavender.report.findings import Report
+
+Frame = pd.DataFrame
+MEAN_TIME_SHIFT = (
+    1e-5  # [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
+)
+# Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
+# the minimum, and within these bounds.
+MIN_NOISE, MAX_NOISE = 0.05, 0.25
+SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
+SERVED_QUANTILE = (
+    0.9  # A solver is recommended for a time or budget if it serves at least this share of the cases.
+)
+RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
+PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
+DEATHS = ("ERROR", "KILLED", "CRASHED")
+MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = (
+    4,
+    4.0,
+)  # An exponent is fitted to at least so many cases and ratio of rows.
+STRUCTURE_ORDER = (
+    *("separate", "chain", "mesh", "stack", "pile", "dense"),
+    *("redundant", "friction", "large mass ratio", "asymmetric"),
+)
+
+
+# -- selection ---------------------------------------------------------------------------------------------
+
+
+def select_ranked_runs(frame: Frame) -> Frame:
+    """Return the runs that rankings count: to a tolerance, if there are any, in the order "given"."""
+    mode = "tol" if (frame["mode"] == "tol").any() else "budget"
+    return select_starts(frame[frame["mode"] == mode])
+
+
+def select_starts(frame: Frame) -> Frame:
+    """Return the runs from the start that counts: cold, or carried over the steps of a sequence."""
+    runs = frame[frame["order"] == "given"]
+    single = runs["step"] < 0
+    carries = runs["solver"].isin(runs.loc[runs["start"] == "carried", "solver"].unique())
+    start = runs["start"].astype(str)
+    return runs[np.where(single | ~carries, start == "cold", start == "carried")]
+
+
+def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
+    """Group single cases by structure, and steps by their sequence. A case is in the group of each of its words.
+
+    If the cases of a word have several laws, each law is a group: "pile, coulomb". Words of the same cases form one
+    group: "stack / friction".
+    """
+    cases = frame.drop_duplicates("case")[["case", "structure", "law", "sequence"]].astype(str)
+    single = cases[cases["sequence"] == ""]
+    words = single.assign(word=single["structure"].str.split(", ")).explode("word")
+    names: dict[tuple[str, ...], list[str]] = {}
+    order = {word: i for i, word in enumerate(STRUCTURE_ORDER)}
+    for word, some in sorted(words.groupby("word"), key=lambda x: (order.get(x[0], len(order)), x[0])):
+        laws = some["law"].value_counts().index
+        for law in laws:
+            members = tuple(some.loc[some["law"] == law, "case"])
+            names.setdefault(members, []).append(word if len(laws) == 1 else f"{word}, {law}")
+    groups = {" / ".join(words): list(members) for members, words in names.items()}
+    steps = cases[cases["sequence"] != ""].groupby("sequence")["case"].agg(list)
+    return {**groups, **{f"sequence {name}": members for name, members in steps.items()}}
+
+
+def compute_mean(times: Any, axis: int = -1) -> Any:
+    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`."""
+    return np.exp(np.log(np.asarray(times) + MEAN_TIME_SHIFT).mean(axis=axis)) - MEAN_TIME_SHIFT
+
+
+def get_times(frame: Frame, tolerance: float) -> Frame:
+    """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
+    runs = select_ranked_runs(frame)
+    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].assign(
+        time=lambda x: x["time"].fillna(0.0)
+    )
+    times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
+    return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
+
+
+def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
+    """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
+
+    Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
+
+    Returns
+    -------
+    DataFrame
+        By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `worst` [s], `hardest` (case), `tie`.
+    """
+    times = get_times(frame, tolerance)
+    runs = select_ranked_runs(frame)
+    ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"], observed=True).median()
+    false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
+    ranking = pd.DataFrame({
+        "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
+        "mean": compute_mean(times.fillna(limit)) if len(times.columns) else math.nan,
+        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
+        "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
+    }, index=times.index)  # fmt: skip
+    ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
+    first = ranking.iloc[:1]
+    equal = [ranking[name] == value for name in ("false", "solved") for value in first[name]]
+    noise = ranking["noise"].fillna(MIN_NOISE)
+    near = ranking["mean"] <= first["mean"].max() * (1.0 + np.maximum(noise, noise.iloc[:1].max()))
+    tie = np.logical_and.reduce([*equal, near, ranking["solved"] > 0]) if len(ranking) else []
+    preferred = ranking.index == PREFERRED_SOLVER
+    ranking = ranking.assign(tie=tie, later=~(preferred & tie))
+    return ranking.sort_values(["tie", "later"], ascending=[False, True], kind="stable").drop(columns="later")
+
+
+def count_solved(solved: int, cases: int) -> str:
+    """Return the number of solved cases of all cases as " (7/8)"; empty if all are solved."""
+    return "" if solved == cases else f" ({solved}/{cases})"
+
+
+# -- tables ------------------------------------------------------------------------------------------------
+
+
+def tabulate_fastest(report: Report) -> Frame:
+    """Tabulate the fastest solver to each tolerance by structure and sequence, with the solvers that tie with it."""
+    rows = []
+    for name, cases in report.structures.items():
+        some = report.frame[report.frame["case"].isin(cases)]
+        row: dict[str, Any] = {"structure": name, "cases": len(cases)}
+        for tolerance in report.tolerances:
+            ranking = rank_solvers(some, tolerance, report.limit)
+            best = ranking.iloc[0] if len(ranking) else None
+            target = f"to {format_tolerance(tolerance)}"
+            row[target], row[f"time {target} [s]"] = "none", math.nan
+            if best is not None and best["solved"]:
+                ties = [str(s) for s in ranking.index[ranking["tie"]]][1:3]
+                solved = count_solved(int(best["solved"]), len(cases))
+                row[target] = " ≈ ".join([f"{ranking.index[0]}{solved}", *ties])
+                row[f"time {target} [s]"] = best["mean"]
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def tabulate_times(report: Report) -> Frame:
+    """Tabulate the mean time of each solver to each tolerance by law, and the number of cases that reach it."""
+    tables = []
+    for law, some in report.frame.groupby("law", observed=True):
+        table = pd.DataFrame()
+        for tolerance in report.tolerances:
+            ranking = rank_solvers(some, tolerance, report.limit)
+            target = f"to {format_tolerance(tolerance)}"
+            part = ranking[["solved", "mean"]].set_axis([f"solved {target}", f"time {target} [s]"], axis=1)
+            table = pd.concat([table, part], axis=1)
+        table.insert(0, "cases", some["case"].nunique())
+        table.insert(0, "law", law)
+        middle = f"to {format_tolerance(report.tolerance)}"
+        order = [f"solved {middle}", f"time {middle} [s]"]
+        tables.append(table.sort_values(order, ascending=[False, True], kind="stable").rename_axis("solver"))
+    table = pd.concat(tables).reset_index() if tables else pd.DataFrame()
+    return table.drop(columns=[c for c in table if c.startswith("time")]) if report.is_campaign else table
+
+
+def tabulate_cases(report: Report) -> Frame:
+    """Tabulate each case: size, fastest solver to the middle tolerance, and residual of its stored answer."""
+    times = get_times(report.frame, report.tolerance)
+    false = report.frame[report.frame["claim_check"] == CONTRADICTED]
+    for case, solver in zip(false["case"], false["solver"], strict=True):
+        times.loc[times.index == solver, times.columns == case] = math.nan
+    target, rows = f"fastest to {format_tolerance(report.tolerance)}", []
+    for name in times.columns:
+        info, own = report.records.cases[name], times[name].dropna()
+        stored = "" if math.isnan(info.stored) else f"{format_residual(info.stored)} {info.stored_verdict}"
+        rows.append({
+            "case": name, "law": info.law, "rows": info.rows, "contacts": info.contacts, "islands": info.islands,
+            "structure": ", ".join(info.structure), target: own.idxmin() if len(own) else "none",
+            "time [s]": own.min() if len(own) else math.nan, "stored answer [-]": stored,
+        })  # fmt: skip
+    table = pd.DataFrame(rows)
+    return table if any(row["stored answer [-]"] for row in rows) else table.iloc[:, :-1]
+
+
+def tabulate_runs(report: Report) -> Frame:
+    """Tabulate the time to each tolerance, smallest residual, status and claim of each solver on each case."""
+    runs = report.frame[(report.frame["order"] == "given") & (report.frame["step"] < 0)]
+    keys = ["case", "solver", "start"]
+    to_tolerance = runs[runs["mode"] == "tol"] if (runs["mode"] == "tol").any() else runs
+    table = runs.groupby(keys, observed=True, sort=False)[["relative"]].min()
+    for tolerance in report.tolerances:
+        reached = to_tolerance[to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance]
+        reached = reached.groupby(keys, observed=True)["time"]
+        table[f"to {format_tolerance(tolerance)} [s]"] = reached.min().reindex(table.index)
+    last = to_tolerance.groupby(keys, observed=True)[["status", "form"]].last()
+    checks = runs["claim_check"].map({CONFIRMED: 0, NOT_PROVEN: 1, CONTRADICTED: 2}).astype(int)
+    worst = checks.groupby([runs[k] for k in keys], observed=True).max()
+    table = table.join(last)
+    table["claim"] = worst.map({0: "", 1: NOT_PROVEN, 2: f"✗ {CONTRADICTED}"})
+    table = table.reset_index().rename(columns={"relative": "smallest residual [-]"})
+    warm = table["start"].astype(str) != "cold"
+    return table.assign(
+        solver=table["solver"].astype(str) + np.where(warm, " (" + table["start"].astype(str) + ")", "")
+    ).drop(columns="start")
+
+
+def tabulate_claims(report: Report) -> Frame:
+    """Tabulate how many claims of each solver the judge confirms."""
+    f = report.newest
+    counts = pd.DataFrame({
+        "solver": f["solver"].astype(str), "runs": 1, "claims": f["claims"].astype(int),
+        "contradicted": (f["claims"] & (f["claim_check"] == CONTRADICTED)).astype(int),
+        "to a tolerance": (f["mode"] == "tol").astype(int), "reached": f["success"].astype(int),
+        "died": f["status"].astype(str).str.startswith(DEATHS).astype(int),
+    })  # fmt: skip
+    table = counts.groupby("solver").sum().reset_index()
+    claims = table["claims"].where(table["claims"] > 0)
+    table.insert(2, "correct rate [%]", (1e3 * (1.0 - table["contradicted"] / claims) // 1.0) / 10.0)
+    return table
+
+
+def select_failures(report: Report) -> Frame:
+    """Return runs that missed their tolerance above the round-off floor, that died, and false claims."""
+    f = report.frame
+    floor = [at_floor(x, y) for x, y in zip(f["relative"], f["roundoff_floor"], strict=True)]
+    proven = (f["status"] == "INFEASIBLE") & (f["claim_check"] == CONFIRMED)
+    missed = (f["mode"] == "tol") & ~f["success"] & ~np.array(floor, bool) & ~proven
+    died = ~np.isfinite(f["relative"]) | f["status"].astype(str).str.startswith(DEATHS)
+    return f[missed | died | (f["claim_check"] == CONTRADICTED)]
+
+
+def tabulate_failures(report: Report) -> Frame:
+    """Tabulate failed runs with the row of the largest error and the reason."""
+    f = select_failures(report)
+    conflict = f["status_conflict"].astype(str)
+    message = f["message"].astype(str)
+    return pd.DataFrame({
+        "case": f["case"].astype(str), "solver": f["solver"].astype(str), "start": f["start"].astype(str),
+        "target": [describe_target(*x) for x in zip(f["mode"], f["tol"], f["max_iter"], strict=True)],
+        "status": f["status"].astype(str), "residual [-]": f["relative"], "floor [-]": f["roundoff_floor"],
+        "velocity error [m/s]": f["velocity"], "worst row": f["worst_name"].astype(str),
+        "reason": np.where(conflict != "", "✗ " + conflict + ". " + message, message),
+    })  # fmt: skip
+
+
+def tabulate_costs(report: Report) -> Frame:
+    """Tabulate how the time to the middle tolerance grows with the number of rows: time = a rows^exponent.
+
+    The exponent is fitted to the logarithms of the cases that a solver solves.
+    """
+    times, rows_of = get_times(report.frame, report.tolerance), report.records.cases
+    rows = []
+    for solver, own in times.iterrows():
+        t = own.dropna()
+        t, n = t[t > 0.0], np.array([rows_of[c].rows for c in t.index if t[c] > 0.0], float)
+        if len(t) < MIN_FIT_CASES or n.min() <= 0.0 or n.max() < MIN_FIT_SIZE_RATIO * n.min():
+            continue
+        x, y = np.log(n), np.log(t.to_numpy(float))
+        exponent, constant = np.polyfit(x, y, 1)
+        scatter = float(np.exp(np.std(y - exponent * x - constant)))
+        at = math.exp(constant + exponent * math.log(1000.0))
+        rows.append({
+            "solver": solver, "cases": len(t), "rows": f"{n.min():.0f} to {n.max():.0f}",
+            "exponent of rows": round(float(exponent), 2), "fit at 1000 rows [s]": at,
+            "scatter [factor]": round(scatter, 2),
+        })  # fmt: skip
+    return pd.DataFrame(rows).sort_values("fit at 1000 rows [s]") if rows else pd.DataFrame()
+
+
+def tabulate_budgets(report: Report) -> Frame:
+    """Tabulate the residual of each solver after fixed numbers of iterations: median and 90th percentile."""
+    runs = select_starts(report.frame[report.frame["mode"] == "budget"])
+    groups = runs.groupby(["solver", "max_iter"], observed=True)["relative"]
+    table = groups.quantile([0.5, SERVED_QUANTILE], interpolation="higher").unstack([1, 2]).sort_index(axis=1)
+    names = {0.5: "median", SERVED_QUANTILE: "90 %"}
+    table.columns = [f"{format_count(n, 'iteration')}, {names[q]} [-]" for n, q in table.columns]
+    return table.rename_axis("solver").reset_index() if len(runs) else pd.DataFrame()
+
+
+def tabulate_in_time(report: Report) -> Frame:
+    """Tabulate the solver with the smallest residual within each time by structure; none if it serves too few cases."""
+    runs, rows = select_starts(report.frame), []
+    for name, cases in report.structures.items():
+        some, row = runs[runs["case"].isin(cases)], {"structure": name, "cases": len(cases)}
+        for t in report.time_budgets:
+            done = some[some["time"] <= t].groupby(["solver", "case"], observed=True)["relative"].min()
+            left = done.unstack().reindex(columns=cases).fillna(1.0)
+            score = left.quantile(SERVED_QUANTILE, axis=1, interpolation="higher").sort_values(kind="stable")
+            score = score[(left <= SERVED_RESIDUAL).mean(axis=1).reindex(score.index) >= SERVED_QUANTILE]
+            near = [str(s) for s in score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()]]
+            near.sort(key=lambda s: s != PREFERRED_SOLVER)
+            row[f"in {format_seconds(t)}"] = " ≈ ".join(near[:3]) or "none"
+            row[f"residual in {format_seconds(t)} [-]"] = score[near[0]] if near else math.nan
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def tabulate_sequences(report: Report) -> Frame:
+    """Tabulate the time and iterations of all steps of each sequence, cold and with carried (warm) impulses."""
+    runs = report.frame[(report.frame["step"] >= 0) & (report.frame["order"] == "given")].astype(
+        {"start": str}
+    )
+    keys = ["sequence", "solver", "mode", "tol", "max_iter"]
+    groups = runs.groupby([*keys, "start"], observed=True)
+    table = groups.agg(steps=("case", "size"), time=("time", "sum"), iterations=("iterations", "sum"),
+                       residual=("relative", "median")).unstack("start")  # fmt: skip
+    out = table.index.to_frame(index=False)[["sequence", "solver"]].astype(str)
+    out["target"] = [describe_target(*x[2:]) for x in table.index]
+    for start in ("cold", "carried"):
+        for name, unit in (("steps", ""), ("time", " [s]"), ("iterations", ""), ("residual", " [-]")):
+            if (name, start) in table:
+                out[f"{name}, {start}{unit}"] = table[name, start].to_numpy()
+    if "time, carried [s]" in out and "time, cold [s]" in out:
+        out["cold / carried"] = (out["time, cold [s]"] / out["time, carried [s]"]).round(2)
+    return out
+
+
+def tabulate_engines(report: Report) -> Frame:
+    """Tabulate engines' own answers, and the fastest solver here on the same cases, to the middle tolerance."""
+    target, rows = f"to {format_tolerance(report.tolerance)}", []
+    for e in report.engines:
+        cases = [n for n, i in report.records.cases.items() if e.contains(i.source)]
+        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance, report.limit)
+        engine = e.rank(report, cases)
+        first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
+        rows.append({
+            "recorded": e.folder, "steps": e.steps, "not recorded": e.left_out, "rows": e.rows,
+            "engine's own": f"{e.solver}{'' if engine is None else count_solved(engine['solved'], len(cases))}",
+            f"own {target} [s]": math.nan if engine is None or not engine["solved"] else engine["mean"],
+            "residual, median [-]": e.relative, "worst [-]": e.worst, "above floor": e.above_floor,
+            "stopped early": e.unconverged, "velocity error [m/s]": e.velocity, "worst row": e.where,
+            "first here": "none" if first is None else ranking.index[0],
+            f"first {target} [s]": math.nan if first is None else first["mean"],
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def tabulate_changes(report: Report) -> Frame:
+    """Tabulate times to a tolerance that differ from an earlier run beyond noise, on cases with the same numbers.
+
+    Earlier times are multiplied by the change of the time of the loop of fixed work on the same case.
+    """
+    old, new = report.earlier_frame, report.frame[report.frame["step"] < 0]
+    rows, keys = [], ["case", "sha", "solver"]
+    both = pd.merge(
+        *(f[f["mode"] == "tol"].astype(dict.fromkeys(keys, str)) for f in (old, new)), on=[*keys, "start"]
+    )
+    both = both[
+        (both["order_x"] == "given") & (both["order_y"] == "given") & (both["tol_x"] == both["tol_y"])
+    ]
+    drift = both.groupby("case")[["calibration_time_x", "calibration_time_y"]].median()
+    drift = (drift["calibration_time_y"] / drift["calibration_time_x"]).fillna(1.0)
+    for r in both.itertuples():
+        before, after = (
+            t if x <= r.tol_x else math.inf
+            for t, x in ((r.time_x * drift[r.case], r.relative_x), (r.time_y, r.relative_y))
+        )
+        spread = 2.0 * (max(r.time_median_x / r.time_x, r.time_median_y / r.time_y) - 1.0)
+        noise = 1.0 + max(MAX_NOISE, spread if math.isfinite(spread) else 0.0)
+        if before != after and not before / noise <= after <= before * noise:
+            kinds = ("lost", "reached") if math.inf in (before, after) else ("slower", "faster")
+            rows.append({"case": r.case, "solver": r.solver, "target": f"to {format_tolerance(r.tol_x)}",
+                         "before [s]": before, "now [s]": after, "change": kinds[int(after < before)]})  # fmt: skip
+    return pd.DataFrame(rows).assign(compared=len(both)) if rows else pd.DataFrame({"compared": [len(both)]})
+
+
+def tabulate_idle(report: Report) -> Frame:
+    """Tabulate cases that the zero impulse solves, with the largest error of any solver, in units."""
+    idle = report.newest[report.newest["nothing_to_do"].astype(bool)].sort_values("velocity")
+    idle = idle.drop_duplicates("case", keep="last")
+    columns = {"velocity": "velocity error [m/s]", "energy": "energy [√J]"}
+    return idle[["case", "rows", "solver", "velocity", "energy"]].rename(columns=columns)
+
+
+def tabulate_skips(skips: Iterable[Skip]) -> Frame:
+    """Tabulate pairs of case and solver that did not run, or not to the end, with the reason."""
+    return pd.DataFrame([{"case": s.case, "solver": s.solver, "reason": s.reason} for s in skips])
+
+
+def choose_time_budgets(times: Frame) -> tuple[float, ...]:
+    """Return three decades of time [s] about the median over the cases of the fastest time."""
+    fastest = times.min().dropna()
+    fastest = fastest[fastest > 0.0]
+    middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
+    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
+
+
+def list_names(table: Frame, column: str) -> Sequence[str]:
+    """Return the texts of a column; empty if the table has no rows."""
+    return [str(x) for x in table[column]] if len(table) else []

@@ -1,0 +1,254 @@
+"""Terminal, page, files and figures of one report in which every part has something to show."""
+
+import csv
+import dataclasses
+import html.parser
+import re
+import sys
+from xml.etree import ElementTree
+
+import pytest
+from worked import python
+
+from lavender.report import Report, Skip, write
+from lavender.report.figures import Curve, Figure, build_figures, build_overall_figure
+from lavender.report.findings import SECTIONS
+from lavender.report.page import NUMBER, keep_numbers_together
+from lavender.report.plotting import PLUG_IN_COLORS, SOLVER_COLORS, assign_styles, render_svg
+from lavender.report.summary_page import PageSection, SummaryPage
+from lavender.report.table import Table
+from lavender.report.terminal import COMMAND_LINES, MAX_LINES
+from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, records_of, shown
+
+
+class Page(html.parser.HTMLParser):
+    """Elements of a page that do not close, the files that it loads, ids, links and alternative texts."""
+
+    VOID = frozenset({"meta", "br", "hr", "img", "input", "link", "path", "use", "rect"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.loads, self.ids, self.links, self.wrong, self.alts = [], [], set(), set(), [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.ids.add(values.get("id"))
+        if values.get("href", "").startswith("#"):
+            self.links.add(values["href"][1:])
+        self.loads += [v for k, v in attrs if k in ("src", "srcset", "data")]
+        self.loads += [values["href"]] if tag == "link" else []
+        if values.get("role") == "img":
+            self.alts.append(values["aria-label"])
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID and self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "steps"
+    folder.mkdir()
+    report, events = example(folder), []
+    write(report, folder / "out", watch=events.append)
+    return report, folder / "out", events
+
+
+def test_page_is_well_formed_and_complete_without_other_files(written):
+    report, out, _ = written
+    text = (out / "index.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert (page.open, page.wrong, page.loads) == ([], [], [])
+    assert page.links <= page.ids and {*report.sections, "machine", "limits"} <= page.ids
+    assert "<script>alert" not in text and "<b>row" not in text and EVIL not in text
+    figures = build_figures(report)
+    assert page.alts == [figure.description for figure in figures] and len(figures) >= 3
+    first = text[text.index("<body>") : text.index('<details class="part"')]
+    assert first.count("<svg") == 1 and "<table" not in first and "Use auto" in first
+    for words in (
+        "The machine was busy",
+        "Left out of all numbers",
+        "duplicate rows: two of &lt;3&gt;",
+        "✗ says CONVERGED",
+    ):
+        assert words in text
+
+
+def test_files_have_every_table_figure_and_run(written):
+    report, out, events = written
+    assert {p.name for p in out.iterdir()} - {"records.parquet"} == {
+        "records.csv", "index.html", "summary.md", "figures", "tables"
+    }  # fmt: skip
+    assert {p.stem for p in (out / "tables").glob("*.csv")} == set(report.sections)
+    assert set(report.sections) - set(SECTIONS) == {"changes", "idle", "skipped"}
+    assert set(SECTIONS) - set(report.sections) == {"costs"}  # Two cases are too few for a fit.
+    for figure in (out / "figures").iterdir():
+        assert ElementTree.parse(figure).getroot().tag.endswith("svg")
+    with (out / "tables" / "structures.csv").open(newline="") as f:
+        assert [row["structure"] for row in csv.DictReader(f)] == list(report.structures)
+    assert r"\begin{tabular}" in (out / "tables" / "claims.tex").read_text()
+    summary = (out / "summary.md").read_text(encoding="utf-8")
+    assert "Use auto" in summary and "| structure | cases |" in summary and EVIL not in summary
+    assert {e.phase for e in events} == {"writing"} and [e.done for e in events] == list(
+        range(events[0].total)
+    )
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_terminal_complete_report_stays_within_the_width_and_cuts_nothing(written, width):
+    report = written[0]
+    out = shown(report, width, complete=True)
+    assert max(map(len, out.splitlines())) <= width and "…" not in out
+    for section in report.sections.values():
+        assert section.title.split()[0] in out
+
+
+@pytest.mark.parametrize(("cases", "width"), [(1, 40), (40, 20), (40, 80), (40, 10_000)])
+def test_terminal_short_report_has_25_lines_within_the_width(cases, width):
+    """Warnings of every kind, names of any length and as many structures as there are words."""
+    made, names = [], [f"case {i} of a folder with a long name" for i in range(cases)]
+    for name in names:
+        for j in range(8):
+            more = {**FALSE_CLAIM, "status_conflict": "says CONVERGED " * 9} if j > 5 else {"load": 9.0}
+            made.append(record(name, f"solver_{j}", 1e-3 * (1 + j), 1e-7, **more))
+    found = records_of(*made, structure={name: (f"structure {i}",) for i, name in enumerate(names)})
+    for name in names:
+        found.add(dataclasses.replace(found.cases[name], diagnostics=("something looks wrong",)))
+        found.add(Skip("run", name + "b", "", "did not load: " + "x" * 100))
+        found.add(Skip("run", name, "newton", "takes laws linear"))
+    lines = shown(Report(found), width).splitlines()
+    assert len(lines) + COMMAND_LINES <= (
+        MAX_LINES if width > 40 else 60
+    )  # A sentence takes the lines that it needs.
+    assert max(map(len, lines)) <= width and lines[0].startswith("Use solver_0")
+    assert sum("more: --tables" in line for line in lines) == 1
+    assert any(line.startswith("false claim, the ") for line in lines)
+
+
+def test_print_table_that_is_too_wide_leaves_numbers_out_and_keeps_the_first_column():
+    import io
+
+    from rich.console import Console
+
+    from lavender.report.terminal import print_table
+
+    name = "worlds/worst_of_a_long_name_1.npz"
+    table = Table(
+        ["file", *(f"number {i} [m/s]" for i in range(8))], [[name, *["1.234567"] * 8]], frozenset({"file"})
+    )
+    out = io.StringIO()
+    print_table(Console(file=out, width=80), table, cut=True)
+    text = out.getvalue()
+    assert (
+        "number 0" in " ".join(text.split())
+        and "number 7" not in text
+        and max(map(len, text.splitlines())) <= 80
+    )
+    assert name in "".join(line[:80].split("  ")[0].strip() for line in text.splitlines()[1:]).replace(
+        "file", ""
+    )
+
+
+def test_styles_tell_solvers_apart_and_plug_ins_have_their_own_colours():
+    styles = assign_styles(["auto", "direct", "newton", "pgs", "osqp", "anderson", "mine", "yours"])
+    assert len({(s.color, s.dash) for s in styles.values()}) == len(styles)
+    assert {styles[n].color for n in ("mine", "yours")} <= set(PLUG_IN_COLORS)
+    assert not set(PLUG_IN_COLORS) & set(SOLVER_COLORS)
+    assert assign_styles(["auto", "x"])["auto"] == assign_styles(["auto", "pgs"])["auto"]
+
+
+def test_render_svg_has_texts_gaps_and_names_of_every_kind():
+    nan, inf = float("nan"), float("inf")
+    curves = (
+        Curve.from_points("a", "_a$\\frac$b", [(1e-3, 1e-2), (0.0, 1e-3), (2e-3, inf), (3e-3, 0.0)]),
+        Curve.from_points("b", "<b>&", [(nan, nan)]), Curve.from_points("c", "x" * 99, [(1e-3, 1.0)], points=True),
+    )  # fmt: skip
+    styles = assign_styles("abc")
+    svg = render_svg(
+        Figure("f", "a title of $1 & $2", "time [s]", "residual [-]", curves, tolerances=(1e-3,)), styles
+    )
+    texts = [t.text for t in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+    assert "a title of $1 & $2" in texts and "<b>&" in texts and any(t and t.endswith("…") for t in texts)
+    assert render_svg(Figure("f", "", "", "", curves), styles) == render_svg(
+        Figure("f", "", "", "", curves), styles
+    )
+
+
+def test_build_overall_figure_is_the_median_of_the_residuals_reached_by_each_time():
+    made = [record(c, "pgs", t, x) for c, t, x in (("a", 1e-3, 1e-2), ("b", 1e-2, 1e-4), ("c", 1e-1, 1e-6))]
+    made.append(record("a", "some", 1e-3, 1e-8))
+    figure = build_overall_figure(Report(records_of(*made)))
+    assert figure.title == "Error against time, median over 3 cases"
+    by = {c.solver: c for c in figure.curves}
+    # Two of three cases have a result from 10 ms on; the median is then the worse of the two.
+    assert (
+        by["pgs"].x[0] == pytest.approx(1e-2, rel=0.2) and by["pgs"].y[0] == 1e-2 and by["pgs"].y[-1] == 1e-4
+    )
+    assert "some" not in by or by["some"].label == "some (1 of 3 cases)"
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("in 1.05 ms on average", ["1.05 ms"]), ("1e-6 m/s", ["1e-6 m/s"]), ("--tables [m/s]", ["--tables", "[m/s]"]),
+        ("h1 and 3 cases", []),
+    ],
+)  # fmt: skip
+def test_keep_numbers_together_marks_numbers_with_their_units(text, kept):
+    assert NUMBER.findall(text) == kept
+    assert str(keep_numbers_together(f"<b>{text}")).count("<span") == len(kept)
+    assert str(keep_numbers_together("<b>")) == "&lt;b&gt;"
+
+
+def test_summary_page_has_its_figures_and_tables(tmp_path):
+    figure = Figure(
+        "over-time", "Errors", "step", "error", (Curve.from_points("worst", "worst", [(0, 1.0), (1, 2.0)]),)
+    )
+    part = PageSection("Errors", [Table(["a"], [["<x>"]])], [figure], short=1)
+    index = SummaryPage("Audit", "A sentence.", [part], {"n": 1}).write(tmp_path)
+    page = Page(index.read_text(encoding="utf-8"))
+    assert (page.open, page.wrong, page.alts) == ([], [], [figure.description])
+    assert (tmp_path / "figures" / "over-time.svg").exists() and "&lt;x&gt;" in index.read_text(
+        encoding="utf-8"
+    )
+
+
+@pytest.mark.parametrize("command", ["", "lv.solve(lv.Problem.lcp([[1.0]], [1.0]))", "lv.report.run"])
+def test_pandas_is_not_imported_by_a_solve(command):
+    code = f"import lavender as lv; {command or None}; import sys; print('pandas' in sys.modules)"
+    assert python("-c", code).stdout.strip() == "False"
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(sys.platform == "win32", reason="the peak of memory is read by the resource module")
+def test_report_of_100000_runs_needs_less_than_500_mb(tmp_path):
+    code = f"""import json, resource
+from pathlib import Path
+from lavender.report.records import to_json
+from tests.report.synthetic import record, records_of
+made = [record(f"c{{i}}", "auto", 1e-3, 1e-8) for i in range(1000)]
+found = records_of(*made)
+path = Path({str(tmp_path / "records.jsonl")!r})
+with path.open("w") as f:
+    for e in (*found.runs.values(), *found.cases.values()):
+        f.write(json.dumps(to_json(e)) + "\\n")
+    line = to_json(made[0])
+    for i in range(100_000):
+        change = {{"case": f"c{{i % 1000}}", "sha": f"shac{{i % 1000}}", "solver": f"s{{i // 1000 % 20}}"}}
+        f.write(json.dumps(line | change | {{"tol": 10.0 ** -(1 + i // 20_000)}}) + "\\n")
+"""
+    python("-c", code)
+    code = f"""import resource
+from lavender.report import Report, read, write
+found = read({str(tmp_path / "records.jsonl")!r})
+write(found, {str(tmp_path / "out")!r})
+print(len(found), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"""
+    count, peak = map(int, python("-c", code).stdout.split())
+    assert count == 100_000 and peak < 500 * 1024  # [KiB] on Linux
+    assert re.search(r"auto|s\d+", (tmp_path / "out" / "tables" / "structures.csv").read_text())

@@ -1,0 +1,278 @@
+"""Tables and sentences of a report, from records that nothing solved."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from lavender.base.deadline import format_seconds
+from lavender.report import Report, tables
+from lavender.report.engine import read_engine_answers
+from lavender.report.recommendation import recommend
+from lavender.report.table import Cell, Table
+from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, records_of
+
+
+def rank(*made, tolerance=1e-6, **more):
+    return tables.rank_solvers(Report(records_of(*made, **more)).frame, tolerance, 2.0)
+
+
+def test_get_times_loose_tolerance_and_budgets_do_not_count():
+    made = [
+        record("a", "pgs", 1e-5, 1e-7, tol=1e-3),
+        record("a", "pgs", 3e-5, 1e-7),
+        record("a", "pgs", 1e-6, 1e-9, **BUDGET),
+    ]
+    frame = Report(records_of(*made)).frame
+    assert tables.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
+    assert tables.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
+    assert math.isnan(tables.get_times(frame, 1e-9).loc["pgs", "a"])
+
+
+def test_rank_solvers_solved_cases_come_before_time_and_false_claims_last():
+    made = [record(c, "slow", 1e-2, 1e-8) for c in "ab"]
+    made += [record("a", "fast", 1e-5, 1e-8), record("b", "fast", 1e-5, 1e-2)]
+    made += [record("a", "liar", 1e-6, 1e-8), record("b", "liar", 1e-6, 1e-8, **FALSE_CLAIM)]
+    ranking = rank(*made)
+    assert list(ranking.index) == ["slow", "fast", "liar"]
+    assert list(ranking["solved"]) == [2, 1, 2]
+    # A miss counts with the limit; 10 µs are added to each time.
+    expected = math.sqrt((1e-5 + 1e-5) * (2.0 + 1e-5)) - 1e-5
+    assert ranking.loc["fast", "mean"] == pytest.approx(expected, rel=1e-12)  # some roundings of one mean
+    assert ranking.loc["slow", "hardest"] in ("a", "b") and ranking.loc["slow", "worst"] == 1e-2
+
+
+@pytest.mark.parametrize(("ratio", "first"), [(1.07, "auto"), (1.2, "direct")])
+def test_rank_solvers_times_within_noise_are_ties_with_auto_first(ratio, first):
+    """The repetitions of these records differ by 2 %, so noise is the minimum of 5 % or twice 2 %, plus the shift."""
+    made = [x for c in "ab" for x in (record(c, "direct", 1.0, 1e-8), record(c, "auto", ratio, 1e-8))]
+    noisy = [dataclasses.replace(r, times=(r.time, 1.04 * r.time, 1.08 * r.time)) for r in made]
+    ranking = rank(*noisy)
+    assert ranking.index[0] == first
+    assert list(ranking["tie"]) == ([True, True] if first == "auto" else [True, False])
+    assert not rank(record("a", "pgs", 1.0, 1.0))[
+        "tie"
+    ].any()  # A solver that solves nothing ties with nothing.
+
+
+def test_rank_solvers_another_solver_changes_no_mean():
+    made = [record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-3), ("b", 1e-2))]
+    with_other = rank(*made, record("a", "slow", 1.9, 1e-8))
+    assert with_other.loc["pgs", "mean"] == rank(*made).loc["pgs", "mean"]
+    assert with_other.loc["slow", "solved"] == 1 and with_other.loc["slow", "cases"] == 2
+
+
+def test_group_cases_by_structure_words_laws_and_sequences_are_groups():
+    made = [record(c, "pgs", 1.0, 1e-8) for c in ("a", "b", "c", "walk[0]")]
+    words = {"a": ("stack",), "b": ("stack", "redundant"), "c": ("pile", "friction")}
+    found = records_of(*made, structure=words, law={"b": "coulomb", "c": "coulomb"})
+    found.add(dataclasses.replace(found.cases["walk[0]"], sequence="walk", step=0))
+    groups = Report(found).structures
+    assert groups == {
+        "stack, coulomb / redundant": ["b"], "stack, lcp": ["a"], "pile / friction": ["c"], "sequence walk": ["walk[0]"]
+    }  # fmt: skip
+
+
+def test_tabulate_fastest_names_solver_share_ties_and_time():
+    made = [record(c, s, t, 1e-8) for c in "ab" for s, t in (("newton", 1.0), ("auto", 1.001), ("pgs", 3.0))]
+    made.append(record("c", "pgs", 1.0, 0.5))
+    table = tables.tabulate_fastest(Report(records_of(*made)))
+    (row,) = table.to_dict("records")
+    assert (row["structure"], row["cases"]) == ("stack", 3)
+    assert row["to 1e-6"] == "auto (2/3) ≈ newton"
+    assert row["time to 1e-6 [s]"] == pytest.approx(
+        (1.001**2 * 2.0) ** (1 / 3), rel=1e-4
+    )  # the shift is 1e-5
+
+
+def test_tabulate_costs_exponent_of_a_power_law_is_fitted():
+    rows = {f"c{n}": n for n in (10, 30, 100, 300, 1000)}
+    made = [record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in rows.items()]
+    made += [record(c, "few", 1e-6, 1e-8) for c in list(rows)[:3]]
+    table = tables.tabulate_costs(Report(records_of(*made, rows=rows)))
+    assert list(table["solver"]) == ["pgs"]  # Three cases are too few for a fit.
+    (row,) = table.to_dict("records")
+    assert (row["exponent of rows"], row["cases"], row["rows"], row["scatter [factor]"]) == (
+        1.5,
+        5,
+        "10 to 1000",
+        1.0,
+    )
+    assert row["fit at 1000 rows [s]"] == pytest.approx(1e-6 * 1000**1.5)
+
+
+def test_tabulate_claims_counts_contradicted_claims_and_deaths():
+    made = [record("a", "pgs", 1.0, 1e-8), record("b", "pgs", 1.0, 0.5, **FALSE_CLAIM)]
+    made.append(record("c", "pgs", 1.0, math.inf, status="KILLED", claims=False))
+    made.append(record("c", "pgs", 1.0, 0.1, **BUDGET))
+    (row,) = tables.tabulate_claims(Report(records_of(*made))).to_dict("records")
+    assert row == {
+        "solver": "pgs", "runs": 4, "correct rate [%]": 50.0, "claims": 2, "contradicted": 1, "to a tolerance": 3,
+        "reached": 1, "died": 1,
+    }  # fmt: skip
+
+
+def test_tabulate_failures_lists_misses_above_the_floor_with_their_reason():
+    made = [
+        record("a", "good", 1.0, 1e-8), record("a", "floor", 1.0, 1e-5, roundoff_floor=1e-5),
+        record("a", "missed", 1.0, 1e-2, message="slow"), record("a", "liar", 1.0, 0.5, **FALSE_CLAIM),
+        record("a", "proved", 1.0, 1.0, status="INFEASIBLE"), record("a", "budget", 1.0, 0.5, **BUDGET),
+    ]  # fmt: skip
+    table = tables.tabulate_failures(Report(records_of(*made)))
+    assert dict(zip(table["solver"], table["reason"], strict=True)) == {
+        "missed": "slow",
+        "liar": "✗ says CONVERGED. ",
+    }
+
+
+def test_tabulate_sequences_compares_cold_with_carried():
+    made = []
+    for step in range(4):
+        for start, t in (("cold", 2e-3), ("carried", 1e-3)):
+            made.append(record(f"walk[{step}]", "auto", t, 1e-8, start=start, step=step, iterations=3))
+    found = records_of(*made)
+    for step in range(4):
+        found.add(dataclasses.replace(found.cases[f"walk[{step}]"], sequence="walk", step=step))
+    report = Report(found)
+    (row,) = tables.tabulate_sequences(report).to_dict("records")
+    assert (row["sequence"], row["steps, cold"], row["iterations, carried"]) == ("walk", 4, 12)
+    assert row["time, cold [s]"] == pytest.approx(8e-3) and row["cold / carried"] == 2.0
+    assert recommend(report)[0].text.startswith(
+        "Use auto: it solves the 4 steps of walk in 1.00 ms on average, warm"
+    )
+
+
+def test_tabulate_in_time_counts_late_runs_as_misses():
+    made = [record(c, "late", 1.0, 1e-9) for c in "ab"] + [record(c, "early", 1e-3, 1e-2) for c in "ab"]
+    (row,) = tables.tabulate_in_time(Report(records_of(*made), times=[1e-2])).to_dict("records")
+    assert (row["in 10.0 ms"], row["residual in 10.0 ms [-]"]) == ("early", 1e-2)
+    (row,) = tables.tabulate_in_time(Report(records_of(*made[:2]), times=[1e-2])).to_dict("records")
+    assert row["in 10.0 ms"] == "none"
+
+
+def test_tabulate_budgets_has_median_and_90th_percentile():
+    made = [record(f"c{i}", "pgs", 1.0, x, **BUDGET) for i, x in enumerate(np.linspace(0.1, 1.0, 10))]
+    (row,) = tables.tabulate_budgets(Report(records_of(*made))).to_dict("records")
+    assert row["8 iterations, median [-]"] == pytest.approx(0.6)
+    assert row["8 iterations, 90 % [-]"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("now", "drift", "change"),
+    [
+        (1.2e-3, 1.0, None),
+        (2e-3, 1.0, "slower"),
+        (0.5e-3, 1.0, "faster"),
+        (2e-3, 2.0, None),
+        (None, 1.0, "lost"),
+    ],
+)
+def test_tabulate_changes_names_changes_beyond_noise_and_drift(now, drift, change):
+    old = records_of(record("a", "pgs", 1e-3, 1e-8))
+    residual = 1e-2 if now is None else 1e-8
+    new = records_of(record("a", "pgs", now or 1e-3, residual, calibration_time=1e-4 * drift))
+    table = tables.tabulate_changes(Report(new, old))
+    assert list(table["change"]) == [change] if change else "change" not in table
+    assert list(table["compared"]) == [1]
+
+
+# -- sentences ---------------------------------------------------------------------------------------------
+
+
+def test_recommend_names_worst_case_ties_misses_and_the_call():
+    made = [record(c, s, t, 1e-8) for c in "abc" for s, t in (("auto", 1e-3), ("direct", 1.0001e-3))]
+    made += [record("d", s, 1.0, 1e-2) for s in ("auto", "direct")]
+    (statement,) = recommend(Report(records_of(*made)))
+    mean = format_seconds(tables.compute_mean([1e-3, 1e-3, 1e-3, 2.0]))
+    assert statement.text == (
+        f"Use auto: it solves 3 of your 4 stacks in {mean} on average (a miss counted as 2.00 s), cold, down to 1e-6 "
+        f"of the error of the zero impulse. As fast within the noise of the repetitions: direct ({mean}). It misses d "
+        "(residual 1.0e-2)."
+    )
+    assert statement.call_line == 'lv.solve(problem, "auto", tol=1e-6)'
+    slow = [record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))]
+    assert "in 1.06 ms on average (100 ms at worst, c), cold" in recommend(Report(records_of(*slow)))[0].text
+
+
+def test_recommend_stopped_run_counts_completely_measured_problems_only():
+    made = [record(c, s, 1e-3, 1e-8) for c in "ab" for s in ("auto", "pgs")] + [
+        record("c", "auto", 1e-3, 1e-8)
+    ]
+    (statement,) = recommend(Report(records_of(*made, whole=False)))
+    assert statement.text.startswith(
+        "Stopped: auto solves the 2 problems measured so far in 1.00 ms on average"
+    )
+    (statement,) = recommend(Report(records_of(record("a", "auto", 1.0, 1.0), whole=False)))
+    assert statement.text.startswith("Stopped: no solver brings the 1 problem measured so far")
+    found = records_of(*made[-1:], whole=False)
+    run = next(iter(found.runs.values()))
+    found.add(dataclasses.replace(run, plan={**run.plan, "solvers": ["auto", "pgs"]}))
+    assert recommend(Report(found))[0].text == "Stopped: no problem was measured with every solver."
+
+
+def test_recommend_plug_ins_are_named_with_place_and_time():
+    made = [record("a", s, t, 1e-8) for s, t in (("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3))]
+    text = recommend(Report(records_of(*made)))[0].text
+    assert "Plug-in mine: place 2 of 3, 1 of 1 solved in 2.00 ms; other: place 3 of 3" in text
+
+
+@pytest.mark.parametrize(
+    ("answers", "first"),
+    [
+        ([(1e-5, 1e-9), (2e-5, 1e-9)], True),  # faster
+        ([(1e-4, 1e-9), (2e-4, 1e-9)], False),  # slower
+        ([(1e-6, 1e-9), (1e-6, 1e-2)], False),  # fewer cases
+        ([(1e-6, 1e-2), (1e-6, math.nan)], False),  # none
+    ],
+)
+def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
+    lines = [
+        {
+            "file": f"step_{i}.npz",
+            "rows": 3,
+            "seconds": t,
+            "relative": x,
+            "solver": "NEWTON",
+            "verdict": "wrong",
+        }
+        for i, (t, x) in enumerate(answers)
+    ]
+    (tmp_path / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    made = [
+        record(f"c{i}", s, t * (1 + i), 1e-8) for i in range(2) for s, t in (("auto", 4e-5), ("pgs", 5e-4))
+    ]
+    found = records_of(*made)
+    for i in range(2):
+        found.add(dataclasses.replace(found.cases[f"c{i}"], source=str(tmp_path / f"step_{i}.npz")))
+    report = Report(found, engines=read_engine_answers([], found))
+    text = recommend(report)[0].text
+    assert text.startswith("First is the engine's own Newton") == first
+    solved = sum(x <= 1e-6 for _, x in answers)
+    mean = tables.compute_mean([t if x <= 1e-6 else 2.0 for t, x in answers])
+    expected = f"solves {solved} of 2 in {format_seconds(mean)}" if solved else "solves none of them"
+    assert expected in text
+    (row,) = tables.tabulate_engines(report).to_dict("records")
+    assert row["first here"] == "auto" and row["first to 1e-6 [s]"] == pytest.approx(
+        tables.compute_mean([4e-5, 8e-5])
+    )
+    assert math.isnan(row["own to 1e-6 [s]"]) == (solved == 0)
+
+
+# -- texts of tables ---------------------------------------------------------------------------------------
+
+
+def test_table_times_have_one_unit_and_sizes_one_format():
+    import pandas as pd
+
+    frame = pd.DataFrame({
+        "solver": ["a", "b"], "time [s]": [1.5e-3, math.nan], "rows": [3, 4], "residual [-]": [1e-7, 0.5],
+        "x": [2.5, 3.0],
+    })  # fmt: skip
+    table = Table.from_frame(frame)
+    assert list(table.heads) == ["solver", "time [ms]", "rows", "residual [-]", "x"]
+    assert table.cell_texts == [["a", "1.50", "3", "1.0e-7", "2.5"], ["b", "–", "4", "5.0e-1", "3"]]
+    assert [table.is_numeric_column(h) for h in table.heads] == [False, True, True, True, True]
+    assert Table(["n", "t"], [["x", Cell.time(2e-6)], ["y", Cell.time(3e-6)]]).heads == ["n", "t [µs]"]
+    assert Table(["a"], [["<b>|*x*"]]).format_markdown() == ["| a |", "|---|", r"| &lt;b&gt;\|\*x\* |"]

@@ -1,0 +1,585 @@
+"""Measurements: judged, timed, written when they are made, and never lost to a backend, a kill or a lost worker."""
+
+import csv
+import dataclasses
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from random_problems import spd, touching
+from stacks import chain, moving_stack, stack
+from worked import python
+
+import lavender as lv
+from lavender import report, suite
+from lavender.report import cases, machine, records, runner, timing, workers
+from lavender.report.records import from_json, to_json
+from lavender.report.timing import format_call
+
+QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
+SEEDED = [f"granular(n=2, seed={i})" for i in range(40)]
+NAMES = [*(f"random_spd(n=12, condition=100, seed={i})" for i in range(3)), *SEEDED[:3], "toy_stack"]
+CAMPAIGN = report.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
+
+
+def lines(entries):
+    return [json.dumps(to_json(r)) for r in entries]
+
+
+# -- what is measured --------------------------------------------------------------------------------------
+
+
+def test_run_records_have_the_judged_result_of_each_target_and_its_times():
+    p = stack(12)
+    found = report.run([p], ["pgs"], QUICK)
+    assert [(r.mode, r.tol, r.max_iter, r.order) for r in found] == [
+        ("tol", 1e-3, 10_000_000, "given"), ("tol", 1e-8, 10_000_000, "given"),
+        ("budget", 0.0, 2, "given"), ("budget", 0.0, 5, "given"), ("budget", 0.0, 5, "reverse"),
+    ]  # fmt: skip
+    for r in found:
+        again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
+        expected = (
+            again.residual.relative,
+            again.residual.energy,
+            again.residual.velocity,
+            again.status.name,
+        )
+        assert (r.relative, r.energy, r.velocity, r.status) == expected
+        assert (r.worst_row, dict(r.work), r.success) == (
+            again.residual.worst_row,
+            dict(again.work),
+            r.mode == "tol",
+        )
+        assert 1 <= len(r.times) <= (1 if r.mode == "budget" else 2)
+        assert 0.0 < r.setup_time + r.solve_time <= max(r.times)
+    assert found.cases["stack"].structure == ("stack",) and found.cases["stack"].islands == 1
+    assert list(found.frame["time"]) == [r.time for r in found]
+
+
+def test_run_timed_call_is_the_printed_line(monkeypatch):
+    calls, true = [], timing.solve
+
+    def solve(problem, solver, **asked):
+        calls.append((solver, asked, problem.guess))
+        return true(problem, solver, **asked)
+
+    monkeypatch.setattr(timing, "solve", solve)
+    monkeypatch.setattr(timing, "LONG_TIME", math.inf)
+    plan = report.Plan(tolerances=(1.23456e-6,), budgets=(4,), repeats=2)
+    found = report.run([stack(6, guess=np.ones(6))], ["pgs"], plan)
+    assert len(calls) == sum(len(r.times) for r in found) == 6
+    for r in found:
+        names = {"lv": lv, "problem": stack(6, guess=np.ones(6)), "dataclasses": dataclasses}
+        del calls[: len(r.times) - 1]  # Only the first call of a task has a time limit.
+        solver, asked, guess = calls.pop(0)
+        exec("\n".join(format_call(r, True)[:-1]), names)
+        line = eval(format_call(r, True)[-1].replace("lv.solve(problem, ", "dict(solver="), {"dict": dict})
+        assert (solver, asked["tol"]) == (line["solver"], line["tol"])
+        assert asked["max_iter"] == line.get("max_iter", 10_000_000)
+        assert (guess is None) == (names["problem"].guess is None) == (r.start == "cold")
+    assert not calls
+
+
+def test_run_near_best_solvers_are_timed_again_and_kept(tmp_path):
+    plan = report.Plan(tolerances=(1e-6,), budgets=(), repeats=2)
+    path = tmp_path / "records.jsonl"
+    found = report.run([stack(6)], ["auto", "direct", "pgs"], plan, path)
+    first = min(found, key=lambda r: r.time)
+    near = [r for r in found if r.time <= runner.NEAR_TIME_RATIO * first.time]
+    assert len(near) < 2 or max(len(r.times) for r in near) == 5
+    events = []
+    again = report.run([stack(6)], ["auto", "direct", "pgs"], plan, path, watch=events.append)
+    assert lines(again) == lines(found) == lines(report.read(path))
+    assert all(e.reused for e in events if e.record is not None)
+
+
+def test_run_answer_as_guess_is_not_a_start(tmp_path):
+    p = stack(12)
+    answer = lv.solve(p, "direct", tol=1e-12).impulse
+    for early in (False, True):
+        guess = (0.99 if early else 1.0) * answer
+        p.updated(guess=guess).save(tmp_path / "step.npz", impulse=guess if early else None)
+        found = report.run([tmp_path / "step.npz"], ["pgs"], QUICK)
+        assert {r.start for r in found} == {"cold"} and found.cases["step"].guess == "answer"
+        assert all(r.iterations > 5 for r in found if r.mode == "tol" and r.tol == 1e-8)
+    warm = report.run([p.updated(guess=0.99 * answer)], ["pgs"], QUICK)
+    assert {r.start for r in warm} == {"cold", "warm"}
+
+
+def test_run_exact_solvers_run_once_and_hopeless_tolerances_are_left_out():
+    assert [(r.tol, r.success) for r in report.run([stack(8)], ["direct"], QUICK)] == [(1e-8, True)]
+    impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible")
+    assert [r.tol for r in report.run([impossible], ["pgs"], QUICK) if r.mode == "tol"] == [1e-3]
+
+
+def test_run_solver_that_raises_costs_its_own_record(plug_in):
+    def fail(problem, impulse):
+        raise RuntimeError("of the backend")
+
+    def lose(problem, impulse):
+        impulse[:] = np.nan
+        return lv.Claim(lv.Status.NUMERICAL_ERROR, 1)
+
+    plug_in(fail, "fake_raise"), plug_in(lose, "fake_nan")
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "fake_lie")
+    found = report.run(
+        [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
+    )
+    by = {(r.case, r.solver): r for r in found}
+    for case in ("one", "two"):
+        assert (by[case, "fake_raise"].status, by[case, "fake_raise"].message) == (
+            "ERROR",
+            "RuntimeError: of the backend",
+        )
+        assert (by[case, "fake_nan"].status, by[case, "fake_nan"].relative) == ("NUMERICAL_ERROR", 1.0)
+        assert by[case, "fake_lie"].claim_check == "contradicted"
+        assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
+    assert sum(r.solver == "fake_raise" for r in found) == 2  # After it, no tolerance can be reached.
+
+
+def test_run_plug_in_that_tests_nothing_is_timed_with_its_default_budget(register):
+    class Untested:
+        def prepare(self, problem):
+            return lv.prepare(problem, "pgs")
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            assert n < 1000, "it would never end"
+            impulse[:] = state.solve(impulse=impulse, tol=0.0, max_iter=n).impulse
+            return lv.Claim(lv.Status.MAX_ITERATIONS, n)
+
+    laws = {"coulomb", "lcp", "linear", "cone"}
+    register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
+    plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
+    (record,) = report.run([stack(2)], ["untested"], plan)
+    assert (record.status, record.iterations) == ("CONVERGED", 200)
+    assert format_call(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
+
+
+def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
+    free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
+    found = report.run([stack(4), free], ["gauss_seidel"], QUICK)
+    assert {(r.case, r.solver) for r in found} == {("stack", "pgs"), ("free", "gauss_seidel")}
+    (moved,) = found.skips
+    assert moved.reason.startswith("gauss_seidel → pgs: takes laws linear, not 'lcp'")
+    both = report.run([stack(4)], ["gauss_seidel", "pgs"], QUICK)  # measured once if both are named
+    assert [r.key for r in both] == [r.key for r in report.run([stack(4)], ["pgs"], QUICK)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tolerances": (), "budgets": ()}, "nothing to run"), ({"repeats": 0}, "repeats is 0"),
+        ({"time_limit": 0.0}, "time_limit is 0"), ({"sequence_time_limit": 0.0}, "sequence_time_limit is 0"),
+    ],
+)  # fmt: skip
+def test_plan_invalid_value_is_rejected(change, message):
+    with pytest.raises(lv.InputError, match=message):
+        report.Plan(**change)
+
+
+def test_plan_duplicates_are_removed():
+    plan = report.Plan(tolerances=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), orders=("reverse",) * 2)
+    assert (plan.tolerances, plan.budgets, plan.orders) == ((1e-3, 1e-6, 1e-9), (4, 8), ("reverse",))
+
+
+def test_limit_to_one_thread_covers_libraries_loaded_later():
+    code = """from lavender.report.timing import limit_to_one_thread
+from threadpoolctl import threadpool_info
+with limit_to_one_thread():
+    import scipy.linalg.lapack
+    print({pool['num_threads'] for pool in threadpool_info()})"""
+    assert python("-c", code).stdout.strip() == "{1}"
+
+
+# -- on disk -----------------------------------------------------------------------------------------------
+
+
+def test_store_has_each_record_when_it_is_made(tmp_path):
+    path, seen = tmp_path / "records.jsonl", []
+
+    def watch(event):
+        if event.record is not None:
+            seen.append(from_json(json.loads(path.read_text().splitlines()[-1])) == event.record)
+
+    found = report.run(
+        [stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch
+    )
+    assert seen == [True] * len(found) and lines(report.read(path)) == lines(found)
+    # Files of an editor that marks UTF-8, put together: the mark is before each part.
+    path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
+    assert lines(report.read(path)) == lines(found)
+
+
+SEQUENCE = (report.make_sequence(moving_stack(5), "load"), ["pgs"], report.Plan((), budgets=(6,), repeats=1))
+SOME = (NAMES[3:], ["pgs", "gauss_seidel"], report.CampaignPlan(tolerances=(1e-3,), budgets=(4,)))
+
+
+@pytest.mark.parametrize(
+    ("given", "first", "later"),
+    [
+        (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1), (SEQUENCE, 1, 1), (SOME, 1, 2),
+        pytest.param(SOME, 2, 1, marks=pytest.mark.nightly),
+    ],
+    ids=["problems", "sequence", "campaign", "campaign of two workers"],
+)  # fmt: skip
+def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
+    """Cut in the middle of lines; impulses that are carried from step to step are restored, too."""
+    path, events = tmp_path / "records.jsonl", []
+
+    def measure(n):
+        """Measure with n workers; return the records, and the number of records that were made now."""
+        events.clear()
+        found = report.run(*given, path, workers=n, watch=events.append)
+        return found, sum(e.record is not None and not e.reused for e in events)
+
+    whole, made = measure(first)
+    content = path.read_bytes()
+    for cut in np.random.default_rng(0).integers(len(content) // 8, len(content) - 2, 3):
+        path.write_bytes(content[:cut])
+        kept = len(report.read(path))
+        again, more = measure(later)
+        assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
+        assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
+        assert kept + more >= len(whole) == len(report.read(path)) and more <= made
+    again, more = measure(later)
+    assert len(again) == len(whole) == len(report.read(path)) and more == 0
+
+
+def test_run_process_killed_at_random_times_loses_nothing(tmp_path):
+    """The end of a process by SIGKILL, several times, and then a whole run."""
+    path = tmp_path / "records.jsonl"
+    code = f"""from lavender import report
+plan = report.Plan(tolerances=(1e-6,), budgets=(4, 8), repeats=1)
+report.run({SEEDED[:6]}, ["pgs", "nncg"], plan, {str(path)!r})"""
+    sizes = [0]
+    for target in np.random.default_rng(1).integers(2000, 9000, 3):
+        process = subprocess.Popen([sys.executable, "-c", code])
+        while process.poll() is None and (path.stat().st_size if path.exists() else 0) < sizes[-1] + target:
+            time.sleep(0.01)
+        process.kill()
+        process.wait()
+        sizes.append(path.stat().st_size)
+        assert len(report.read(path)) >= 0
+    python("-c", code)
+    fresh = report.run(SEEDED[:6], ["pgs", "nncg"], report.Plan((1e-6,), budgets=(4, 8), repeats=1))
+    assert [(r.key, r.relative) for r in report.read(path)] == [(r.key, r.relative) for r in fresh]
+
+
+def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
+    path = tmp_path / "records.jsonl"
+    first = report.run([stack(5)], ["direct"], QUICK, path)
+    ids = {r.run for r in first}
+    for name, value in (("__version__", "99"), ("get_cpu_name", lambda: "another")):
+        monkeypatch.setattr(machine, name, value)
+        ids |= {r.run for r in report.run([stack(5)], ["direct"], QUICK, path)}
+    assert len(ids) == 3 and len(report.read(path)) == 3 * len(first)
+    assert len(report.read(path).latest_frame) == len(first)
+
+
+def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
+    def interrupt(problem, impulse):
+        raise KeyboardInterrupt
+
+    plug_in(interrupt, "fake_interrupt")
+    path, into = tmp_path / "records.jsonl", []
+    with pytest.raises(KeyboardInterrupt):
+        report.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
+    assert {r.solver for r in report.read(path)} == {"pgs"} and lines(into[0]) == lines(report.read(path))
+    assert report.Report(report.read(path)).is_stopped
+    report.run([stack(5)], ["pgs", "direct"], QUICK, path)
+    assert not report.Report(report.read(path)).is_stopped
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
+def test_store_removed_file_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "SYNC_INTERVAL", -1.0)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    with report.Store("sub/records.jsonl") as opened:
+
+        def watch(event):
+            if event.solver == "direct" and event.record is None:
+                (tmp_path / "sub" / "records.jsonl").unlink()
+
+        monkeypatch.chdir("/")  # A relative name refers to the folder in which it was given.
+        with pytest.raises(lv.InputError, match="was removed"):
+            report.run([stack(5)], ["pgs", "direct"], QUICK, opened, watch=watch)
+
+
+def test_frame_and_csv_have_a_row_for_each_run(tmp_path):
+    found = report.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
+    report.write(found, tmp_path, figures=False)
+    with (tmp_path / "records.csv").open(newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert len(rows) == len(found) == len(found.frame)
+    for row, r in zip(rows, found, strict=True):
+        assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (
+            r.relative,
+            r.time,
+            machine.get_cpu_name(),
+        )
+        assert json.loads(row["work"]) == dict(r.work) and int(row["rows"]) == found.cases[r.case].rows
+    assert f"numpy {np.__version__}" in rows[0]["versions"]
+    with pytest.raises(lv.InputError, match="no records of solver 'nncg'; there are records of direct, pgs"):
+        found.select_solvers(["nncg"])
+
+
+def test_json_infinite_and_undefined_numbers_are_kept():
+    r = report.Record("r", "c", "s", "x", "cold", "tol", 1e-3, 1, 1.0, status="ERROR", message="é\n")
+    back = from_json(json.loads(json.dumps(to_json(r), allow_nan=False)))
+    assert back.relative == math.inf and math.isnan(back.time) and math.isnan(back.roundoff_floor)
+    assert (back.message, back.key) == ("é\n", r.key)
+
+
+# -- sequences ---------------------------------------------------------------------------------------------
+
+
+def test_run_sequence_carries_each_solvers_own_impulses():
+    problems = moving_stack(5)
+    plan = report.Plan(tolerances=(1e-6,), budgets=(6,), repeats=1)
+    found = report.run(report.make_sequence(problems, "load"), ["pgs"], plan)
+    impulse, by = problems[0].start(), {(r.start, r.mode, r.step): r for r in found}
+    for i, p in enumerate(problems):
+        carried = lv.solve(p, "pgs", impulse=impulse, tol=0.0, max_iter=6)
+        impulse = carried.impulse
+        assert by["carried", "budget", i].relative == carried.residual.relative
+        cold = lv.solve(p, "pgs", impulse=p.start(), tol=0.0, max_iter=6)
+        assert by["cold", "budget", i].relative == cold.residual.relative
+    assert len(found) == 5 * 4
+    # The load changes by a thousandth: from the second step on, carried impulses are far closer.
+    assert by["carried", "budget", 4].relative < 0.2 * by["cold", "budget", 4].relative
+
+
+def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypatch):
+    items = report.make_sequence(moving_stack(5), "load")
+    # No solve takes less than a picosecond: each pass ends after its first step.
+    plan = report.Plan(tolerances=(), budgets=(6,), repeats=1, sequence_time_limit=1e-12)
+    found = report.run(items, ["pgs"], plan, tmp_path / "records.jsonl")
+    assert [(r.step, r.start) for r in found] == [(0, "cold"), (0, "carried")]
+    assert [s.case for s in found.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
+    assert all("after 1 of 5 steps" in s.reason for s in found.skips)
+    monkeypatch.setattr(runner, "measure_task", None)  # Nothing is solved again.
+    assert lines(report.run(items, ["pgs"], plan, tmp_path / "records.jsonl")) == lines(found)
+
+
+def test_records_of_two_sequences_with_one_name_are_kept_apart(tmp_path):
+    path, plan = tmp_path / "records.jsonl", report.Plan(tolerances=(), budgets=(6,), repeats=1)
+    report.run(report.make_sequence(moving_stack(5), "load"), ["pgs"], plan, path)
+    report.run(report.make_sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
+    frame = report.read(path).latest_frame
+    assert sorted(frame.loc[frame["start"] == "cold", "step"]) == [0, 1]
+
+
+# -- workers -----------------------------------------------------------------------------------------------
+
+
+def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
+    one = report.run(NAMES, ["pgs", "direct"], CAMPAIGN)
+    two = report.run(NAMES, ["pgs", "direct"], CAMPAIGN, workers=2)
+    assert lines(one) == lines(two) and lines(one.cases.values()) == lines(two.cases.values())
+    assert [s.case for s in one.skips] == [s.case for s in two.skips]
+    assert all(r.times == () and math.isnan(r.setup_time) for r in one)
+    (r,) = (
+        r for r in one if r.case == NAMES[0] and r.solver == "pgs" and r.max_iter == 8 and r.order == "given"
+    )
+    again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=8)
+    assert again.residual.relative == r.relative
+    page = report.write(one, tmp_path)
+    assert "Error and robustness without times" in page.read_text(encoding="utf-8")
+    assert not (tmp_path / "figures").exists()
+    with pytest.raises(lv.InputError, match="give a CampaignPlan, or workers=1"):
+        report.run(["toy_stack"], ["direct"], report.Plan(), workers=2)
+
+
+def test_campaign_exception_of_the_watch_stops_workers_without_warnings(tmp_path, recwarn):
+    def stop(event):
+        raise OSError("no room")
+
+    path, stored = tmp_path / "records.jsonl", []
+    with pytest.raises(OSError, match="no room"):
+        report.run(NAMES, ["pgs", "direct"], CAMPAIGN, path, workers=2, watch=stop, into=stored)
+    assert not recwarn.list and lines(stored[0]) == lines(report.read(path))
+
+
+def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path, plug_in):
+    short = report.CampaignPlan(tolerances=(1e-6,), budgets=())
+    p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
+    lv.io.save(p, tmp_path / "file.npz")
+    (tmp_path / "bad.npz").write_bytes(b"broken")
+    found = report.run([p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["direct"], short, workers=2)
+    assert [(r.case, r.success) for r in found] == [("mine", True), ("file", True)]
+    assert ["did not load" in s.reason for s in found.skips] == [True]
+    for name in ("here alone", "pgs"):  # also under the name of a solver of lavender
+        plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 1, {"mine": 1}), name)
+    found = report.run(["toy_stack"], ["here alone", "pgs"], short, workers=2)
+    assert [dict(r.work) for r in found] == 2 * [{"mine": 1}]
+
+
+def test_campaign_changed_file_is_measured_again(tmp_path):
+    short, file = report.CampaignPlan(tolerances=(1e-6,), budgets=()), tmp_path / "file.npz"
+    shas = []
+    for factor in (1.0, 1.0, 2.0):
+        lv.Problem.lcp(factor * np.eye(2), np.ones(2)).save(file)
+        shas.append({r.sha for r in report.run([file], ["pgs"], short, tmp_path / "records.jsonl")})
+    assert shas[0] == shas[1] != shas[2]
+
+
+@pytest.mark.parametrize(
+    ("backend", "missing", "message"),
+    [
+        ("nowhere", "", "'loky' runs processes"), ("loky=here", "", "'loky' runs processes"),
+        ("dask=tcp://127.0.0.1:1", "", "no dask scheduler answers"), ("dask", "", "DASK_SCHEDULER_ADDRESS"),
+        ("dask", "distributed", r"pip install 'lavender-contact\[cluster\]'"),
+    ],
+)  # fmt: skip
+def test_campaign_backend_that_cannot_be_used_is_an_input_error(backend, missing, message, monkeypatch):
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
+    elif backend.startswith("dask"):
+        pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
+        monkeypatch.setattr(workers, "CONNECT_TIMEOUT", 0.2)
+    with pytest.raises(lv.InputError, match=message):
+        report.run(NAMES[:1], ["pgs"], CAMPAIGN, backend=backend)
+
+
+@pytest.mark.nightly
+def test_campaign_cluster_that_loses_a_worker_loses_no_record():
+    distributed = pytest.importorskip(
+        "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
+    )
+    plan = report.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64))
+    expected = report.run(SEEDED[:16], ["pgs", "jacobi"], plan)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        pids = list(client.run(os.getpid).values())
+        killed = threading.Event()
+
+        def watch(event):
+            if event.done >= event.total // 3 and not killed.is_set():
+                killed.set()
+                os.kill(pids[0], signal.SIGKILL)
+
+        found = report.run(SEEDED[:16], ["pgs", "jacobi"], plan, backend="dask", watch=watch)
+        while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
+            time.sleep(0.1)
+    assert killed.is_set() and lines(found) == lines(expected)
+
+
+# -- cases -------------------------------------------------------------------------------------------------
+
+
+def two_bodies(copies, ratio=1.0):
+    """A light ball on the ground, a heavy one on it, each pair touching at `copies` equal contacts."""
+    inverse = np.array([1.0, 1.0 / ratio])
+    pairs = np.repeat([[-1, 0], [0, 1]], copies, axis=0)
+    return touching(pairs, inv_mass=inverse, inv_inertia=inverse[:, None, None] * np.eye(3))
+
+
+def make_pile_among_separate_rows():
+    """Six rows, each coupled to the next two, among a hundred that nothing couples: the six decide."""
+    a = np.eye(106)
+    a[:6, :6] += np.diag(np.full(5, 0.1), 1) + np.diag(np.full(4, 0.1), 2)
+    return lv.Problem.lcp(np.maximum(a, a.T), np.ones(106))
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (chain(6), ("chain",)),
+        (lv.Problem.linear(*spd(20)), ("dense",)),
+        (stack(6), ("stack",)),
+        (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
+        (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
+        (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
+        (lv.Problem.from_rows(two_bodies(1), mu=0.5, tangents=2), ("stack", "friction")),
+        (lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)), ("separate", "redundant")),
+        (lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)), ("separate", "asymmetric")),
+        (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("asymmetric",)),
+        (lv.Problem.contact(np.eye(9), np.ones(9), np.full(3, 0.5)), ("separate", "friction")),
+        (make_pile_among_separate_rows(), ("pile",)),
+        (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
+    ],
+)
+def test_classify_structure_names_the_largest_component(problem, words):
+    assert report.classify_structure(problem) == words
+
+
+def test_hash_problem_changes_with_every_number():
+    p = stack(5)
+    variants = [
+        p, dataclasses.replace(p, b=p.b + 1e-15), dataclasses.replace(p, guess=np.zeros(5)),
+        lv.Problem.lcp(p.matrix, p.b, upper=1.0), lv.Problem.lcp(2 * p.matrix, p.b),
+        lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
+    ]  # fmt: skip
+    jac, mass, v = (
+        np.array([[1.0, 0.2], [0.0, 1.0]]),
+        np.array([[2.0, 0.3], [0.3, 1.0]]),
+        np.array([-1.0, 0.5]),
+    )
+    for s in (1.0, 2.0):  # one A and one b
+        cones = lv.Cones.contacts(0.5, 1)
+        variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
+    variants.append(dataclasses.replace(variants[-1], precision="float32"))
+    variants += [dataclasses.replace(p, key=np.arange(5, dtype=np.uint64) + k) for k in (0, 1)]
+    hashes = [cases.hash_problem(v) for v in variants]
+    assert len(set(hashes)) == len(variants) and cases.hash_problem(stack(5, "renamed")) == hashes[0]
+
+
+def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(tmp_path):
+    p = lv.Problem.contact(np.eye(4), np.ones(4), np.full(2, 0.5), key=np.array([7, 9], np.uint64))
+    for folder in ("a/steps", "b/steps", "mixed", "a/my steps", "a/My_steps"):
+        (tmp_path / folder).mkdir(parents=True)
+        for i in (1, 2):
+            lv.io.save(p, tmp_path / folder / f"scene-{i:06d}.npz")
+    lv.io.save(p, tmp_path / "mixed" / "other.npz")
+    items = report.resolve_sources([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
+    assert [(i.sequence, i.step) for i in items] == [
+        ("steps", 0), ("steps", 1), ("b/steps", 0), ("b/steps", 1), ("", -1), ("", -1), ("", -1),
+    ]  # fmt: skip
+    assert all(i.sequence == "" for i in report.resolve_sources([tmp_path / "a" / "steps"], sequences=False))
+    alike = report.resolve_sources([tmp_path / "a" / name for name in ("my steps", "My_steps")])
+    assert {i.sequence for i in alike} == {
+        "my steps",
+        "a/My_steps",
+    }  # Figures are files named after sequences.
+    (tmp_path / "mixed" / "back").symlink_to(tmp_path / "mixed")  # is not read again
+    assert len(report.resolve_sources([tmp_path / "mixed", "stack(n=2)"])) == 4
+    for source, message in (
+        (tmp_path / "no.npz", "no such file"),
+        (tmp_path / "a", None),
+        ([tmp_path / "b" / "x"], "no such"),
+    ):
+        if message:
+            with pytest.raises(lv.InputError, match=message):
+                report.resolve_sources(source)
+    with pytest.raises(lv.UnknownName, match="pgs"):
+        report.run([stack(3)], ["pgz"])
+
+
+@pytest.mark.parametrize("names", [("s_1", "s_2", "s_02"), ("a_1", "a_2", "b_1", "b_2")])
+def test_list_steps_two_recordings_in_a_folder_are_rejected(tmp_path, names):
+    for name in names:
+        lv.io.save(stack(4), tmp_path / f"{name}.npz")
+    with pytest.raises(lv.InputError, match="more than one recording"):
+        cases.list_steps_in_folder(tmp_path)
+    with pytest.raises(lv.InputError, match="is not a folder"):
+        cases.list_steps_in_folder(tmp_path / "none")
+
+
+def test_list_steps_are_in_numeric_order(tmp_path):
+    for i in (10, 9, 1):
+        lv.io.save(stack(4), tmp_path / f"step_{i}.npz")
+    steps = cases.list_steps_in_folder(tmp_path)
+    assert [item.source.rpartition("_")[2] for item in steps] == ["1.npz", "9.npz", "10.npz"]
+    assert [i.sequence for i in report.resolve_sources([tmp_path])] == ["", "", ""]  # No blocks are named.
