@@ -55,7 +55,7 @@ CONTENTS = {
     ),
     "Use": (
         "commands report formats own-engine generalized quadratic-programs mujoco worlds engines audit "
-        "tune derivatives c solvers generated/api"
+        "tune derivatives c solvers backends generated/api"
     ),
     "LavenderSim": "engine engine-measurements scenes towers web",
     "Background": (

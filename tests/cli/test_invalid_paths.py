@@ -447,7 +447,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         from lavender import cli
         from lavender.io.stored import TEMPORARY_NAME
         from lavender.sim.web import pages
-        pages.module = lambda say, name: b"a module"
+        pages.get_or_build_module = lambda say, name: b"a module"
         here, opened = os.getcwd(), set()
 
         def watch(event, given):

@@ -111,7 +111,7 @@ def factor_of(matrix, order):
     return np.cumsum([0, *map(len, below)]), np.array([i for rows in below for i in sorted(rows)])
 
 
-@pytest.mark.parametrize("piles", [1, 3])
+@pytest.mark.parametrize("piles", [1, 2])
 def test_dissection_halves_the_work_of_minimum_degree_on_a_cube(piles):
     """Blocks of a grid of 14 x 14 x 14 with 26 neighbours, alone or beside others: each vertex has one place."""
     line = sp.diags_array([np.ones(13), np.ones(14), np.ones(13)], offsets=[-1, 0, 1])
@@ -241,8 +241,8 @@ def test_what_is_no_mirror_is_seen():
 
 @pytest.mark.skipif(os.name != "posix", reason="a timer that sends a signal is of POSIX")
 def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
-    """The grid takes 2.8e9 multiply-adds, and signals are checked after every 2e8: the handler runs inside the call."""
-    n = 30
+    """The grid takes 7e8 multiply-adds, and signals are checked after every 2e8: the handler runs inside the call."""
+    n = 24
     line, one = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), sp.eye_array(n)
     grid = (
         sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
