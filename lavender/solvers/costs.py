@@ -87,27 +87,13 @@ class Cost:
 
 @dataclass(frozen=True)
 class Count:
-    """Operation counts of one step of Newton's method over rows or bodies.
+    """Operation counts of one step of Newton's method over rows or bodies."""
 
-    Parameters
-    ----------
-    form : {"bodies", "dense", "panels"}
-        Matrix that is factored.
-    work : float
-        Multiply-adds of one factorisation.
-    entries : float
-        Number of additional values that a step reads.
-    rows : float
-        Number of rows.
-    set_up : float, ns
-        Cost to form A from J and M.
-    """
-
-    form: str
-    work: float
-    entries: float
+    form: str  # Matrix that is factored: "bodies", "dense" or "panels".
+    work: float  # Multiply-adds of one factorisation.
+    entries: float  # Number of additional values that a step reads.
     rows: float
-    set_up: float = 0.0
+    set_up: float = 0.0  # [ns] Cost to form A from J and M.
 
 
 # -- iterations ----------------------------------------------------------------------------------

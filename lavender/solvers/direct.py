@@ -61,29 +61,15 @@ def _estimate_linear_cost(problem: Problem) -> float:
 
 @dataclass
 class DirectState:
-    """State of one solve, which `run` continues.
-
-    Parameters
-    ----------
-    problem : Problem
-    pivot : PivotState, optional
-        State of the exchanges, for a boxed or symmetric problem.
-    general : RankRevealingFactor or PanelsLU, optional
-        Factor of an asymmetric or indefinite linear system.
-    failed_factorisations : int
-        Number of factorisations that failed before `general`.
-    is_running : bool
-        Whether `run` was called.
-    note : str
-        Part of the message.
-    """
+    """State of one solve, which `run` continues."""
 
     problem: Problem
-    pivot: PivotState | None = None
+    pivot: PivotState | None = None  # State of the exchanges, for a boxed or symmetric problem.
+    # Factor of an asymmetric or indefinite linear system.
     general: RankRevealingFactor | PanelsLU | None = None
-    failed_factorisations: int = 0
-    is_running: bool = False
-    note: str = ""
+    failed_factorisations: int = 0  # Number of factorisations that failed before `general`.
+    is_running: bool = False  # Whether `run` was called.
+    note: str = ""  # Part of the message.
 
 
 @dataclass(frozen=True)

@@ -87,23 +87,12 @@ WARM_START_MAX_RESIDUAL = 1e-3
 
 @dataclass
 class NewtonState:
-    """The linear system of a problem, built once.
-
-    Parameters
-    ----------
-    problem : Problem
-    system : System or None
-        None if no body in a row can move, or for the driver in generalised coordinates.
-    general : lavender_ext.driver.driver.Driver, optional
-        Driver in generalised coordinates.
-    begun : bool
-        Whether `advance` has been called, so that the next call continues.
-    """
+    """The linear system of a problem, built once."""
 
     problem: Problem
-    system: System | None
-    general: Any = None
-    begun: bool = False
+    system: System | None  # None if no body in a row can move, or for the driver in generalised coordinates.
+    general: Any = None  # Driver in generalised coordinates, or None.
+    begun: bool = False  # Whether `advance` has been called, so that the next call continues.
 
     @cached_property
     def count(self) -> Count:

@@ -25,8 +25,8 @@
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others whose A is a narrow band, start with `direct`. A program with a singular P
-is solved by `PROGRAM_BACKENDS`, one after the other. The result is the best impulse of all stages. Costs are estimated,
-never measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
+is solved by backends (`singular_programs.py`). The result is the best impulse of all stages. Costs are estimated, never
+measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
 starts only if its estimated cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of
 the time, or all of it if no factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain`
 the stages that would run. The decisions depend on these numbers (`decisions.py`):
@@ -36,28 +36,21 @@ the stages that would run. The decisions depend on these numbers (`decisions.py`
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 from math import inf, nan
 from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.deadline import NEVER, Deadline, Stopwatch, format_seconds
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import NEVER, Deadline, format_seconds
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
-    MAX_EXCUSED_RESIDUAL,
     combine_best_islands,
-    find_relative_at_zero,
-    get_zero_impulse_reference,
-    replace_stale_start,
-    residual,
-    reuse_or_judge_impulse,
 )
-from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers._accelerated import build_state_in_given_form
@@ -79,15 +72,15 @@ from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton import NewtonState
-from lavender.solvers.registry import Solver, SolverSpec, get, specs
+from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solvers.small import (
     AUTO,
     NO_TIME_MESSAGE,
-    NO_WORK_MESSAGES,
-    describe_stages,
     get_call_time_fraction,
 )
-from lavender.solving.loop import Loop, Record
+from lavender.solving.log import Recorder, SolveLog, get_relaxation
+from lavender.solving.loop import Loop
+from lavender.solving.singular_programs import program_backends, run_program_backends
 from lavender_ext.judge.measure import all_finite, residuals_by_island
 
 assert __doc__ is not None
@@ -101,30 +94,21 @@ ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
 MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
-# Solvers of quadratic programs with a singular P, which are tried in this order if they are installed; osqp always is.
-PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
-MIN_PREDICTED_RESIDUAL = (
-    1e-16  # Predictions of remaining sweeps replace a smaller tol by this relative residual.
-)
-ITERATION_TIME_PER_COST = (
-    4e-9  # [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
-)
-FIRST_SWEEPS_OF_LARGE_PROBLEM = (
-    8  # Sweeps of `is_large` problems before the first prediction of how many remain.
-)
-FIRST_RELAXED_FACTORISATIONS = (
-    6  # Interior points on the relaxation need at least this number of factorisations.
-)
+# Predictions of remaining sweeps replace a smaller tol by this relative residual.
+MIN_PREDICTED_RESIDUAL = 1e-16
+# [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
+ITERATION_TIME_PER_COST = 4e-9
+# Sweeps of `is_large` problems before the first prediction of how many remain.
+FIRST_SWEEPS_OF_LARGE_PROBLEM = 8
+# Interior points on the relaxation need at least this number of factorisations.
+FIRST_RELAXED_FACTORISATIONS = 6
 # Interior points on the relaxation continue to this multiple of tol, because Coulomb's law has a larger residual.
 RELAXED_TOLERANCE = 0.01
-FORMATION_COST_RATIO = (
-    4.0  # Sweeps use a formed A only if at least this multiple of the cost to form it remains.
-)
-MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
-SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
+# Sweeps use a formed A only if at least this multiple of the cost to form it remains.
+FORMATION_COST_RATIO = 4.0
 #: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
@@ -137,9 +121,6 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "admm from zero": ("admm", {}),
     "newton on the relaxation": ("newton", {}),
 }
-RELAXATION_KEY = (
-    "lavender.solving.auto: relaxation"  # Key in `Derived.cache` of the problem's convex relaxation.
-)
 
 
 def make_solver(name: str, problem: Problem) -> Any:
@@ -165,254 +146,6 @@ def starts_relaxed(problem: Problem) -> bool:
     """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large."""
     large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
     return large and not problem.cones.has_round and problem.is_symmetric
-
-
-def get_relaxation(problem: Problem) -> Problem:
-    """Return the convex relaxation over the same arrays and references; it is cached with the problem."""
-    relaxed: Problem | None = problem.derived.cache.get(RELAXATION_KEY)
-    if relaxed is None:
-        relaxed = problem.relaxed("cone")
-        get_zero_impulse_reference(problem)
-        relaxed.metric.share_reference(problem.metric)
-        problem.derived.cache[RELAXATION_KEY] = relaxed
-    return relaxed
-
-
-# -- the log of one solve --------------------------------------------------------------------------
-
-
-class SolveLog:
-    """Stages that ran on a problem, their work, the best impulse and the deadline."""
-
-    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
-        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
-        self.interrupted = False
-        self.failure = ""  # Message of the last arithmetic error.
-        self.remark = ""  # Message of the solve of some islands.
-        self.timed_out = (
-            False  # A stage was left out or ended early, because the remaining time was too short.
-        )
-        # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
-        self.best, self.impulse = inf, problem._start
-        self.judged: Any = None
-        # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
-        self.result = problem._start
-        self.stages: list[SolverStage] = []
-        self.work: dict[str, int] = {}
-        self.iterations = 0
-        self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
-        # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
-        self.direction: FloatArray | None = None
-        self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
-        self.recorder: Recorder | None = None  # Writes the history if one is requested.
-
-    def start_from_better_impulse(self, start: FloatArray) -> None:
-        """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
-        get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
-        start = start.copy()
-        replace_stale_start(self.problem, start)
-        self.judge_and_store_best(start, is_start=True)
-
-    def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
-        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
-
-        `judged` is the judge's result if it is known. If `is_start` is true, the impulse also sets an upper bound of
-        the relative residual of each island of `result`.
-        """
-        relative = find_relative_at_zero(self.problem, impulse)
-        is_known = relative is not None and self.result is self.problem._start
-        if relative is None:
-            last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
-            relative, impulse = float(last.relative), last.impulse
-            if relative < self.best:
-                self.judged = last
-        if relative < self.best:
-            self.best, self.impulse = relative, impulse.copy()
-        if self.best > self.tol and not is_known:
-            starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
-            self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
-
-    def compare_with_relaxation(self, impulse: FloatArray) -> float:
-        """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.
-
-        The ratio is the largest of all islands that are not solved; 0 if all are solved.
-        """
-        problems = self.problem, get_relaxation(self.problem)
-        exact, relaxed = (residuals_by_island(p.metric, impulse)[1] for p in problems)
-        unsolved = exact[:, 0] > self.tol
-        return float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
-
-    def record_stage(self, name: str, claim: Claim, before: float) -> None:
-        """Record a stage that has ended; the relative residual before it was `before`."""
-        stage = SolverStage(name, dict(claim.work), before, self.best)
-        is_proof = (
-            claim.certificate is not None
-            and check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None
-        )
-        self._add_claim(claim, (stage,), claim.certificate, is_proof)
-
-    def record_part(self, claim: Claim, rows: IntArray) -> None:
-        """Record the claim of a solve of some islands, with these row numbers."""
-        remark = claim.message.removeprefix(describe_stages(claim.stages)).removeprefix("; ")
-        if claim.status is Status.NUMERICAL_ERROR:
-            self.failure = remark
-        elif claim.stages:
-            self.remark = remark
-        direction = None
-        if claim.certificate is not None:
-            direction = np.zeros(self.problem.m)
-            direction[rows] = claim.certificate
-        self._add_claim(claim, claim.stages, direction, claim.status is Status.INFEASIBLE)
-
-    def _add_claim(
-        self, claim: Claim, stages: Iterable[SolverStage], direction: FloatArray | None, is_proof: bool
-    ) -> None:
-        """Add the work, the stages and the direction (m,) of a claim."""
-        self.iterations += claim.iterations
-        self.work = sum_work_counts((self.work, claim.work))
-        self.stages += stages
-        if is_proof:
-            self.certificate = direction
-        elif direction is not None:
-            self.direction = direction
-        if claim.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-
-    @property
-    def remaining_iterations(self) -> int:
-        """Number of iterations that the budget still allows."""
-        return self.budget - self.iterations
-
-    @property
-    def time_left(self) -> float | None:
-        """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
-        return self.deadline.get_remaining_seconds(1e-5)
-
-    @property
-    def last_stage_failed(self) -> bool:
-        """Whether the last stage did not reduce the residual."""
-        return bool(self.stages) and self.best >= self.stages[-1].before
-
-    def done(self) -> bool:
-        """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""
-        return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
-
-    def is_at_floor(self) -> bool:
-        """Return whether rounding explains the best residual: no solver can be expected to reach the tolerance."""
-        if self.best > MAX_EXCUSED_RESIDUAL:
-            return False
-        self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
-        return bool(self.judged.above_floor <= self.tol)
-
-    @property
-    def status(self) -> Status:
-        """Status of the solve so far."""
-        if self.certificate is not None:
-            return Status.INFEASIBLE
-        if self.best <= self.tol:
-            return Status.CONVERGED
-        if self.is_at_floor():
-            return Status.ROUNDOFF_LIMIT
-        if self.deadline.has_passed():
-            return Status.TIME_LIMIT
-        if self.remaining_iterations <= 0:
-            return Status.MAX_ITERATIONS
-        return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
-
-    def make_claim(self) -> Claim:
-        """Return the claim of the complete solve."""
-        status = self.status
-        if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
-            status = Status.TIME_LIMIT
-        no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
-        no_work = NO_WORK_MESSAGES.get(status, no_work)
-        messages = [
-            describe_stages(self.stages) or ("" if self.failure else no_work),
-            self.failure,
-            self.remark,
-        ]
-        if self.conflict is not None and self.best > self.tol:
-            if self.certificate is None:
-                messages.append("of the convex relaxation, " + self.conflict.proof.message)
-            messages.append(self.conflict.advice)
-        return Claim(
-            Status.INTERRUPTED if self.interrupted else status,
-            self.iterations,
-            self.work,
-            "; ".join(filter(None, messages)),
-            certificate=self.direction if self.certificate is None else self.certificate,
-            stages=tuple(self.stages),
-            judged=self.judged,
-        )
-
-
-@dataclass
-class Recorder:
-    """Writes the history of one solve: the residual after each recorded iteration of each stage.
-
-    A stage of sweeps or of another resumable solver is recorded after 1, 2, ..., 16 iterations of the stage, and then
-    each time after an eighth more. Newton's method and `direct` are recorded at the end of their stage. The compiled
-    call is repeated with smaller limits of its estimated cost, since it returns the iterate at the limit. `solve` is
-    the loop of the solve, which holds the records. Recording does not change the result.
-    """
-
-    solve: Loop
-    watch: Stopwatch = field(default_factory=Stopwatch)
-
-    @property
-    def records(self) -> list[Record]:
-        """The records so far."""
-        assert self.solve.records is not None
-        return self.solve.records
-
-    @property
-    def time(self) -> float:
-        """Time of the solve without recording [s]."""
-        return self.watch.elapsed_seconds - self.solve.recording_time
-
-    def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
-        """Append the records with more iterations than the last one."""
-        for record in records:
-            if not self.records or record[0] > self.records[-1][0]:
-                self.records.append(record)
-                self.solve.record_solvers.append(solver)
-
-    def record_impulse(
-        self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
-    ) -> None:
-        """Record an impulse (m,) [N s] after this number of iterations of all stages."""
-        time, watch = self.time if time is None else time, Stopwatch()
-        r = residual(self.solve.problem, impulse, "float64")
-        self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
-        self.solve.recording_time += watch.elapsed_seconds
-
-    def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
-        """Append the records of a loop that began at this number of iterations and this time [s]."""
-        self.solve.recording_time += loop.recording_time
-        records = loop.records or ()
-        self.append_later_records(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records])
-
-    def record_compiled_call(self, start: FloatArray, tol: float, claim: Claim) -> None:
-        """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
-        call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
-        problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
-        before = self.solve.recording_time
-        while claim.iterations > self.records[-1][0]:
-            watch = Stopwatch()
-            result, counts = AUTO.solve_and_judge(problem, start, tol, cost)
-            seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
-            if result is not None:
-                part = AUTO.make_claim(problem, counts, start, result.relative)
-                if part.iterations <= claim.iterations:
-                    name = part.stages[-1].solver if part.stages else "auto"
-                    self.record_impulse(name, part.iterations, result.impulse, seconds)
-                if result.relative <= tol:
-                    break
-            cost *= SAMPLED_COST_RATIO
-        self.solve.recording_time = before + excluded.elapsed_seconds
-
-
-# -- the steps of the stages -----------------------------------------------------------------------
 
 
 class Step:
@@ -665,9 +398,6 @@ STEPS = {
 }  # fmt: skip
 
 
-# -- the decisions ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Stage:
     """One stage of the tree."""
@@ -797,8 +527,6 @@ class DecisionTree:
         """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
         return self.newton if self.newton < inf else self.first
 
-    # -- time limits: no stage of a factorising solver starts if it is expected to end after the deadline
-
     @property
     def is_late(self) -> bool:
         """Whether no factorising solver can return a result before the deadline."""
@@ -842,8 +570,6 @@ class DecisionTree:
         if step.state is not None:
             return True
         return self.deadline.fits(estimate_cost(stage.solver, self.problem).setup / DECISIONS.time_share)
-
-    # -- the stages
 
     @cached_property
     def factorises_first(self) -> bool:
@@ -973,17 +699,12 @@ class DecisionTree:
         return Stage("anderson", cost / self.sweep, cost, why, max_remaining / self.sweep)
 
 
-# -- the solver ------------------------------------------------------------------------------------
-
-
 @dataclass
 class AutoState:
     """State of one solve."""
 
     problem: Problem
-    failed_call: tuple[int, ...] | None = (
-        None  # Counts of a compiled call that has failed; None without a call.
-    )
+    failed_call: tuple[int, ...] | None = None  # Counts of a compiled call that has failed.
     loop: Loop | None = None  # Loop of the solve, if it records a history.
     first_stage: int = 1  # Position of the first stage that has not run on a problem with more islands.
 
@@ -1157,58 +878,6 @@ def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
         step.state = tree.states[name]
         step.started_from_zero = name == "newton" and tree.started_from_zero
     return step
-
-
-# -- programs with a singular P --------------------------------------------------------------------
-
-
-def program_backends() -> list[SolverSpec]:
-    """Return the specs of the installed `PROGRAM_BACKENDS`."""
-    return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]
-
-
-@np.errstate(all="ignore")  # Results that overflow are judged.
-def run_program_backends(log: SolveLog, impulse: FloatArray) -> Claim:
-    """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
-
-    If no backend reaches tol, the result with the smallest error of the program is returned.
-    """
-    problem, tol, start = log.problem, log.tol, impulse.copy()
-    log.judge_and_store_best(impulse)
-    error, best = program_error(problem, log.impulse), log.impulse
-    try:
-        for spec in program_backends():
-            if log.done() and (log.status is not Status.ROUNDOFF_LIMIT or error <= tol):
-                break
-            solver, before, trial = spec.load()(), log.best, start.copy()
-            state = solver.prepare(problem)
-            claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
-            log.judge_and_store_best(trial)
-            log.record_stage(spec.name, claim, before)
-            for result in (trial, log.impulse if log.best <= tol else log.result):
-                if program_error(problem, result) < error:
-                    error, best = program_error(problem, result), result.copy()
-            if tol == 0.0:
-                break
-        if error > tol > 0.0 and not log.done():
-            certify_by_linear_programs(log)
-    except KeyboardInterrupt:
-        log.interrupted = True
-    except BREAKDOWN as failure:
-        log.failure = format_error(failure)
-    claim = log.make_claim()
-    impulse[:] = log.impulse if log.best <= tol else best
-    if log.best > tol and claim.status is Status.ROUNDOFF_LIMIT:
-        return replace(
-            claim, status=Status.STALLED
-        )  # That status belongs to the impulse with the best residual.
-    return claim
-
-
-def program_error(problem: Problem, impulse: FloatArray) -> float:
-    """Return `QPSolution.error` of x and the multipliers (n + m,); inf if it is not a number."""
-    error = float(problem.qp.solution(impulse).error)
-    return error if error == error else inf
 
 
 SPEC = SolverSpec(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from lavender.solvers.small import get_call_time_fraction
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
 from lavender_ext.judge.measure import all_finite
-
-if TYPE_CHECKING:
-    pass
 
 COST_PER_SECOND = 0.9e9  # [ns/s] Estimated cost that a compiled call may have per second of its time limit.
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"

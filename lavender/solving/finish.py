@@ -60,34 +60,20 @@ CONTRADICTING_IMPULSE_RATIO = 100.0
 
 
 class FinishedRun(NamedTuple):
-    """One run of a solver: the arguments, the impulse and the claim that it returned, and the time that it took.
-
-    Parameters
-    ----------
-    problem : Problem
-    spec : SolverSpec
-    options : dict
-    impulse : (m,) N s
-    claim : Claim
-    tol : float, -
-    setup_time, solve_time : float, s
-    history : History, optional
-    sweeps_per_decade : float
-    refutation : str
-        Empty unless the caller knows that the claim is false: it describes a solution that was found although the
-        solver claims that none exists, or the residual of the solver's own impulse if that was replaced.
-    """
+    """One run of a solver: the arguments, the impulse and the claim that it returned, and the time that it took."""
 
     problem: Problem
     spec: SolverSpec
     options: dict[str, Any]
-    impulse: FloatArray
+    impulse: FloatArray  # (m,) [N s]
     claim: Claim
     tol: float
-    setup_time: float = 0.0
-    solve_time: float = 0.0
+    setup_time: float = 0.0  # [s]
+    solve_time: float = 0.0  # [s]
     history: History | None = None
     sweeps_per_decade: float = math.nan
+    # Empty unless the caller knows that the claim is false: it describes a solution that was found although the solver
+    # claims that none exists, or the residual of the solver's own impulse if that was replaced.
     refutation: str = ""
 
 
@@ -103,23 +89,12 @@ class Verdict(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """One row of `RULES`.
-
-    Parameters
-    ----------
-    claims : set of Status
-    applies : callable (run, judged) -> bool
-        The judge's finding to which the rule refers.
-    status : Status
-        Status that replaces a claim in `claims` if the rule applies.
-    message : str
-        Reason, which is appended to the solver's message; "{floor}" is the round-off floor.
-    """
+    """One row of `RULES`: a claim in `claims` is replaced by `status` if the judge's finding `applies`."""
 
     claims: tuple[Status, ...]
     applies: Callable[[FinishedRun, Residual], bool]
     status: Status
-    message: str = ""
+    message: str = ""  # Reason, which is appended to the solver's message; "{floor}" is the round-off floor.
 
 
 def _hides_b(run: FinishedRun, judged: Residual) -> bool:

@@ -55,58 +55,27 @@ EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 
 @dataclass
 class Loop:
-    """Loop around one solver's `run`, with chunks, clock, history and Ctrl-C.
-
-    Parameters
-    ----------
-    problem : Problem
-    solver : Solver
-    state : object
-        State of the solver.
-    impulse : (m,) N s
-        Start; replaced by the result in place.
-    tol : float, -
-    deadline : Deadline, optional
-    callback : callable, optional
-    records : list, optional
-        List to which the records of the history are appended.
-    record_solvers : list of str
-        Solver of each record, if the records are made by `auto`.
-    time : float, s
-        Time of the solver, without the judge.
-    recording_time : float, s
-        Time of the judge for the records.
-    done : int
-        Number of iterations so far.
-    work : dict
-        Work so far, as in `Claim`.
-    broken : bool
-        Whether the solver raised an arithmetic error.
-    next_record : int
-        Number of iterations at which the next record is made.
-    pace : float, s
-        Estimated upper bound of the time of an iteration; inf if it is unknown, and the first chunk measures it.
-    judged : lavender_ext.judge.measure.Judged, optional
-        The judge's last pass over a result.
-    """
+    """Loop around one solver's `run`, with chunks, clock, history and Ctrl-C."""
 
     problem: Problem
     solver: Any
-    state: Any
-    impulse: FloatArray
+    state: Any  # State of the solver.
+    impulse: FloatArray  # Start (m,) [N s]; replaced by the result in place.
     tol: float
     deadline: Deadline | None = None
     callback: Callback | None = None
-    records: list[Record] | None = None
-    record_solvers: list[str] = field(default_factory=list)
-    time: float = 0.0
-    recording_time: float = 0.0
-    done: int = 0
-    work: Mapping[str, int] = field(default_factory=dict)
-    broken: bool = False
-    next_record: int = 0
-    pace: float = inf
-    judged: Any = None
+    records: list[Record] | None = None  # The history; None if it is not requested.
+    record_solvers: list[str] = field(
+        default_factory=list
+    )  # Solver of each record, if `auto` makes the records.
+    time: float = 0.0  # [s] Time of the solver, without the judge.
+    recording_time: float = 0.0  # [s] Time of the judge for the records.
+    done: int = 0  # Number of iterations so far.
+    work: Mapping[str, int] = field(default_factory=dict)  # Work so far, as in `Claim`.
+    broken: bool = False  # Whether the solver raised an arithmetic error.
+    next_record: int = 0  # Number of iterations at which the next record is made.
+    pace: float = inf  # [s] Upper bound of the time of an iteration; inf if the first chunk measures it.
+    judged: Any = None  # The judge's last pass over a result.
 
     def run_in_one_call(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""

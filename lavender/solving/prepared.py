@@ -113,61 +113,35 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
 
 
 class SolveArguments(NamedTuple):
-    """Checked arguments of one solve (`check_arguments`).
+    """Checked arguments of one solve (`check_arguments`)."""
 
-    Parameters
-    ----------
-    impulse : array-like (m,) N s, optional
-        Start; it is checked with the problem that it belongs to.
-    tol : float, -
-    max_iter : int
-    deadline : Deadline, optional
-    history : bool
-    callback : callable, optional
-    failed_call : tuple of int, optional
-        Work counts of a compiled call that has failed; None if no call was made.
-    """
-
-    impulse: Any
+    impulse: Any  # Start (m,) [N s] or None; it is checked with the problem that it belongs to.
     tol: float
     max_iter: int
     deadline: Deadline | None = None
     history: bool = False
     callback: Callback | None = None
-    failed_call: tuple[int, ...] | None = None
+    failed_call: tuple[int, ...] | None = None  # Work counts of a compiled call that has failed.
 
 
 class SetUp:
-    """State of `Prepared` with a solver that is set up for its problem.
-
-    Attributes
-    ----------
-    solver : Solver
-    state : object
-        Result of the solver's `prepare` or `update`.
-    is_used : bool
-        Whether a solve has used the state, so that the next solve has to update it.
-    """
+    """State of `Prepared` with a solver that is set up for its problem."""
 
     __slots__ = ("is_used", "solver", "state")
 
     def __init__(self, solver: Solver, state: Any) -> None:
-        self.solver, self.state, self.is_used = solver, state, False
+        self.solver, self.state = (
+            solver,
+            state,
+        )  # `state` is the result of the solver's `prepare` or `update`.
+        self.is_used = False  # Whether a solve has used the state, so that the next solve has to update it.
 
 
 class NotSetUp(NamedTuple):
-    """State of `Prepared` without a solver that is set up: it is set up by the next solve.
+    """State of `Prepared` without a solver that is set up: the next solve sets it up."""
 
-    Parameters
-    ----------
-    failure : str
-        Arithmetic error that ended the last set-up; empty if there was none.
-    is_late : bool
-        Whether the set-up was left out because it would have ended after the deadline.
-    """
-
-    failure: str = ""
-    is_late: bool = False
+    failure: str = ""  # Arithmetic error that ended the last set-up; empty if there was none.
+    is_late: bool = False  # Whether the set-up was left out because it would have ended after the deadline.
 
 
 class Prepared:

@@ -27,7 +27,8 @@ from lavender import registry
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
-from lavender.solving.auto import DecisionTree, SolveLog, create_solver_step
+from lavender.solving.auto import DecisionTree, create_solver_step
+from lavender.solving.log import SolveLog
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.pivot.lemke import Lemke
 

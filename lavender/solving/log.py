@@ -1,0 +1,274 @@
+"""Log of one solve by `auto`: the best impulse, the stages that ran, the deadline, and the history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import NEVER, Deadline, Stopwatch
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import (
+    MAX_EXCUSED_RESIDUAL,
+    combine_best_islands,
+    find_relative_at_zero,
+    get_zero_impulse_reference,
+    replace_stale_start,
+    residual,
+    reuse_or_judge_impulse,
+)
+from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
+from lavender.problem import Problem
+from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
+from lavender.solving.loop import Loop, Record
+from lavender_ext.judge.measure import residuals_by_island
+
+MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
+SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
+# Key in `Derived.cache` of the problem's convex relaxation.
+RELAXATION_KEY = "lavender.solving.log: relaxation"
+
+
+def get_relaxation(problem: Problem) -> Problem:
+    """Return the convex relaxation over the same arrays and references; it is cached with the problem."""
+    relaxed: Problem | None = problem.derived.cache.get(RELAXATION_KEY)
+    if relaxed is None:
+        relaxed = problem.relaxed("cone")
+        get_zero_impulse_reference(problem)
+        relaxed.metric.share_reference(problem.metric)
+        problem.derived.cache[RELAXATION_KEY] = relaxed
+    return relaxed
+
+
+class SolveLog:
+    """Stages that ran on a problem, their work, the best impulse and the deadline."""
+
+    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
+        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
+        self.interrupted = False
+        self.failure = ""  # Message of the last arithmetic error.
+        self.remark = ""  # Message of the solve of some islands.
+        # A stage was left out or ended early, because the remaining time was too short.
+        self.timed_out = False
+        # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
+        self.best, self.impulse = inf, problem._start
+        self.judged: Any = None
+        # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
+        self.result = problem._start
+        self.stages: list[SolverStage] = []
+        self.work: dict[str, int] = {}
+        self.iterations = 0
+        self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
+        # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
+        self.direction: FloatArray | None = None
+        self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
+        self.recorder: Recorder | None = None  # Writes the history if one is requested.
+
+    def start_from_better_impulse(self, start: FloatArray) -> None:
+        """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
+        get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
+        start = start.copy()
+        replace_stale_start(self.problem, start)
+        self.judge_and_store_best(start, is_start=True)
+
+    def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
+        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
+
+        `judged` is the judge's result if it is known. If `is_start` is true, the impulse also sets an upper bound of
+        the relative residual of each island of `result`.
+        """
+        relative = find_relative_at_zero(self.problem, impulse)
+        is_known = relative is not None and self.result is self.problem._start
+        if relative is None:
+            last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
+            relative, impulse = float(last.relative), last.impulse
+            if relative < self.best:
+                self.judged = last
+        if relative < self.best:
+            self.best, self.impulse = relative, impulse.copy()
+        if self.best > self.tol and not is_known:
+            starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
+            self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
+
+    def compare_with_relaxation(self, impulse: FloatArray) -> float:
+        """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.
+
+        The ratio is the largest of all islands that are not solved; 0 if all are solved.
+        """
+        problems = self.problem, get_relaxation(self.problem)
+        exact, relaxed = (residuals_by_island(p.metric, impulse)[1] for p in problems)
+        unsolved = exact[:, 0] > self.tol
+        return float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
+
+    def record_stage(self, name: str, claim: Claim, before: float) -> None:
+        """Record a stage that has ended; the relative residual before it was `before`."""
+        stage = SolverStage(name, dict(claim.work), before, self.best)
+        is_proof = (
+            claim.certificate is not None
+            and check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None
+        )
+        self._add_claim(claim, (stage,), claim.certificate, is_proof)
+
+    def record_part(self, claim: Claim, rows: IntArray) -> None:
+        """Record the claim of a solve of some islands, with these row numbers."""
+        remark = claim.message.removeprefix(describe_stages(claim.stages)).removeprefix("; ")
+        if claim.status is Status.NUMERICAL_ERROR:
+            self.failure = remark
+        elif claim.stages:
+            self.remark = remark
+        direction = None
+        if claim.certificate is not None:
+            direction = np.zeros(self.problem.m)
+            direction[rows] = claim.certificate
+        self._add_claim(claim, claim.stages, direction, claim.status is Status.INFEASIBLE)
+
+    def _add_claim(
+        self, claim: Claim, stages: Iterable[SolverStage], direction: FloatArray | None, is_proof: bool
+    ) -> None:
+        """Add the work, the stages and the direction (m,) of a claim."""
+        self.iterations += claim.iterations
+        self.work = sum_work_counts((self.work, claim.work))
+        self.stages += stages
+        if is_proof:
+            self.certificate = direction
+        elif direction is not None:
+            self.direction = direction
+        if claim.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+
+    @property
+    def remaining_iterations(self) -> int:
+        """Number of iterations that the budget still allows."""
+        return self.budget - self.iterations
+
+    @property
+    def time_left(self) -> float | None:
+        """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
+        return self.deadline.get_remaining_seconds(1e-5)
+
+    @property
+    def last_stage_failed(self) -> bool:
+        """Whether the last stage did not reduce the residual."""
+        return bool(self.stages) and self.best >= self.stages[-1].before
+
+    def done(self) -> bool:
+        """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""
+        return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
+
+    def is_at_floor(self) -> bool:
+        """Return whether rounding explains the best residual: no solver can be expected to reach the tolerance."""
+        if self.best > MAX_EXCUSED_RESIDUAL:
+            return False
+        self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
+        return bool(self.judged.above_floor <= self.tol)
+
+    @property
+    def status(self) -> Status:
+        """Status of the solve so far."""
+        if self.certificate is not None:
+            return Status.INFEASIBLE
+        if self.best <= self.tol:
+            return Status.CONVERGED
+        if self.is_at_floor():
+            return Status.ROUNDOFF_LIMIT
+        if self.deadline.has_passed():
+            return Status.TIME_LIMIT
+        if self.remaining_iterations <= 0:
+            return Status.MAX_ITERATIONS
+        return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
+
+    def make_claim(self) -> Claim:
+        """Return the claim of the complete solve."""
+        status = self.status
+        if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
+            status = Status.TIME_LIMIT
+        no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
+        no_work = NO_WORK_MESSAGES.get(status, no_work)
+        messages = [
+            describe_stages(self.stages) or ("" if self.failure else no_work),
+            self.failure,
+            self.remark,
+        ]
+        if self.conflict is not None and self.best > self.tol:
+            if self.certificate is None:
+                messages.append("of the convex relaxation, " + self.conflict.proof.message)
+            messages.append(self.conflict.advice)
+        return Claim(
+            Status.INTERRUPTED if self.interrupted else status,
+            self.iterations,
+            self.work,
+            "; ".join(filter(None, messages)),
+            certificate=self.direction if self.certificate is None else self.certificate,
+            stages=tuple(self.stages),
+            judged=self.judged,
+        )
+
+
+@dataclass
+class Recorder:
+    """Writes the history of one solve: the residual after each recorded iteration of each stage.
+
+    A stage of sweeps or of another resumable solver is recorded after 1, 2, ..., 16 iterations of the stage, and then
+    each time after an eighth more. Newton's method and `direct` are recorded at the end of their stage. The compiled
+    call is repeated with smaller limits of its estimated cost, since it returns the iterate at the limit. `solve` is
+    the loop of the solve, which holds the records. Recording does not change the result.
+    """
+
+    solve: Loop
+    watch: Stopwatch = field(default_factory=Stopwatch)
+
+    @property
+    def records(self) -> list[Record]:
+        """The records so far."""
+        assert self.solve.records is not None
+        return self.solve.records
+
+    @property
+    def time(self) -> float:
+        """Time of the solve without recording [s]."""
+        return self.watch.elapsed_seconds - self.solve.recording_time
+
+    def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
+        """Append the records with more iterations than the last one."""
+        for record in records:
+            if not self.records or record[0] > self.records[-1][0]:
+                self.records.append(record)
+                self.solve.record_solvers.append(solver)
+
+    def record_impulse(
+        self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
+    ) -> None:
+        """Record an impulse (m,) [N s] after this number of iterations of all stages."""
+        time, watch = self.time if time is None else time, Stopwatch()
+        r = residual(self.solve.problem, impulse, "float64")
+        self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
+        self.solve.recording_time += watch.elapsed_seconds
+
+    def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
+        """Append the records of a loop that began at this number of iterations and this time [s]."""
+        self.solve.recording_time += loop.recording_time
+        records = loop.records or ()
+        self.append_later_records(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records])
+
+    def record_compiled_call(self, start: FloatArray, tol: float, claim: Claim) -> None:
+        """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
+        call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
+        problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
+        before = self.solve.recording_time
+        while claim.iterations > self.records[-1][0]:
+            watch = Stopwatch()
+            result, counts = AUTO.solve_and_judge(problem, start, tol, cost)
+            seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
+            if result is not None:
+                part = AUTO.make_claim(problem, counts, start, result.relative)
+                if part.iterations <= claim.iterations:
+                    name = part.stages[-1].solver if part.stages else "auto"
+                    self.record_impulse(name, part.iterations, result.impulse, seconds)
+                if result.relative <= tol:
+                    break
+            cost *= SAMPLED_COST_RATIO
+        self.solve.recording_time = before + excluded.elapsed_seconds
