@@ -73,7 +73,7 @@ class ImpulseState(SweepState):
 class SequentialImpulses(Sweeping):
     """Matrix-free projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _get_formation_time(self, problem: Problem) -> float:
+    def _estimate_formation_cost(self, problem: Problem) -> float:
         return 0.0
 
     def _build_state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:

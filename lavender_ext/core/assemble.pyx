@@ -6,6 +6,7 @@ Blocks that share a body are found from the list of blocks of each body. Entries
 A_rc is computed once, for r <= c, so that A is symmetric to the bit.
 """
 from libc.stdint cimport INT32_MAX, int32_t, int64_t
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -13,9 +14,9 @@ from lavender_ext.core.csr cimport transpose_csr
 from lavender_ext.core.faults cimport NO_FAULT, find_matrix_fault
 from lavender_ext.core.mass cimport THIN_PADDING, compress_dense_rows
 from lavender_ext.core.validate cimport has_invalid_number
-from lavender_ext.core.block_types cimport blocks_t, count_tangent_rows, count_angular_rows
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport form_contact_jacobian, dot6, multiply_inverse_mass
+from lavender_ext.core.rows cimport dot6, get_block_jacobian, multiply_inverse_mass
 from lavender_ext.core.view cimport get_block_bodies, get_moving_body, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
@@ -23,20 +24,17 @@ cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
     """Write J and M^-1 J^T (m, 12) of every row, in the layout of joint rows: linear and angular on body a, then on body b."""
-    cdef int32_t i, j, k, c, a, b, end
+    cdef int32_t i, j, k
+    cdef const int32_t* bodies
+    cdef const double* rows
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        end = p.ptr[i + 1]
-        a = get_block_bodies(r, i)[0]
-        b = get_block_bodies(r, i)[1]
+        bodies = get_block_bodies(r, i)
+        rows = get_block_jacobian(p, r, i, jac + 12 * j)
         if i < r.n_joints:
-            for k in range(12 * j, 12 * end):
-                jac[k] = r.jac[k]
-        else:
-            c = i - r.n_joints
-            form_contact_jacobian(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), jac + 12 * j)
-        for k in range(j, end):
-            multiply_inverse_mass(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
+            memcpy(jac + 12 * j, rows, 12 * (p.ptr[i + 1] - j) * sizeof(double))
+        for k in range(j, p.ptr[i + 1]):
+            multiply_inverse_mass(jac + 12 * k, r.inv_mass, r.inv_inertia, bodies[0], bodies[1], minv_jac + 12 * k)
 
 
 cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,

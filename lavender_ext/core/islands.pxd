@@ -153,8 +153,3 @@ cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noex
         index[k + i] = i
     index[2 * k], index[2 * k + 1] = 0, k
     out.n, out.label, out.order, out.ptr = 1, index, index + k, index + 2 * k
-
-
-cdef inline int32_t first_row_of_island(const blocks_t* p, int32_t island) noexcept nogil:
-    """Return the first row of an island."""
-    return p.ptr[p.islands.order[p.islands.ptr[island]]]

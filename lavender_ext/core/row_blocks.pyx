@@ -16,6 +16,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, ndarray
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.core.validate cimport is_valid_number, min_magnitude
+from lavender_ext.core.vectors cimport copy3, scale3, subtract3
 
 #: Types of blocks by number; the number is the highest part of a key.
 BLOCK_TYPES = ("hinge", "ball", "weld", "slider", "distance", "motor", "limit", "spring", "gear", "contact")
@@ -79,18 +80,6 @@ cdef inline double norm(const double* x) noexcept nogil:
         return 0.0
     root = sqrt(total)
     return root + (fma(-root, root, total) + error) / (2.0 * root)
-
-
-cdef inline void scale(double factor, const double* x, double* out) noexcept nogil:
-    cdef int32_t k
-    for k in range(3):
-        out[k] = factor * x[k]
-
-
-cdef inline void subtract(const double* x, const double* y, double* out) noexcept nogil:
-    cdef int32_t k
-    for k in range(3):
-        out[k] = x[k] - y[k]
 
 
 cdef inline bint normalise(const double* x, double* out) noexcept nogil:
@@ -219,7 +208,7 @@ cdef class RowBlocks:
         if body < 0:
             memset(out, 0, 3 * sizeof(double))
         else:
-            subtract(point, self.centres + 3 * body, out)
+            subtract3(point, self.centres + 3 * body, out)
 
     cdef row_t* append_linear_row(self, const arguments_t* x, const double* axis, const double* point_a,
                                   const double* point_b, double error) noexcept:
@@ -229,12 +218,12 @@ cdef class RowBlocks:
         if x.a >= 0:
             self.compute_arm(x.a, point_a, arm)
             cross(arm, axis, moment)
-            scale(-1.0, axis, row.jac)
-            scale(-1.0, moment, row.jac + 3)
+            scale3(-1.0, axis, row.jac)
+            scale3(-1.0, moment, row.jac + 3)
         if x.b >= 0:
             self.compute_arm(x.b, point_b, arm)
             cross(arm, axis, row.jac + 9)
-            scale(1.0, axis, row.jac + 6)
+            copy3(axis, row.jac + 6)
         return row
 
     cdef row_t* append_angular_row(self, const arguments_t* x, const double* axis_a, const double* axis_b,
@@ -242,16 +231,16 @@ cdef class RowBlocks:
         """Append axis_b.omega_b - axis_a.omega_a; its error is an angle [rad]."""
         cdef row_t* row = self.append_row(error)
         if x.a >= 0:
-            scale(-1.0, axis_a, row.jac + 3)
+            scale3(-1.0, axis_a, row.jac + 3)
         if x.b >= 0:
-            scale(1.0, axis_b, row.jac + 9)
+            copy3(axis_b, row.jac + 9)
         return row
 
     cdef void append_point_rows(self, const arguments_t* x) noexcept:
         """Append the rows that hold the second point on b at the first point on a."""
         cdef double[3] offset
         cdef int32_t k
-        subtract(x.vector[1], x.vector[0], offset)
+        subtract3(x.vector[1], x.vector[0], offset)
         for k in range(self.dimensions):
             self.append_linear_row(x, UNIT[k], x.vector[0], x.vector[1], offset[k])
 
@@ -266,18 +255,18 @@ cdef class RowBlocks:
         cdef double[3] offset
         if not (x.given[0] and x.given[1]):
             return False
-        subtract(x.vector[1], x.vector[0], offset)
+        subtract3(x.vector[1], x.vector[0], offset)
         size[0] = norm(offset)
         if size[0] > min_magnitude():
-            scale(1.0 / size[0], offset, direction)
+            scale3(1.0 / size[0], offset, direction)
         else:
-            scale(1.0, UNIT[1 if self.dimensions == 2 else 2], direction)
+            copy3(UNIT[1 if self.dimensions == 2 else 2], direction)
         return True
 
     cdef bint compute_rotation_axis(self, const arguments_t* x, int32_t which, double* out) noexcept:
         """Compute the unit vector of an axis of rotation, z in two dimensions; return whether the arguments are valid."""
         if self.dimensions == 2:
-            scale(1.0, UNIT[2], out)
+            copy3(UNIT[2], out)
             return not x.given[which]
         return x.given[which] and normalise(x.vector[which], out)
 
@@ -307,14 +296,14 @@ cdef class RowBlocks:
             if not x.given[0]:
                 return False
             if not x.given[1]:
-                scale(1.0, x.vector[0], x.vector[1])
+                copy3(x.vector[0], x.vector[1])
         if kind == BALL or kind == HINGE or kind == WELD:
             self.append_point_rows(x)
         if kind == HINGE:
             if not self.compute_rotation_axis(x, 2, first):
                 return False
             if not x.given[3]:
-                scale(1.0, first, second)
+                copy3(first, second)
             elif not self.compute_rotation_axis(x, 3, second):
                 return False
             if self.dimensions == 3:
@@ -329,7 +318,7 @@ cdef class RowBlocks:
         elif kind == SLIDER:
             if not (x.given[2] and x.given[3] and normalise(x.vector[2], x.vector[2])):
                 return False
-            subtract(x.vector[1], x.vector[0], error)
+            subtract3(x.vector[1], x.vector[0], error)
             if self.dimensions == 2:
                 cross(UNIT[2], x.vector[2], first)
             else:
@@ -380,11 +369,11 @@ cdef class RowBlocks:
             if not self.compute_rotation_axis(x, 0, first) or isnan(number[0]) or number[0] == 0.0 or isnan(number[1]):
                 return False
             if not x.given[1]:
-                scale(1.0, first, second)
+                copy3(first, second)
             elif not self.compute_rotation_axis(x, 1, second):
                 return False
-            scale(number[0], second, second)
-            scale(-1.0, first, first)
+            scale3(number[0], second, second)
+            scale3(-1.0, first, first)
             self.append_angular_row(x, first, second, number[1])
         return True
 
@@ -400,7 +389,7 @@ cdef class RowBlocks:
         size = norm(x.vector[1])
         if not fabs(size - 1.0) <= NORMAL_LENGTH_TOLERANCE:
             return False
-        scale(1.0 / size, x.vector[1], c.normal)
+        scale3(1.0 / size, x.vector[1], c.normal)
         c.a, c.b, c.mu = x.a, x.b, x.number[1]
         if self.dimensions == 2:
             if x.given[2]:
@@ -409,8 +398,8 @@ cdef class RowBlocks:
         elif x.given[2]:
             if not normalise(x.vector[2], moment):
                 return False
-            scale(dot3(moment, c.normal), c.normal, other)
-            subtract(moment, other, moment)
+            scale3(dot3(moment, c.normal), c.normal, other)
+            subtract3(moment, other, moment)
             if not norm(moment) >= NORMAL_LENGTH_TOLERANCE:
                 return False
             normalise(moment, c.tangent)

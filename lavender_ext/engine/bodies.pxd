@@ -16,7 +16,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
-from lavender_ext.engine.vectors cimport copy3, add_scaled3, matvec3
+from lavender_ext.core.vectors cimport copy3, add_scaled3, matvec3
 
 
 cdef inline void compute_rotation_matrix(const double* q, double* r) noexcept nogil:

@@ -39,7 +39,7 @@ from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_body
 from lavender_ext.engine.narrow_phase cimport collide_bodies, manifold_t
-from lavender_ext.engine.vectors cimport linear_combination3, copy3, subtract3
+from lavender_ext.core.vectors cimport linear_combination3, copy3, subtract3
 
 
 cdef inline uint64_t make_contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:

@@ -23,7 +23,7 @@ from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_world
-from lavender_ext.engine.vectors cimport copy3, subtract3, add_scaled3, scale3
+from lavender_ext.core.vectors cimport copy3, subtract3, add_scaled3, scale3
 
 
 cdef inline void rotate_direction_to_world(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:

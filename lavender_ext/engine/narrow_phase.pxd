@@ -22,7 +22,7 @@ from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
 from lavender_ext.engine.bodies cimport rotate_to_body, rotate_to_world
-from lavender_ext.engine.vectors cimport copy_column3, copy3, subtract3, add_scaled3, scale3
+from lavender_ext.core.vectors cimport copy_column3, copy3, subtract3, add_scaled3, scale3
 
 
 cdef struct manifold_t:

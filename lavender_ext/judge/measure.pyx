@@ -293,16 +293,6 @@ def are_bit_identical(const double[::1] x, const double[::1] y):
     return y.shape[0] == n and (n == 0 or memcmp(&x[0], &y[0], n * sizeof(double)) == 0)
 
 
-def score_slack_array(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
-    """Compute the error e of lam with the given slack w; return (energy, velocity, worst row, whether all are finite)."""
-    cdef score_t s = make_empty_score()
-    if p.blocks.n_rows == 0:
-        return 0.0, 0.0, -1, True
-    with nogil:
-        score_all_blocks(&p.blocks, &lam[0], &w[0], &e[0], &s)
-    return s.energy, s.velocity, s.worst, bool(s.finite)
-
-
 def store_zero_impulse_residual(Data p):
     """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only."""
     cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks

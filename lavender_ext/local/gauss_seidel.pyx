@@ -25,7 +25,7 @@ from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk_friction_con
 from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport apply_contact_impulse_changes_to_body
 from lavender_ext.core.row_forms cimport find_panel, row_form_t, compute_row_slack, set_row_impulse
-from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, form_contact_jacobian, compute_contact_velocity,
+from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, get_block_jacobian, compute_contact_velocity,
                                      cross, dot12,
                                      dot3, joint_row_velocity, multiply_inverse_mass, compute_relative_velocity)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
@@ -337,11 +337,8 @@ cdef inline void form_rows_diagonal_block(const blocks_t* p, const rows_t* r, in
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, c = i - r.n_joints
     cdef double jac[72]
     cdef double minv_jac_row[12]
-    cdef const double* row = r.jac + 12 * j
+    cdef const double* row = get_block_jacobian(p, r, i, jac)
     cdef const double* change
-    if c >= 0:
-        form_contact_jacobian(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), jac)
-        row = jac
     for k in range(n):
         change = r.minv_jac + 12 * (j + k)
         if c >= 0:

@@ -6,10 +6,10 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+from header import parse_struct_fields, strip_comments
 from vectors import METHODS, make_problem_view
 
 from lavender.export import HEADER
-from lavender.export.header import parse_struct_fields, strip_comments
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too

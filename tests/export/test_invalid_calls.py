@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clib import COUNTS, STRUCTS, SWEEPS, Options, Problem, Result, Verdict, functions
+from header import parse_enum_constants, parse_struct_fields
 from hypothesis import given
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
@@ -15,7 +16,6 @@ from vectors import ARRAYS, METHODS
 
 import lavender as lv
 from lavender.export import HEADER
-from lavender.export.header import parse_enum_constants, parse_struct_fields
 
 ERRORS = {
     value: name

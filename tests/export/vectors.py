@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from header import parse_enum_constants, parse_struct_fields
 
 import lavender as lv
 from lavender.base.errors import InputError
 from lavender.export import HEADER
-from lavender.export.header import parse_enum_constants, parse_struct_fields
 from lavender.solvers import registry
 from lavender.solving.auto import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES

@@ -268,3 +268,14 @@ print(lv.solve(problem, tol=1e-13, time_limit=0.2))
     before, after = python("-c", code).stdout.splitlines()
     assert "import scipy.linalg.lapack, scipy.sparse before" in before
     assert "scipy" not in after
+
+
+def test_set_up_of_sequential_impulses_is_estimated_without_forming_a():
+    builder = lv.RowBuilder(
+        np.ones(50), np.tile(np.eye(3), (50, 1, 1)), np.zeros((50, 6)), 0.01, np.zeros((50, 3))
+    )
+    pairs = np.column_stack([np.arange(50) - 1, np.arange(50)])
+    builder.contacts(pairs, np.arange(150.0).reshape(50, 3), (0.0, 0.0, 1.0), mu=0.5)
+    problem = builder.problem()
+    assert registry.get("sequential_impulses").load()().cost(problem).setup == 0.0
+    assert registry.get("jacobi").load()().cost(problem).setup > 0.0

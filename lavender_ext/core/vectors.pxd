@@ -1,5 +1,4 @@
 """Arithmetic of 3-vectors, complementing `dot3` and `cross` of core/rows.pxd; `out` may alias an argument."""
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.rows cimport dot3
@@ -52,13 +51,3 @@ cdef inline void matvec3(const double* matrix, const double* x, double* out) noe
     cdef int32_t k
     for k in range(3):
         out[k] = dot3(matrix + 3 * k, x)
-
-
-cdef inline double normalise3(double* x) noexcept nogil:
-    """Scale x to unit length if it is not zero, and return its previous length."""
-    cdef double size = sqrt(dot3(x, x))
-    cdef int32_t k
-    if size > 0.0:
-        for k in range(3):
-            x[k] /= size
-    return size
