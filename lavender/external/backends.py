@@ -185,7 +185,7 @@ TRIANGLE_SENTENCES = {
     "all": "Both triangles of P are used, and an asymmetric P gives a wrong answer.",
     "none": "An asymmetric P is rejected.",
 }
-#: What the adapter does about an observation, by field of `Behaviour`.
+#: Remedy of the adapter for an observation, by field of `Behaviour`.
 ADAPTER_REMEDIES = {
     "triangle": "Both triangles of P are passed equal in every bit, or the one that is read.",
     "start": "These arrays are passed if a start is given.",
@@ -232,7 +232,7 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
 
 
 def describe_backend(name: str) -> list[str]:
-    """Return sentences on the behaviour of the backend `name`, with what its adapter does about it."""
+    """Return sentences on the behaviour of the backend `name`, with the remedies of its adapter."""
     behaviour = _get_behaviour(name)
     if behaviour is None:
         return []

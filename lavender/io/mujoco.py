@@ -79,6 +79,7 @@ DIVERGED_TEXT = (
     "earlier step"
 )
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
+FLOAT32_GAP = 1e-5  # Largest difference of M qacc_smooth from qfrc_smooth, relative to their size, if data are in float32.
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = (
     "The model was changed, or MjData belongs to another model: give a model and data made from it"
@@ -315,9 +316,14 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
         return matrix.lower, matrix.change
     mass, gap = result
     if not gap <= MASS_TOLERANCE:
+        difference = f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size"
+        if gap <= FLOAT32_GAP:
+            raise CapabilityError(
+                f"{difference}, as in float32: mjx.get_data copies results of MJX in float32. Pass the arrays of the "
+                "mjx.Data (efc_J, efc_D, efc_aref, ...) to lavender.io.from_efc"
+            )
         raise CapabilityError(
-            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: the problem was built with "
-            f"another matrix than M. {CHANGED_ADVICE}"
+            f"{difference}: the problem was built with another matrix than M. {CHANGED_ADVICE}"
         )
     return mass, None
 

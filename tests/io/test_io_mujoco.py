@@ -499,6 +499,15 @@ def test_data_of_a_second_model_are_refused():
         lv.io.from_mujoco(other, data)
 
 
+def test_data_in_float32_as_of_mjx_are_rejected_and_from_efc_is_named():
+    model, data = state()
+    for field in ("M", "qacc_smooth", "qfrc_smooth"):
+        getattr(data, field)[:] = getattr(data, field).astype(np.float32)
+    data.efc_R[:] = 0.0  # mjx.get_data does not write it.
+    with pytest.raises(lv.CapabilityError, match=r"as in float32: mjx.get_data .* lavender.io.from_efc"):
+        lv.io.from_mujoco(model, data)
+
+
 def test_data_without_a_forward_pass_are_rejected_by_name():
     model = mj.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
