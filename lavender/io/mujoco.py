@@ -79,7 +79,7 @@ DIVERGED_TEXT = (
     "earlier step"
 )
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
-FLOAT32_GAP = 1e-5  # Largest difference of M qacc_smooth from qfrc_smooth, relative to their size, if data are in float32.
+FLOAT32_GAP = 1e-5  # [-] Largest relative difference of M qacc_smooth and qfrc_smooth of data in float32.
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 OTHER_MODEL_ADVICE = (
     "The model was changed, or MjData belongs to another model: give a model and data made from it"
