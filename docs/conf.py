@@ -54,8 +54,8 @@ CONTENTS = {
         "diagnose examples generated/examples"
     ),
     "Use": (
-        "commands report formats own-engine generalized quadratic-programs mujoco worlds engines audit "
-        "tune derivatives c solvers backends generated/api"
+        "commands report formats own-engine generalized quadratic-programs mujoco worlds engines engine-arrays "
+        "audit tune derivatives c solvers backends generated/api"
     ),
     "LavenderSim": "engine engine-measurements scenes towers web",
     "Background": (

@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite docs/solvers.md, scenes.md and backends.md, which are checked in
+    python docs/generate.py --pages    rewrite solvers.md, scenes.md, backends.md and engine-arrays.md of docs/
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
@@ -424,6 +424,28 @@ def backends_page():
     )
 
 
+ENGINES_INTRODUCTION = """\
+This page lists facts about other engines that are easily guessed wrong: which numbers their arrays hold, and how they
+read the same file. [The importers](engines.md) of lavender take them into account. Each fact was found with the version
+in the table. A test runs the engine, if it is installed, and fails if the fact has changed."""
+
+
+def engine_arrays_page():
+    """Return the text of docs/engine-arrays.md: facts about engines."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "io"))
+    from engine_probes import FACTS
+
+    parts = ["# Engines: what their arrays mean", "<!-- Written by `python docs/generate.py --pages`. -->"]
+    parts.append(ENGINES_INTRODUCTION)
+    for engine in dict.fromkeys(f.engine for f in FACTS):
+        facts = [f for f in FACTS if f.engine == engine]
+        has_handling = any(f.handling for f in facts)
+        rows = [(f.subject, f.text, *[f.handling] * has_handling) for f in facts]
+        head = ("subject", "fact", *["lavender"] * has_handling)
+        parts += [f"## {engine} {facts[0].version}", table(head, rows)]
+    return "\n\n".join(parts)
+
+
 def solver_pages(site, report, figures):
     """Write the page of each built-in solver, and one page for the backends."""
     specs = built_in()
@@ -718,6 +740,7 @@ def write(source, cache):
 def committed_pages():
     """Return the texts of the pages that are checked in, by file name."""
     pages = {"solvers.md": solver_overview(), "scenes.md": scene_page(), "backends.md": backends_page()}
+    pages["engine-arrays.md"] = engine_arrays_page()
     return {name: text.rstrip() + "\n" for name, text in pages.items()}
 
 
@@ -725,7 +748,7 @@ def main():
     """Run the command line that the docstring of this module describes."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
-        "--pages", action="store_true", help="rewrite docs/solvers.md, scenes.md and backends.md"
+        "--pages", action="store_true", help="rewrite the pages of docs/ that are made from tables"
     )
     parser.add_argument("--tables", action="store_true", help="measure; rewrite tables and figures of pages")
     chosen = parser.parse_args()

@@ -1,0 +1,10 @@
+"""Engines behave as the table of docs/engine-arrays.md states."""
+
+import pytest
+from engine_probes import FACTS
+
+
+@pytest.mark.parametrize("fact", FACTS, ids=lambda f: f"{f.engine}-{f.probe.__name__}")
+def test_fact_about_an_installed_engine_still_holds(fact):
+    pytest.importorskip(fact.module)
+    assert fact.probe(), f"{fact.engine} {fact.version}, {fact.subject}: {fact.text}"
