@@ -1,7 +1,6 @@
 """Ways into kernels, a clock that is played, and problems, which tests of several floors share."""
 
 import re
-from contextlib import contextmanager
 from dataclasses import fields, replace
 from unittest import mock
 
@@ -15,7 +14,6 @@ from lavender.judge.certificates import check_certificate
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.driver.driver import Driver
-from lavender_ext.newton.solve import PHASES
 
 SHORT = ("auto", "direct", "newton")
 
@@ -172,19 +170,6 @@ def system_in(problem, form):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system
-
-
-@contextmanager
-def newton_without(*phases):
-    """Newton's method goes without these."""
-    given = systems.System.__init__
-
-    def begin(self, problem, solve):
-        given(self, problem, solve)
-        solve.disabled_phases = sum(PHASES[name] for name in phases)
-
-    with mock.patch.object(systems.System, "__init__", begin):
-        yield
 
 
 def keep_values(monkeypatch, module, name, values, solvers):

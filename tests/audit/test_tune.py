@@ -197,17 +197,6 @@ def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how):
     assert none.lines[0].startswith("PROVISIONAL, the m") and "none of 1 settings" in none.lines[0]
 
 
-def test_a_line_after_the_model_s_own_option_wins_and_before_it_does_not():
-    model = BOXES.format(options='iterations="7"')
-    line = Setting((("iterations", 50),)).option_line
-    head, own, rest = model.partition("<option")
-    option, end, tail = (own + rest).partition("/>")
-    after, before = f"{head}{option}{end}{line}{tail}", f"{head}{line}{option}{end}{tail}"
-    assert mj.MjModel.from_xml_string(after).opt.iterations == 50
-    assert mj.MjModel.from_xml_string(before).opt.iterations == 7
-    assert "after the model's own <option>" in mujoco_settings.MERGE_NOTE
-
-
 def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
     fewer(monkeypatch)
     cores = sweep.os.cpu_count()

@@ -19,7 +19,6 @@ from random_problems import (
 )
 
 import lavender as lv
-from lavender.problem import generalized as coordinates
 from lavender.solvers.sweeping import is_sweep_over_jacobian_cheaper
 
 # -- the operator ----------------------------------------------------------------------------------
@@ -58,23 +57,6 @@ def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(
     general = lv.Generalized(np.ones((1, n)), mass, np.zeros(n))
     order = np.arange(n) if general.order is None else general.order
     assert general.solve(x)[order].tobytes() == row_by_row(mass[np.ix_(order, order)], x[order]).tobytes()
-
-
-def test_an_order_that_fills_in_is_left_before_its_factor_is_made(monkeypatch):
-    rng = np.random.default_rng(5)
-    n = 65_536  # n^2 is 0 in 32 bits
-    i = np.arange(n)  # of a ladder whose ends meet, two to a rung
-    columns = np.sort(np.stack([i, i ^ 1, (i + 2) % n, (i - 2) % n], 1), 1).ravel()
-    mass = sp.csr_array((np.where(columns == np.repeat(i, 4), 4.0, -1.0), columns, 4 * np.arange(n + 1)))
-    x = rng.normal(size=n)
-    jac = sp.csr_array((np.ones(1), [0], [0, 1]), shape=(1, n))
-    looked_at = lv.Generalized(jac, mass, np.zeros(n))
-    # Its lower triangle has 2.5 n entries, its factor about 4 n.
-    monkeypatch.setattr(coordinates, "MAX_FACTOR_ENTRIES", 3 * n)
-    other = lv.Generalized(jac, mass, np.zeros(n))
-    assert other.order is not None
-    for made in (looked_at, other):
-        np.testing.assert_allclose(mass @ made.solve(x), x, atol=1e-12)
 
 
 def test_every_way_to_give_j_and_m_is_one_problem():
@@ -189,18 +171,6 @@ def test_entries_of_a_that_vanish_are_left_out(jac):
     n = len(jac)
     problem = lv.Problem.from_jacobian(jac, np.eye(n), np.zeros(n), cones=lv.Cones.free(n))
     assert problem.csr.nnz == n
-
-
-def test_nothing_of_the_judge_forms_a(monkeypatch):
-    problem = random_generalized_problem(6, "cone")
-    monkeypatch.setattr(
-        "lavender.problem.operators.assemble.form_gram_matrix", None
-    )  # which A = Y Y^T is formed by
-    solution = lv.solve(problem, tol=1e-8)
-    lv.residual(problem, solution.impulse)
-    problem.velocity(solution.impulse)
-    with pytest.raises(TypeError):
-        _ = problem.csr
 
 
 @given(seed=seeds)

@@ -140,19 +140,6 @@ def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
     np.testing.assert_array_equal(sim.reset(seed=1)[0]["positions"], first)
 
 
-def test_arrays_grow_in_one_go_and_pair_lists_last():
-    sim, small = (lv.Simulation(lv.Scene("pile", n=60, kind="boxes")) for _ in range(2))
-    anew = paired_anew(lv.Simulation(lv.Scene("pile", n=60, kind="boxes")), None)
-    small.state = with_room(small.state, 3, 3)
-    with_larger_buffers = 0
-    for _ in range(80):
-        before = int(sim.state.size[9])
-        assert len({trajectory(of, 1)[0] for of in (sim, small, anew)}) == 1
-        with_larger_buffers += int(sim.state.size[9]) != before
-    assert small.state.size[9] > 3 and with_larger_buffers <= 3
-    assert sim.state.head[HEAD["rebuilds"]] < 0.7 * anew.state.head[HEAD["rebuilds"]]
-
-
 def test_what_lacks_room_says_so_before_any_state_has_changed():
     sim = lv.Simulation("stack")
     state = with_room(sim.state, sim.state.size[8], 5)
