@@ -158,11 +158,6 @@ class RowBuilder(RowAssembly):
             Hinge axis that is fixed to a, in world coordinates. Its length does not matter.
         axis_b : array-like (3,), optional
             Hinge axis that is fixed to b, in world coordinates. Default: `axis`.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("hinge", a, b, feature, name, anchor, anchor_b, axis, axis_b)
 
@@ -180,11 +175,6 @@ class RowBuilder(RowAssembly):
         angle_error : scalar, or array-like (3,), rad, default 0
             Small rotation of b relative to a from the welded orientation: a rotation vector in world axes, in two
             dimensions the angle.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("weld", a, b, feature, name, anchor, anchor_b, angle_error)
 
@@ -206,11 +196,6 @@ class RowBuilder(RowAssembly):
             the error of the joint.
         angle_error : scalar, or array-like (3,), rad, default 0
             As in `weld`.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("slider", a, b, feature, name, anchor, anchor_b, axis, angle_error)
 
@@ -229,11 +214,6 @@ class RowBuilder(RowAssembly):
             Points on a and on b, in world coordinates.
         length : float, m, optional
             Distance to keep. Default: the present distance.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("distance", a, b, feature, name, anchor_a, anchor_b, length)
 
@@ -256,11 +236,6 @@ class RowBuilder(RowAssembly):
             k; at least one of `stiffness` and `damping` is positive.
         damping : float, N s/m, default 0
             c.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("spring", a, b, feature, name, anchor_a, anchor_b, length, stiffness, damping)
 
@@ -288,11 +263,6 @@ class RowBuilder(RowAssembly):
             Largest force of a linear motor, as on a slider; `anchor` is needed with it.
         anchor : array-like (2,) or (3,), m, optional
             Point on b at which the force acts, in world coordinates.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("motor", a, b, feature, name, axis, anchor, speed, max_torque, max_force)
 
@@ -342,11 +312,6 @@ class RowBuilder(RowAssembly):
             belt.
         angle_error : float, rad, default 0
             Present angle_a + ratio angle_b, minus its value when the gears were joined.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add("gear", a, b, feature, name, axis_a, axis_b, ratio, angle_error)
 
@@ -384,11 +349,6 @@ class RowBuilder(RowAssembly):
         feature : int, 0 to 65535, optional
             Number of this point among the contacts of a and b, as from collision detection; part of its key. Default:
             the order of the calls.
-
-        Returns
-        -------
-        int
-            Key of the block.
         """
         return self._add(
             "contact",

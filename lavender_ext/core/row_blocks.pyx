@@ -7,7 +7,7 @@ validates the arguments again in detail and writes the message. Single blocks an
 Bodies are numbers, -1 is the static world, and the first numbers of two dimensions are those of a plane z = 0 of three.
 """
 from libc.math cimport INFINITY, NAN, fabs, fma, isinf, isnan, sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport INT32_MAX, int32_t, int64_t, uint64_t
 from libc.string cimport memcpy, memset
 from cpython.mem cimport PyMem_Free, PyMem_Realloc
 
@@ -153,6 +153,18 @@ cdef inline int64_t read_body(object value, int32_t n):
     if type(value) is not int and not (isinstance(value, np.integer) and not isinstance(value, np.timedelta64)):
         return -2
     return value if -1 <= value < n else -2
+
+
+cdef int grow(void** memory, int32_t* capacity, int64_t count, size_t size) except -1:
+    """Reallocate an array of elements of `size` bytes if its capacity is below `count`."""
+    cdef void* larger
+    if count > capacity[0]:
+        count += count // 2 + 16
+        larger = PyMem_Realloc(memory[0], count * size)
+        if larger == NULL or count > INT32_MAX:
+            raise MemoryError(f"{count} rows or blocks")
+        memory[0], capacity[0] = larger, <int32_t>count
+    return 0
 
 
 cdef class RowBlocks:
@@ -425,31 +437,12 @@ cdef class RowBlocks:
 
     # -- blocks --------------------------------------------------------------------------------------------------
 
-    cdef int reserve(self, int32_t kind, int32_t n) except -1:
+    cdef int reserve(self, int32_t kind, int64_t n) except -1:
         """Allocate memory for n more blocks of a type."""
-        cdef int64_t rows = self.n_rows + MAX_ROWS * <int64_t>n, joints = self.n_joints + n, contacts = self.n_contacts + n
-        cdef void* memory
         if kind == CONTACT:
-            if contacts > self.contact_capacity:
-                contacts += contacts // 2 + 16
-                memory = PyMem_Realloc(self.contacts, contacts * sizeof(contact_t))
-                if memory == NULL:
-                    raise MemoryError(f"{contacts} contacts")
-                self.contacts, self.contact_capacity = <contact_t*>memory, <int32_t>contacts
-            return 0
-        if rows > self.row_capacity:
-            rows += rows // 2 + 16
-            memory = PyMem_Realloc(self.rows, rows * sizeof(row_t))
-            if memory == NULL:
-                raise MemoryError(f"{rows} rows")
-            self.rows, self.row_capacity = <row_t*>memory, <int32_t>rows
-        if joints > self.joint_capacity:
-            joints += joints // 2 + 16
-            memory = PyMem_Realloc(self.joints, joints * sizeof(joint_t))
-            if memory == NULL:
-                raise MemoryError(f"{joints} joints")
-            self.joints, self.joint_capacity = <joint_t*>memory, <int32_t>joints
-        return 0
+            return grow(<void**>&self.contacts, &self.contact_capacity, self.n_contacts + n, sizeof(contact_t))
+        grow(<void**>&self.rows, &self.row_capacity, self.n_rows + MAX_ROWS * n, sizeof(row_t))
+        return grow(<void**>&self.joints, &self.joint_capacity, self.n_joints + n, sizeof(joint_t))
 
     cdef object append_block(self, int32_t kind, arguments_t* x, int64_t feature):
         """Append a block and return its key; None for invalid arguments. A negative feature: the next one."""
@@ -562,9 +555,11 @@ cdef class RowBlocks:
         """Return the rows of the joints, the joints, and the contacts, with the fields of ROW, JOINT and CONTACT_FIELDS."""
         rows, joints = np.empty(self.n_rows, ROW), np.empty(self.n_joints, JOINT)
         contacts = np.empty(self.n_contacts, CONTACT_FIELDS)
-        memcpy((<ndarray>rows).data, self.rows, self.n_rows * sizeof(row_t))
-        memcpy((<ndarray>joints).data, self.joints, self.n_joints * sizeof(joint_t))
-        memcpy((<ndarray>contacts).data, self.contacts, self.n_contacts * sizeof(contact_t))
+        if self.n_joints:                                   # The pointers of empty arrays are NULL.
+            memcpy((<ndarray>rows).data, self.rows, self.n_rows * sizeof(row_t))
+            memcpy((<ndarray>joints).data, self.joints, self.n_joints * sizeof(joint_t))
+        if self.n_contacts:
+            memcpy((<ndarray>contacts).data, self.contacts, self.n_contacts * sizeof(contact_t))
         return rows, joints, contacts
 
     def find_rows(self, uint64_t key):
