@@ -10,13 +10,12 @@ from lavender.base.errors import InputError
 from lavender.io.stored import make_folder, write_atomically, write_text
 from lavender.report.findings import Report
 from lavender.report.page import render_page
-from lavender.report.recommendation import recommend
 from lavender.report.records import Records
 from lavender.report.runner import Event
 from lavender.report.table import escape_markdown
 from lavender.report.text import list_cases_not_loaded
 
-LONG_TABLES = ("runs", "skipped", "failures")  # Tables that are not written as LaTeX and Markdown.
+LONG_TABLES = ("cases", "failures", "runs", "skipped")  # Tables that are not written as LaTeX and Markdown.
 
 
 def write(
@@ -96,7 +95,7 @@ def summarise(report: Report) -> str:
         lines += [escape_markdown(f"{machine}; run {run.run}, {run.started}"), ""]
     if report.busy_warning:
         lines += [f"**{escape_markdown(report.busy_warning)}**", ""]
-    for statement in recommend(report):
+    for statement in report.statements:
         lines += [escape_markdown(statement.text), ""]
         lines += ["```python", *statement.code, "```", ""] if statement.code else []
     for cases, reason in list_cases_not_loaded(report.records):

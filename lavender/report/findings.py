@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -12,6 +13,9 @@ from lavender.report import machine, tables
 from lavender.report.engine import EngineAnswers
 from lavender.report.records import Records, escape_unprintable, format_tolerance
 from lavender.report.table import Table
+
+if TYPE_CHECKING:
+    from lavender.report.recommendation import Statement
 
 MAX_ROWS = 500  # Largest number of rows of a table on a page and in the summary; files have all rows.
 
@@ -190,6 +194,13 @@ class Report:
         loads = [None if x != x else float(x) for x in self.frame["load"]]
         busy = machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0]))
         return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
+
+    @cached_property
+    def statements(self) -> tuple[Statement, ...]:
+        """The sentences of the recommendation."""
+        from lavender.report.recommendation import recommend
+
+        return recommend(self)
 
     @cached_property
     def overview(self) -> Section:

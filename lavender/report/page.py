@@ -11,7 +11,6 @@ from lavender.base.errors import require_packages
 from lavender.report.figures import build_figures, list_solvers
 from lavender.report.findings import Report
 from lavender.report.plotting import assign_styles, draw_figures
-from lavender.report.recommendation import recommend
 from lavender.report.records import make_file_name
 from lavender.report.tables import select_failures
 from lavender.report.text import format_count, list_cases_not_loaded, list_diagnostics
@@ -58,7 +57,7 @@ def render_page(report: Report, figures: bool = True, folder: Path | None = None
     drawn = draw_figures(built, assign_styles(list_solvers(built)), folder)
     return str(
         create_environment().get_template("index.html.j2").render(
-            report=report, statements=recommend(report), drawn=drawn,
+            report=report, drawn=drawn,
             left_out=list_cases_not_loaded(report.records), diagnostics=list_diagnostics(report.records),
             n_failures=len(select_failures(report)) if len(report.frame) else 0,
         )

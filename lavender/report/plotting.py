@@ -18,7 +18,7 @@ from typing import Any
 from lavender.base.errors import require_packages
 from lavender.io.stored import make_folder, write_text
 from lavender.report.figures import Curve, Figure
-from lavender.report.records import make_file_name
+from lavender.report.records import format_tolerance, make_file_name
 from lavender.solvers import registry
 
 SOLVER_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#A0803A", "#7F7F7F")
@@ -100,6 +100,10 @@ def plot_figure(figure: Figure, styles: Mapping[str, CurveStyle]) -> Any:
     for tolerance in figure.tolerances:
         if low <= tolerance <= high:
             axes.axhline(tolerance, color=GREY, linewidth=0.8, zorder=0)
+    for axis, is_log in ((axes.xaxis, figure.x_log), (axes.yaxis, figure.y_log)):
+        if is_log:
+            axis.set_major_formatter(lambda x, _: f"{x:g}" if 0.1 <= x < 1e4 else format_tolerance(x))
+            axis.set_minor_formatter(lambda x, _: "")
     axes.grid(True, color=GREY, linewidth=0.4, alpha=0.4)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(_shorten(figure.title, MAX_TITLE_LENGTH), fontsize=10, loc="left", parse_math=False)

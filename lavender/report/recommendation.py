@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -87,20 +88,10 @@ def _recommend_for(report: Report, frame: pd.DataFrame) -> Statement:
     if misses:
         sentences.append(_describe_misses(report, runs, cases, solver))
     sentences += _describe_plug_ins(ranking, solver)
-    record = _find_record(report, own)
+    loosest = own[own["tol"] == own["tol"].max()]
+    call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
     guessed = any(report.records.cases[c].guess for c in cases)
-    return Statement(_add_engine(" ".join(sentences), engine, first), format_call(record, guessed))
-
-
-def _find_record(report: Report, runs: pd.DataFrame) -> Any:
-    """Return the record of the loosest run to a tolerance that took the largest number of iterations."""
-    loosest = runs[runs["tol"] == runs["tol"].max()]
-    row = runs.loc[loosest["iterations"].idxmax()]
-    return next(
-        r for r in report.records
-        if (r.run, r.case, r.solver, r.start, r.mode, r.tol, r.max_iter, r.order)
-        == tuple(row[["run", "case", "solver", "start", "mode", "tol", "max_iter", "order"]])
-    )  # fmt: skip
+    return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
 
 
 def _describe_misses(report: Report, runs: pd.DataFrame, cases: Sequence[str], solver: str) -> str:

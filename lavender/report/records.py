@@ -13,10 +13,9 @@ import json
 import math
 import os
 import re
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from statistics import median
@@ -101,7 +100,9 @@ class _PrintableEntry:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if isinstance(value, (str, tuple, Mapping)):
+            kind = type(value)
+            if (kind is str and not value.isprintable()) or (kind is not str and kind is not float and value and
+                                                             isinstance(value, (str, tuple, Mapping))):  # fmt: skip
                 object.__setattr__(self, name, _make_printable(value, name == "message"))
 
 
@@ -229,12 +230,19 @@ class Record(_PrintableEntry):
 
 def make_measurement_key(m: Any) -> tuple[Any, ...]:
     """Return the key of a measurement from its `Task` or its `Record`."""
-    return (m.case, m.sha, m.solver, m.start, m.mode, m.tol, m.max_iter, m.time_limit, m.order)
+    return tuple(getattr(m, name) for name in _KEY_NAMES[1:])
 
 
 Entry = Run | CaseInfo | Skip | Record
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 _FIELD_NAMES = [f.name for f in fields(Record)]
+_WORK_PLACE, _MESSAGE_PLACE = map(_FIELD_NAMES.index, ("work", "message"))
+_KEY_NAMES = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
+_DEFAULTS = {
+    f.name: f.default if f.default_factory is MISSING else f.default_factory()
+    for f in fields(Record)
+    if f.default is not MISSING or f.default_factory is not MISSING
+}
 #: Columns of a case and of a machine in a frame.
 CASE_COLUMNS = (
     "law", "rows", "blocks", "islands", "contacts", "mass_ratio", "sequence", "nothing_to_do", "symmetric"
@@ -276,32 +284,38 @@ def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
         A field has another type than declared, or is out of its range.
     """
     values = {}
-    for name, (needed, is_valid), is_float, is_tuple in _list_rules(cls):
+    for name, (needed, is_valid), kind in _list_rules(cls):
         if name not in line:
             continue
         value = line[name]
-        if is_float and (_is_integer(value) or (isinstance(value, str) and value in ("inf", "-inf", "nan"))):
+        if kind == "float" and (
+            _is_integer(value) or (isinstance(value, str) and value in ("inf", "-inf", "nan"))
+        ):
             value = float(value)
-        elif is_tuple and isinstance(value, list):
-            value = tuple(map(_to_float, value) if is_tuple == "float" else value)
-        if not is_valid(value):
+        elif isinstance(value, list) and kind in ("floats", "words"):
+            value = tuple(map(_to_float, value) if kind == "floats" else value)
+        if not (kind == "str" and type(value) is str) and not is_valid(value):
             raise ValueError(f"{name} is {value!r:.60}; {needed} is needed")
         values[name] = value
     return values
 
 
 @cache
-def _list_rules(cls: Any) -> list[tuple[str, _Rule, bool, str]]:
-    """Return (name, rule, whether it is a float, kind of the entries of a tuple) for each field of a data class."""
+def _list_rules(cls: Any) -> list[tuple[str, _Rule, str]]:
+    """Return (name, rule, kind) for each field of a data class; a field of kind "str" accepts every text."""
     rules = []
     for f in fields(cls):
-        kind = str(f.type)
-        if kind in _TYPES:
-            rule = _RANGES.get((cls.__name__, f.name), _RANGES.get(("", f.name), _TYPES[kind]))
-            entries = "float" if kind == "tuple[float, ...]" else "str"
-            rules.append(
-                (f.name, rule, kind.startswith("float"), entries if kind.startswith("tuple") else "")
-            )
+        declared = str(f.type)
+        if declared in _TYPES:
+            rule = _RANGES.get((cls.__name__, f.name), _RANGES.get(("", f.name), _TYPES[declared]))
+            kinds = {
+                "tuple[float, ...]": "floats",
+                "tuple[str, ...]": "words",
+                "float": "float",
+                "float | None": "float",
+            }
+            kind = "str" if declared == "str" and rule is _TYPES["str"] else kinds.get(declared, "")
+            rules.append((f.name, rule, kind))
     return rules
 
 
@@ -409,6 +423,7 @@ class Records:
         self._sequences: dict[str, str] = {}  # The identity of each sequence in its latest description.
         self._columns: dict[str, list[Any]] = {name: [] for name in _FIELD_NAMES}
         self._places: dict[tuple[Any, ...], int] = {}  # Place of each measurement in the columns.
+        self._texts: dict[str, str] = {}
         self._frame: DataFrame | None = None
 
     @property
@@ -445,17 +460,29 @@ class Records:
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
         else:
-            place = self._places.setdefault((entry.run, *entry.key), len(self))
-            for name, column in self._columns.items():
-                value = getattr(entry, name)
-                if name == "work":
-                    value = json.dumps(dict(value))
-                if isinstance(value, str):
-                    value = sys.intern(value)  # Most texts occur many times.
-                if place < len(column):
-                    column[place] = value
-                else:
-                    column.append(value)
+            self.add_values(vars(entry))
+
+    def add_values(self, values: Mapping[str, Any]) -> None:
+        """Add a record by the values of its fields, which `parse_fields` accepts."""
+        self._frame = None
+        key = tuple(values[name] for name in _KEY_NAMES)
+        row = [self._add_text(v) if type(v) is str else v for v in map(values.__getitem__, _FIELD_NAMES)]
+        row[_WORK_PLACE] = self._add_text(json.dumps(dict(values["work"])))
+        row[_MESSAGE_PLACE] = escape_unprintable(values["message"], lines=True)
+        place = self._places.setdefault(key, len(self))
+        is_new = place == len(self)
+        for column, value in zip(self._columns.values(), row, strict=True):
+            if is_new:
+                column.append(value)
+            else:
+                column[place] = value
+
+    def _add_text(self, text: str) -> str:
+        """Return a text in printable form; equal texts, of which most occur many times, are one object."""
+        known = self._texts.get(text)
+        if known is None:
+            known = self._texts[text] = escape_unprintable(text)
+        return known
 
     def __len__(self) -> int:
         return len(self._columns["run"])
@@ -651,19 +678,26 @@ def read(path: str | Path) -> Records:
         if not line.strip():
             continue
         try:
-            entry = from_json(json.loads(line))
+            content = json.loads(line)
+            if isinstance(content, dict) and content.get("kind") == "record":
+                # No `Record` is created: a file may have a million of them.
+                values = _DEFAULTS | parse_fields(Record, content)
+                if missing := [name for name in _FIELD_NAMES if name not in values]:
+                    raise ValueError(f"a record has no {missing[0]}")
+                if not (values["case"] in records.cases and values["run"] in records.runs):
+                    owner = "case" if values["run"] in records.runs else "run"
+                    raise ValueError(
+                        f"the record belongs to a {owner} that no earlier line describes; a complete records.jsonl is "
+                        "needed: copy the whole file"
+                    )
+                records.add_values(values)
+            else:
+                records.add(from_json(content))
         except (ValueError, RecursionError) as error:
             raise InputError(
                 f"{path}, line {number}: {error}. Give a records.jsonl that `lavender report` wrote, or "
                 "remove this line"
             ) from None
-        if isinstance(entry, Record) and not (entry.case in records.cases and entry.run in records.runs):
-            missing = "case" if entry.run in records.runs else "run"
-            raise InputError(
-                f"{path}, line {number}: the record belongs to a {missing} that no earlier line describes; a "
-                "complete records.jsonl is needed: copy the whole file"
-            )
-        records.add(entry)
     return records
 
 

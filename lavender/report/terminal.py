@@ -103,12 +103,9 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
     """
     from rich.text import Text
 
-    from lavender.report.recommendation import recommend
-
     lines: list[Text] = []
-    statements = recommend(report)
-    for statement in statements:
-        lines.append(Text(statement.text, style="bold" if statement is statements[0] else ""))
+    for i, statement in enumerate(report.statements):
+        lines.append(Text(statement.text, style="" if i else "bold"))
         hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
         code = statement.code if complete else (statement.call_line + hint,) * bool(statement.call_line)
         lines += [Text(f"    {line}") for line in code]

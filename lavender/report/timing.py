@@ -111,8 +111,8 @@ class Task:
 _SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)}
 
 
-def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
-    """Return the lines of Python with which a record was measured.
+def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
+    """Return the lines of Python with which a record, or a row of a frame, was measured.
 
     If `guessed` is true, some problems have a guess, and a line before a cold start removes it.
     """
