@@ -276,7 +276,9 @@ class Pace:
         return begins
 
     def format_remaining_time(self, event: Event) -> str:
-        """Return a phrase such as "about 40 s remain", or an empty text if it is too early for an estimate."""
+        """Return a phrase such as "about 40 s remain"; empty if it is too early, or if steps take unequal times."""
+        if event.phase == "writing":
+            return ""
         return format_remaining_time(event, self.elapsed, event.done - self.reused_until)
 
 

@@ -31,27 +31,10 @@ _PUBLIC_NAMES = {
 _MODULE_OF_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 
 __all__ = [
-    "CampaignPlan",
-    "CaseInfo",
-    "Event",
-    "Item",
-    "Plan",
-    "Record",
-    "Records",
-    "Report",
-    "Run",
-    "Skip",
-    "Store",
-    "carry_impulses",
-    "classify_structure",
-    "make_sequence",
-    "read",
-    "resolve_sources",
-    "run",
-    "select_solver_names",
-    "tables",
-    "write",
-]
+    "CampaignPlan", "CaseInfo", "Event", "Item", "Plan", "Record", "Records", "Report", "Run", "Skip", "Store",
+    "carry_impulses", "classify_structure", "make_sequence", "read", "resolve_sources", "run", "select_solver_names",
+    "tables", "write",
+]  # fmt: skip
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 

@@ -45,38 +45,18 @@ DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by defaul
 
 @dataclass(eq=False)
 class Item:
-    """One case of a run; its problem is loaded at the first access.
-
-    Parameters
-    ----------
-    name : str
-    source : str
-        Path, or name in the suite.
-    load : callable
-        Loads the problem.
-    reason : str
-        Property that the case tests.
-    sequence : str
-        Name of the sequence that contains the case as a step; empty for a single case.
-    step : int
-        Number of the step; -1 for a single case.
-    in_memory : Problem, optional
-        The problem itself, if it was passed as an object.
-    load_stored : callable
-        Returns the answer stored with the problem (m,) [N s], or None.
-    named : bool
-        Whether the user named this case. False if it was found in a folder. A named case that does not load is an
-        error of the request.
-    """
+    """One case of a run; its problem is loaded at the first access."""
 
     name: str
-    source: str
+    source: str  # Path, or name in the suite.
     load: Callable[[], Problem]
-    reason: str = ""
-    sequence: str = ""
-    step: int = -1
-    in_memory: Problem | None = None
+    reason: str = ""  # Property that the case tests.
+    sequence: str = ""  # Name of the sequence that contains the case as a step; empty for a single case.
+    step: int = -1  # Number of the step; -1 for a single case.
+    in_memory: Problem | None = None  # The problem itself, if it was passed as an object.
+    # Returns the answer stored with the problem (m,) [N s], or None.
     load_stored: Callable[[], FloatArray | None] = lambda: None
+    # Whether the user named this case, and it was not found in a folder. It is an error if it does not load.
     named: bool = False
 
     def __post_init__(self) -> None:
@@ -416,29 +396,14 @@ def describe_case(item: Item, run: str) -> CaseInfo:
     answer = item.judge_stored_answer()
     structure, islands = _classify_structure_and_count_islands(p)
     return CaseInfo(
-        run=run,
-        case=item.name,
-        source=item.source,
-        sha=hash_problem(p),
-        law=p.law,
-        rows=p.m,
-        blocks=p.n_blocks,
-        contacts=contacts,
-        bodies=p.rows.n_bodies if p.rows is not None else 0,
-        nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz),
-        mass_ratio=compute_mass_ratio(p),
-        structure=structure,
-        symmetric=p.is_symmetric,
-        reason=item.reason,
-        sequence=item.sequence,
-        step=item.step,
-        stored=math.nan if answer is None else answer.relative,
+        run=run, case=item.name, source=item.source, sha=hash_problem(p), law=p.law, rows=p.m, blocks=p.n_blocks,
+        contacts=contacts, bodies=p.rows.n_bodies if p.rows is not None else 0,
+        nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz), mass_ratio=compute_mass_ratio(p),
+        structure=structure, islands=islands, symmetric=p.is_symmetric, reason=item.reason, sequence=item.sequence,
+        step=item.step, stored=math.nan if answer is None else answer.relative,
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
-        nothing_to_do=is_solved_by_zero(p),
-        diagnostics=tuple(map(str, diagnose(p))),
-        guess=_classify_guess(item),
-        islands=islands,
-    )
+        nothing_to_do=is_solved_by_zero(p), diagnostics=tuple(map(str, diagnose(p))), guess=_classify_guess(item),
+    )  # fmt: skip
 
 
 def _classify_guess(item: Item) -> str:

@@ -37,10 +37,7 @@ from lavender.solving.prepared import check_arguments
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
-CONE_REFERENCES = (
-    "clarabel_cone",
-    "block_gauss_seidel",
-)
+CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")
 # A reference must reach this relative residual, or 10 times the round-off floor.
 REFERENCE_MAX_RESIDUAL = 1e-9
 
@@ -61,48 +58,23 @@ REFUSED = "refused"
 
 @dataclass(frozen=True)
 class CrossCheckRow:
-    """Comparison of one solver with the reference; a number that does not apply is None.
+    """Comparison of one solver with the reference; a number that does not apply is None."""
 
-    Parameters
-    ----------
-    solver : str
-        Name as requested.
-    verdict : str
-    status : str
-    relative, roundoff_floor : float or None
-        Relative residual and its round-off floor, by the judge.
-    velocity : float or None, m/s
-        Velocity error of the worst row, by the judge.
-    distance : float or None, sqrt J
-        |Delta|_A to the reference.
-    allowed : float or None, sqrt J
-        Largest distance that (1) and (2) allow.
-    slack : float or None, m/s
-        Largest difference of a row's slack from the reference's.
-    objective : float or None, J
-        1/2 l.A l - b.l of the solver's impulse l, minus that value for the reference.
-    time : float or None, s
-        Set-up and solve.
-    note : str
-        Operator form, message and reason.
-    ran : str
-        Name of the bounded variant that was run instead, if the requested solver accepts only free rows.
-    solution : Solution or None
-    """
-
-    solver: str
+    solver: str  # Name as requested.
     verdict: str
     status: str = ""
-    relative: float | None = None
+    relative: float | None = None  # Relative residual and its round-off floor, by the judge.
     roundoff_floor: float | None = None
-    velocity: float | None = None
-    distance: float | None = None
-    allowed: float | None = None
-    slack: float | None = None
-    objective: float | None = None
-    time: float | None = None
-    note: str = ""
-    ran: str = ""
+    velocity: float | None = None  # [m/s] Velocity error of the worst row, by the judge.
+    distance: float | None = None  # [sqrt J] |Delta|_A to the reference.
+    allowed: float | None = None  # [sqrt J] Largest distance that (1) and (2) allow.
+    slack: float | None = None  # [m/s] Largest difference of a row's slack from the reference's.
+    objective: float | None = (
+        None  # [J] 1/2 l.A l - b.l of the solver's impulse l, minus the reference's value.
+    )
+    time: float | None = None  # [s] Set-up and solve.
+    note: str = ""  # Operator form, message and reason.
+    ran: str = ""  # Name of the bounded variant that was run instead, if the solver accepts only free rows.
     solution: Solution | None = None
 
     @property

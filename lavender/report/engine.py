@@ -29,34 +29,27 @@ INSIDE = "inside the engine, warm-started, without copy and judge"
 
 @dataclass(frozen=True)
 class EngineAnswers:
-    """Answers of an engine to one folder of recorded steps.
-
-    Parameters
-    ----------
-    folder, source : name of the folder, and its path as in the records
-    solver : solver of the engine
-    steps, left_out : recorded steps, and steps that could not be recorded
-    rows : median number of rows
-    relative, worst : median and largest relative residual [-]
-    above_floor : answers above the round-off floor
-    unconverged : number of answers with an error above the recording's threshold [m/s] that rounding does not explain
-    velocity, where : largest velocity error of a row [m/s], nan if it was not recorded; and the name of that row
-    answers : time inside the engine [s] and relative residual by file name
-    """
+    """Answers of an engine to one folder of recorded steps."""
 
     folder: str
-    source: str
+    source: str  # Path of the folder as in the records.
     solver: str
     steps: int
-    left_out: int
-    rows: float
-    relative: float
+    left_out: int  # Number of steps that could not be recorded.
+    rows: float  # Median number of rows.
+    relative: float  # Median relative residual, and the largest.
     worst: float
-    above_floor: int
-    unconverged: int
-    velocity: float
+    above_floor: int  # Number of answers above the round-off floor.
+    unconverged: (
+        int  # Number of answers with an error above the recording's threshold that rounding does not explain.
+    )
+    velocity: (
+        float  # [m/s] Largest velocity error of a row, nan if it was not recorded; and the name of that row.
+    )
     where: str
-    answers: Mapping[str, tuple[float, float]]
+    answers: Mapping[
+        str, tuple[float, float]
+    ]  # Time inside the engine [s] and relative residual by file name.
 
     def contains(self, source: str) -> bool:
         """Return whether the source of a case is a file of the engine's folder."""
@@ -109,17 +102,10 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
     sizes, relatives, worst_rows, verdicts, solvers = zip(*entries, strict=True)
     velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
     return EngineAnswers(
-        folder=folder.name,
-        source=escape_unprintable(str(folder)),
-        solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
-        steps=len(entries),
-        left_out=left_out,
-        rows=float(np.median(sizes)),
-        relative=float(np.median(relatives)),
-        worst=float(np.max(relatives)),
+        folder=folder.name, source=escape_unprintable(str(folder)),
+        solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"), steps=len(entries), left_out=left_out,
+        rows=float(np.median(sizes)), relative=float(np.median(relatives)), worst=float(np.max(relatives)),
         above_floor=sum(verdict != AT_FLOOR for verdict in verdicts),
-        unconverged=sum(verdict in (UNCONVERGED, WRONG) for verdict in verdicts),
-        velocity=velocity,
-        where=escape_unprintable(where),
-        answers=answers,
-    )
+        unconverged=sum(verdict in (UNCONVERGED, WRONG) for verdict in verdicts), velocity=velocity,
+        where=escape_unprintable(where), answers=answers,
+    )  # fmt: skip

@@ -22,63 +22,39 @@ MAX_ROWS = 500  # Largest number of rows of a table on a page and in the summary
 
 #: Title, meaning of the numbers, and function of each table, in their order.
 SECTIONS: dict[str, tuple[str, str, Callable[[Report], pd.DataFrame]]] = {
-    "structures": (
-        "By structure",
-        (
-            "The solver that solves the largest number of cases to each tolerance, then the fastest, with its mean "
-            "time. Solvers after ≈ tie with it within the noise of the repetitions. A miss counts with the time limit."
-        ),
-        tables.tabulate_fastest,
-    ),
-    "in-time": (
-        "In a time",
-        (
-            "The solver with the smallest residual at the 90th percentile of the cases; none if no solver halves the "
-            "residual of nine cases of ten."
-        ),
-        tables.tabulate_in_time,
-    ),
-    "costs": (
-        "Cost and rows",
-        (
-            "Time to the middle tolerance as a power of the number of rows, fitted to the cases that a solver solves; "
-            "scatter: typical factor between a case and the fit."
-        ),
-        tables.tabulate_costs,
-    ),
+    "structures": ("By structure", (
+        "The solver that solves the largest number of cases to each tolerance, then the fastest, with its mean time. "
+        "Solvers after ≈ tie with it within the noise of the repetitions. A miss counts with the time limit."
+    ), tables.tabulate_fastest),
+    "in-time": ("In a time", (
+        "The solver with the smallest residual at the 90th percentile of the cases; none if no solver halves the "
+        "residual of nine cases of ten."
+    ), tables.tabulate_in_time),
+    "costs": ("Cost and rows", (
+        "Time to the middle tolerance as a power of the number of rows, fitted to the cases that a solver solves; "
+        "scatter: typical factor between a case and the fit."
+    ), tables.tabulate_costs),
     "times": (
-        "By law",
-        "Mean time of each solver to each tolerance, and number of cases that it solves.",
-        tables.tabulate_times,
+        "By law", "Mean time of each solver to each tolerance, and number of solved cases.", tables.tabulate_times
     ),
     "budgets": (
-        "By iterations",
-        "Residual after a fixed number of iterations, over the cases.",
-        tables.tabulate_budgets,
+        "By iterations", "Residual after a fixed number of iterations, over the cases.", tables.tabulate_budgets
     ),
-    "claims": (
-        "Claims and verdicts",
-        "A claim is correct if the judge confirms it. The judge computes the residual from the problem's data.",
-        tables.tabulate_claims,
-    ),
+    "claims": ("Claims and verdicts", (
+        "A claim is correct if the judge confirms it. The judge computes the residual from the problem's data."
+    ), tables.tabulate_claims),
     "failures": (
-        "Failures",
-        "Runs that missed their tolerance, that died, or that made a false claim.",
-        tables.tabulate_failures,
+        "Failures", "Runs that missed their tolerance, that died, or that made a false claim.", tables.tabulate_failures
     ),
-    "engines": (
-        "Inside the engine",
-        "The engine's own answers, judged like all others. Its time excludes the copy of the problem and the judge.",
-        tables.tabulate_engines,
-    ),
+    "engines": ("Inside the engine", (
+        "The engine's own answers, judged like all others. Its time excludes the copy of the problem and the judge."
+    ), tables.tabulate_engines),
     "sequences": (
-        "Sequences",
-        "All steps, cold and with the impulses of the step before (carried).",
-        tables.tabulate_sequences,
+        "Sequences", "All steps, cold and with the impulses of the step before (carried).", tables.tabulate_sequences
     ),
     "cases": ("Cases", "", tables.tabulate_cases),
     "runs": ("Every case", "Time to each tolerance and smallest residual.", tables.tabulate_runs),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

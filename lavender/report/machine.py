@@ -146,35 +146,9 @@ def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: st
     if not known or fmean(known) <= max(cores, own) + 0.5:
         return ""
     return (
-        f"The machine was busy: load {fmean(known):.1f} on {_count_cores(cores)} during the measurement. "
+        f"The machine was busy: load {fmean(known):.1f} on {cores} core{'s' * (cores != 1)} during the measurement. "
         f"{consequence}"
     ).rstrip()
-
-
-def summarise_loads(loads: Iterable[float | None], cores: int) -> str:
-    """Return a sentence with the mean and the largest load of runs, then `describe_loaded_runs`; empty if unknown."""
-    known = [load for load in loads if load is not None]
-    if not known:
-        return ""
-    mean_and_max = f"{fmean(known):.1f} on average and {max(known):.0f} at most"
-    text = f"Load during the runs: {mean_and_max}, on {_count_cores(cores)}."
-    return f"{text} {describe_loaded_runs(known, cores)}".rstrip()
-
-
-def describe_loaded_runs(loads: Iterable[float | None], cores: int) -> str:
-    """Return a sentence on the runs during which more processes were runnable than there are cores; empty if none."""
-    known = [load for load in loads if load is not None]
-    n = sum(load > cores for load in known)
-    if not n:
-        return ""
-    return (
-        f"In {n} of {len(known)} runs more processes were runnable (up to {max(known):.0f}) than the machine has cores "
-        f"({cores}), so their times may be too long."
-    )
-
-
-def _count_cores(cores: int) -> str:
-    return f"{cores} core{'s' * (cores != 1)}"
 
 
 def get_processor_clock() -> dict[str, str]:

@@ -217,12 +217,6 @@ class Record(_PrintableEntry):
         return make_measurement_key(self)
 
     @property
-    def target(self) -> str:
-        """Budget or tolerance, and the sweep order if it is not "given"."""
-        order = "" if self.order == "given" else f", order {self.order}"
-        return describe_target(self.mode, self.tol, self.max_iter) + order
-
-    @property
     def time(self) -> float:
         """Smallest time of a repetition [s]; nan without times."""
         return min(self.times, default=math.nan)
@@ -284,49 +278,39 @@ def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
         A field has another type than declared, or is out of its range.
     """
     values = {}
-    for name, (needed, is_valid), kind in _list_rules(cls):
+    for name, declared, (needed, is_valid) in _list_rules(cls):
         if name not in line:
             continue
         value = line[name]
-        if kind == "float" and (
-            _is_integer(value) or (isinstance(value, str) and value in ("inf", "-inf", "nan"))
-        ):
-            value = float(value)
-        elif isinstance(value, list) and kind in ("floats", "words"):
-            value = tuple(map(_to_float, value) if kind == "floats" else value)
-        if not (kind == "str" and type(value) is str) and not is_valid(value):
+        if declared == "str":
+            if type(value) is not str:
+                raise ValueError(f"{name} is {value!r:.60}; a text is needed")
+        elif declared[0] == "f" and type(value) is not float:
+            value = _to_float(value)
+        elif isinstance(value, list) and declared[0] == "t":
+            value = tuple(map(_to_float, value) if "float" in declared else value)
+        if not is_valid(value):
             raise ValueError(f"{name} is {value!r:.60}; {needed} is needed")
         values[name] = value
     return values
 
 
 @cache
-def _list_rules(cls: Any) -> list[tuple[str, _Rule, str]]:
-    """Return (name, rule, kind) for each field of a data class; a field of kind "str" accepts every text."""
-    rules = []
-    for f in fields(cls):
-        declared = str(f.type)
-        if declared in _TYPES:
-            rule = _RANGES.get((cls.__name__, f.name), _RANGES.get(("", f.name), _TYPES[declared]))
-            kinds = {
-                "tuple[float, ...]": "floats",
-                "tuple[str, ...]": "words",
-                "float": "float",
-                "float | None": "float",
-            }
-            kind = "str" if declared == "str" and rule is _TYPES["str"] else kinds.get(declared, "")
-            rules.append((f.name, rule, kind))
-    return rules
+def _list_rules(cls: Any) -> list[tuple[str, str, _Rule]]:
+    """Return (name, declared type, rule) for each field of a data class."""
+    declared = {f.name: str(f.type) for f in fields(cls) if str(f.type) in _RULES}
+    return [(name, kind, _RANGES.get((cls.__name__, name), _RULES[kind])) for name, kind in declared.items()]
 
 
 def _to_float(value: Any) -> Any:
     """Convert an integer, or "inf" or "nan", to float; return other values unchanged."""
-    return float(value) if _is_integer(value) or value in ("inf", "nan") else value
+    is_word = isinstance(value, str) and value in ("inf", "-inf", "nan")
+    return float(value) if is_word or _is_integer(value) else value
 
 
-def _is_integer(value: Any) -> bool:
-    """Whether a value is a 64-bit integer."""
-    return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
+def _is_integer(value: Any, low: int = -(2**63)) -> bool:
+    """Whether a value is a 64-bit integer of at least `low`."""
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value < 2**63
 
 
 def _is_size(value: Any) -> bool:
@@ -346,14 +330,6 @@ def _is_mapping(value: Any, is_valid: Callable[[Any], bool]) -> bool:
     return isinstance(value, Mapping) and all(isinstance(k, str) and is_valid(v) for k, v in value.items())
 
 
-def _is_string(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_count(value: Any) -> bool:
-    return _is_integer(value) and value >= 0
-
-
 def _is_positive(value: Any) -> bool:
     """Whether a value is a finite positive number."""
     return (_is_integer(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
@@ -366,24 +342,21 @@ def _is_valid_plan(plan: Any) -> bool:
 
 
 _Rule = tuple[str, Callable[[Any], bool]]
-_COUNT: _Rule = ("a whole number of 0 or more", _is_count)
+_COUNT: _Rule = ("a whole number of 0 or more", lambda v: _is_integer(v, 0))
 #: Description and test of the values of each declared type in a file.
-_TYPES: dict[str, _Rule] = {
-    "str": ("a text", _is_string),
+_RULES: dict[str, _Rule] = {
+    "str": ("a text", lambda v: isinstance(v, str)),
     "int": ("a whole number", _is_integer),
     "float": ("a number of 0 or more", _is_size),
     "float | None": ("a number of 0 or more, or nothing", lambda v: v is None or _is_size(v)),
     "bool": ("true or false", lambda v: isinstance(v, bool)),
-    "tuple[float, ...]": (
-        "a list of numbers of 0 or more",
-        lambda v: isinstance(v, tuple) and all(map(_is_size, v)),
-    ),
-    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_string, v))),
+    "tuple[float, ...]": ("a list of numbers of 0 or more", lambda v: isinstance(v, tuple) and all(map(_is_size, v))),
+    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(isinstance(x, str) for x in v)),
     "Mapping[str, Any]": ("a table of numbers and words", lambda v: _is_mapping(v, _is_flat)),
-    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, _is_string)),
-    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _is_count)),
-}
-#: Description and test of the range of a field of one class, or of all classes.
+    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, lambda x: isinstance(x, str))),
+    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _COUNT[1])),
+}  # fmt: skip
+#: Description and test of the range of a field.
 _RANGES: dict[tuple[str, str], _Rule] = {
     ("Run", "plan"): ("a plan with positive tolerances", _is_valid_plan),
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
@@ -391,8 +364,7 @@ _RANGES: dict[tuple[str, str], _Rule] = {
     ("Record", "claim_check"): ("confirmed, not proven or contradicted", lambda v: v in CLAIM_CHECKS),
     ("Record", "tol"): ("a finite number of 0 or more", lambda v: _is_size(v) and v < math.inf),
     ("Record", "time_limit"): ("a positive number of seconds", _is_positive),
-    ("", "max_iter"): _COUNT,
-    ("", "iterations"): _COUNT,
+    **{(kind, name): _COUNT for kind in ("Record", "Outcome") for name in ("max_iter", "iterations")},
 }
 
 

@@ -23,14 +23,7 @@ from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.problem import Problem, check_problem
 from lavender.report import machine
-from lavender.report.cases import (
-    Item,
-    Source,
-    describe_case,
-    hash_problem,
-    resolve_item,
-    resolve_sources,
-)
+from lavender.report.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
 from lavender.report.plan import CampaignPlan, Plan, list_passes
 from lavender.report.records import (
     CaseInfo,
@@ -57,9 +50,8 @@ MAX_REPEATED_STEPS = 20
 # A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
 NEAR_TIME_RATIO = 1.6
 MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
-AGAIN_TIME = (
-    1.0  # [s] Solvers are timed again on a case until this time has passed; every solver at least once.
-)
+# [s] Solvers are timed again on a case until this time has passed; every solver at least once.
+AGAIN_TIME = 1.0
 MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
 
 Watch = Callable[["Event"], Any]
@@ -67,26 +59,16 @@ Watch = Callable[["Event"], Any]
 
 @dataclass(frozen=True)
 class Event:
-    """Progress of a run.
+    """Progress of a run."""
 
-    Parameters
-    ----------
-    done, total : number of pairs of case and solver, or of other tasks, that are done, and of all; total 0: unknown
-    case, solver : the present task
-    record : the record that was made last
-    reused : whether this record was not measured now
-    remaining : estimate of the remaining time [s]; None if only the counts are known
-    phase : the present phase, such as "measuring"
-    """
-
-    done: int
-    total: int
+    done: int  # Number of pairs of case and solver, or of other tasks, that are done.
+    total: int  # Number of all; 0 if unknown.
     case: str
     solver: str
-    record: Record | None = None
-    reused: bool = False
-    remaining: float | None = None
-    phase: str = ""
+    record: Record | None = None  # The record that was made last.
+    reused: bool = False  # Whether this record was not measured now.
+    remaining: float | None = None  # [s] Estimate of the remaining time; None if only the counts are known.
+    phase: str = ""  # The present phase, such as "measuring".
 
 
 def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
@@ -196,30 +178,12 @@ def run(
     packages = {module for name in names for module in registry.specs()[name].requires}
     this = machine.describe_run({**plan.as_dict(), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
-    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
+    # The limit of threads covers the description of cases, which uses BLAS.
+    with cluster, open_store(store) as kept, Worker(memory) as worker, limit_to_one_thread():
+        runner = Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
         if into is not None:
             into.append(runner.out)
         return runner.measure_items(items, workers, backend, memory)
-
-
-@contextlib.contextmanager
-def open_runner(
-    this: Run,
-    plan: Plan,
-    names: list[str],
-    store: Store | str | Path | None,
-    watch: Watch | None = None,
-    isolate: bool = True,
-    memory: int | None = None,
-    reuse: bool = True,
-) -> Iterator[Runner]:
-    """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
-    with (
-        open_store(store) as kept,
-        Worker(memory) as worker,
-        limit_to_one_thread(),
-    ):  # The limit covers the description of cases, which uses BLAS.
-        yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
 class Runner:
@@ -257,17 +221,10 @@ class Runner:
     ) -> None:
         """Call `watch` with the number of pairs that are done."""
         if self.watch is not None:
-            self.watch(
-                Event(
-                    done=self.done,
-                    total=self.total,
-                    case=case,
-                    solver=solver,
-                    record=record,
-                    reused=reused,
-                    phase="measuring",
-                )
+            event = Event(
+                done=self.done, total=self.total, case=case, solver=solver, record=record, reused=reused
             )
+            self.watch(replace(event, phase="measuring"))
 
     def measure_items(
         self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
@@ -314,17 +271,11 @@ class Runner:
             source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
             records = tuple(known.get((item.name, name), ()))
             info = self.described.get(item.name)
-            pairs.append(
-                Pair(
-                    index=len(pairs),
-                    case=item.name,
-                    source=source,
-                    reason=item.reason,
-                    solver=name,
-                    info=info,
-                    known=records,
-                )
-            )
+            pair = Pair(
+                index=len(pairs), case=item.name, source=source, reason=item.reason, solver=name, info=info,
+                known=records,
+            )  # fmt: skip
+            pairs.append(pair)
         entries: dict[int, list[Entry]] = {}
         try:
             for _ in range(MAX_ATTEMPTS):

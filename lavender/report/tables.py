@@ -8,7 +8,7 @@ in advance. Single cases count from a cold start, steps of a sequence with carri
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -399,8 +399,3 @@ def choose_time_budgets(times: Frame) -> tuple[float, ...]:
     fastest = fastest[fastest > 0.0]
     middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
     return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
-
-
-def list_names(table: Frame, column: str) -> Sequence[str]:
-    """Return the texts of a column; empty if the table has no rows."""
-    return [str(x) for x in table[column]] if len(table) else []

@@ -24,13 +24,7 @@ from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.solution import Claim, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.report import machine
-from lavender.report.records import (
-    ERROR,
-    CaseInfo,
-    Record,
-    format_tolerance,
-    make_measurement_key,
-)
+from lavender.report.records import ERROR, CaseInfo, Record, format_tolerance, make_measurement_key
 from lavender.solvers import registry
 from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.prepared import prepare
@@ -231,21 +225,15 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
+    shared = {name: getattr(solution, name) for name in _OF_SOLUTION}
     return Outcome(
-        impulse=solution.impulse,
-        certificate=solution.certificate,
-        status=solution.status.name,
-        iterations=solution.iterations,
-        work=solution.work,
-        message=solution.message,
-        form=solution.solver.form,
-        setup_time=solution.setup_time,
-        solve_time=solution.solve_time,
-        times=tuple(times),
-        calibration_time=min(calibration_times),
-        status_conflict=solution.status_conflict[:500],
-    )
+        **shared, status=solution.status.name, form=solution.solver.form, times=tuple(times),
+        calibration_time=min(calibration_times), status_conflict=solution.status_conflict[:500],
+    )  # fmt: skip
 
+
+#: Fields of an outcome that are attributes of a solution.
+_OF_SOLUTION = ("impulse", "certificate", "iterations", "work", "message", "setup_time", "solve_time")
 
 _LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-level cache holds
 
@@ -307,50 +295,26 @@ def judge_outcome(problem: Problem, task: Task, outcome: Outcome | str) -> tuple
 def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
     """Judge an outcome on `problem` and return its solution."""
     claim = Claim(
-        Status[outcome.status],
-        outcome.iterations,
-        outcome.work,
-        outcome.message,
-        outcome.form,
+        Status[outcome.status], outcome.iterations, outcome.work, outcome.message, outcome.form,
         certificate=outcome.certificate,
-    )
-    return finish(
-        FinishedRun(
-            problem,
-            registry.get(task.solver),
-            dict(task.options),
-            np.array(outcome.impulse),
-            claim,
-            tol=task.tol,
-            setup_time=outcome.setup_time,
-            solve_time=outcome.solve_time,
-            refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
-        )
-    )
+    )  # fmt: skip
+    run = FinishedRun(
+        problem, registry.get(task.solver), dict(task.options), np.array(outcome.impulse), claim, tol=task.tol,
+        setup_time=outcome.setup_time, solve_time=outcome.solve_time,
+        refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
+    )  # fmt: skip
+    return finish(run)
 
 
 def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
     """Return the record of a measurement; its last repeat returned the solution `s`."""
     r = s.residual
     return task.make_record(
-        status=s.status.name,
-        relative=float(r.relative),
-        energy=float(r.energy),
-        velocity=float(r.velocity),
-        roundoff_floor=float(r.roundoff_floor),
-        worst_row=int(r.worst_row),
-        worst_name=r.worst_name,
-        success=bool(s.success) and task.mode == "tol",
-        claim_check=s.claim_check,
-        status_conflict=s.status_conflict,
-        claims=s.status in CLAIM_STATUSES,
-        iterations=int(s.iterations),
-        work={k: int(v) for k, v in s.work.items()},
-        form=s.solver.form,
-        message=s.message[:500],
-        times=outcome.times,
-        setup_time=outcome.setup_time,
-        solve_time=outcome.solve_time,
-        calibration_time=outcome.calibration_time,
+        status=s.status.name, relative=float(r.relative), energy=float(r.energy), velocity=float(r.velocity),
+        roundoff_floor=float(r.roundoff_floor), worst_row=int(r.worst_row), worst_name=r.worst_name,
+        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check, status_conflict=s.status_conflict,
+        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations), work={k: int(v) for k, v in s.work.items()},
+        form=s.solver.form, message=s.message[:500], times=outcome.times, setup_time=outcome.setup_time,
+        solve_time=outcome.solve_time, calibration_time=outcome.calibration_time,
         load=machine.count_runnable_processes(),
-    )
+    )  # fmt: skip

@@ -21,13 +21,7 @@ from lavender.problem import Problem
 from lavender.report.cases import hash_problem
 from lavender.report.machine import get_memory_per_process
 from lavender.report.records import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
-from lavender.report.timing import (
-    Outcome,
-    Task,
-    judge_outcome,
-    make_solution,
-    run_task_or_return_error,
-)
+from lavender.report.timing import Outcome, Task, judge_outcome, make_solution, run_task_or_return_error
 from lavender.solvers import registry
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import Prepared
@@ -148,25 +142,14 @@ def solve_isolated(
     """
     spec = registry.get(name)
     if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
-        import_numerical_modules(
-            *spec.requires
-        )  # Import here, so that the first solve's time does not include it.
+        import_numerical_modules(*spec.requires)  # The first solve's time does not include the import.
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
-    Prepared(
-        problem, spec, options, begin=False
-    )  # Raises an error if the solver rejects the problem or an option.
+    # Raises an error if the solver rejects the problem or an option.
+    Prepared(problem, spec, options, begin=False)
     task = Task(
-        run="",
-        case=problem.name,
-        sha=hash_problem(problem),
-        solver=name,
-        mode="tol",
-        tol=tol,
-        max_iter=max_iter or 0,
-        time_limit=check_time_limit(time_limit),
-        start="warm",
-        options=options,
-    )
+        run="", case=problem.name, sha=hash_problem(problem), solver=name, mode="tol", tol=tol, max_iter=max_iter or 0,
+        time_limit=check_time_limit(time_limit), start="warm", options=options,
+    )  # fmt: skip
     return worker.solve(problem, task)
 
 
