@@ -58,8 +58,10 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
         np.concatenate([bodies.joint_body[joints].ravel(), bodies.contact_body[contacts].ravel()])
     )
     used = used[used >= 0]
-    check_float = np.full(bodies.n_bodies + 1, -1, np.int32)  # The last entry belongs to the static body, -1.
-    check_float[used] = np.arange(len(used))
+    number_in_part = np.full(
+        bodies.n_bodies + 1, -1, np.int32
+    )  # The last entry belongs to the static body, -1.
+    number_in_part[used] = np.arange(len(used))
     joint_rows = int(np.diff(bodies.joint_ptr)[joints].sum())
     part = replace(
         bodies,
@@ -68,12 +70,12 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
         v_free=bodies.v_free[used],
         jac=bodies.jac[rows[:joint_rows]],
         joint_ptr=np.concatenate([[0], np.cumsum(np.diff(bodies.joint_ptr)[joints])]).astype(np.int32),
-        joint_body=check_float[bodies.joint_body[joints]],
+        joint_body=number_in_part[bodies.joint_body[joints]],
         normal=bodies.normal[contacts],
         tangent=bodies.tangent[contacts],
         arm_a=bodies.arm_a[contacts],
         arm_b=bodies.arm_b[contacts],
-        contact_body=check_float[bodies.contact_body[contacts]],
+        contact_body=number_in_part[bodies.contact_body[contacts]],
         copy=False,
     )
     assert problem.compliance is not None

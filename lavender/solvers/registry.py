@@ -12,17 +12,20 @@ import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
 from lavender.base.lazy_import import import_lock, import_module_under_lock
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.costs import Cost
 from lavender.solvers.decisions import DECISIONS
+
+if TYPE_CHECKING:
+    from lavender.solvers.small import SmallCall
 
 __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
@@ -53,39 +56,6 @@ class SolverOptions(TypedDict, total=False):
     settings: Mapping[str, Any]
     isolate: bool
     unit_diagonal: bool
-
-
-class SmallCall(Protocol):
-    """Compiled call that solves a small problem with the same bits as `run`, or returns None to leave it to `run`."""
-
-    @property
-    def pivots(self) -> bool:  # pyright: ignore[reportReturnType]
-        """Whether the call accepts bounded rows of a matrix or of bodies."""
-
-    @property
-    def hands_over(self) -> bool:  # pyright: ignore[reportReturnType]
-        """Whether the call accepts friction on a matrix or on bodies."""
-
-    @property
-    def limits(self) -> Any:
-        """Limits of the call's cost in generalised coordinates; None if the call does not accept this form."""
-
-    @property
-    def rules(self) -> Any:
-        """Options of the compiled call for matrices and bodies."""
-
-    def solve_and_judge(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = ...
-    ) -> tuple[Any, Any]:  # pyright: ignore[reportReturnType]
-        """Solve from `impulse` (m,) [N s] or from the zero impulse; return (judged result, work counts).
-
-        The result is None if the call did not converge. `max_cost` [ns] limits the estimated cost of the call.
-        """
-
-    def make_claim(
-        self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
-    ) -> Claim:  # pyright: ignore[reportReturnType]
-        """Build the claim of a call from its counts, its start (m,) and its final relative residual `after`."""
 
 
 class State(Protocol):
