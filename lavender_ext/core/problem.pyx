@@ -587,18 +587,21 @@ cdef class Data:
             self.store_reference(other.blocks.islands, start)
 
     def islands(self):
-        """Return (number of islands, island of each block (k,)), computed by `find_islands` of core/islands.pxd."""
+        """Return (number of islands, island of each block (k,)): the labels of the judge, if it has judged the zero impulse."""
         cdef view_t v = self.get_pointers()
-        cdef islands_t islands
-        cdef Py_ssize_t i, k = self.blocks.n_blocks
-        cdef Workspace marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
-        cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &islands)
+        cdef islands_t found
+        cdef const islands_t* islands = self.blocks.islands
+        cdef Py_ssize_t k = self.blocks.n_blocks
+        cdef Workspace marks
+        if self.reference_energy < 0.0:
+            marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
+            islands = &found if find_islands(&v, <int32_t*>marks.at, &found) > 1 else NULL
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_
-        if count > 1:
-            for i in range(k):
-                label[i] = islands.label[i]
-        return count if k else 0, label_
+        if islands == NULL:
+            return 1 if k else 0, label_
+        memcpy(&label[0], islands.label, k * sizeof(int32_t))
+        return islands.n, label_
 
 
 def make_generalized_data(Blocks blocks, b, Operator operator, compliance, int law):
