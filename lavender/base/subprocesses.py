@@ -226,7 +226,7 @@ class ProcessBackend:
         if process is None:
             return
         if PROCESS_GROUPS:
-            # Kill the group. Its number, that of its first process, is not reused while a process of the group runs.
+            # Kill the group. Its number, which its first process has too, is not reused while a process of it runs.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
         self._close_lifeline()

@@ -42,7 +42,7 @@ MAX_HIGHS_SHIFT = 1e-3
 
 
 def _merge(settings: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings without those that are None (no time limit), overridden by those of the user."""
+    """Return the settings without those that are None (no time limit), overridden by the user's settings."""
     return {name: value for name, value in settings.items() if value is not None} | extra
 
 

@@ -377,7 +377,7 @@ def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Cal
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
-    """Write an archive of arrays (.npz) with `write_atomically`; their names may be those of arguments of NumPy."""
+    """Write an archive of arrays (.npz) with `write_atomically`; their names may equal names of arguments of NumPy."""
 
     def write_to(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "x", zipfile.ZIP_DEFLATED) as archive:

@@ -12,7 +12,7 @@ row's velocity, in `lavender_ext/core/block.pxd`). Then
     success   relative <= tol
 
 Each island (blocks connected through moving bodies, trees of M or entries of A) has its own E, V, E0 and V0, so bodies
-that never meet do not change each other's verdict; the relative residual and the floor are those of the worst island.
+that never meet do not change each other's verdict; the relative residual and the floor belong to the worst island.
 E shows errors of heavy bodies, V errors of light bodies. If the zero impulse solves an island, row by row to rounding,
 the size of the terms of its active rows replaces E0 and V0 (`lavender_ext/judge/reference.pxd`).
 

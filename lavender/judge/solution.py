@@ -29,7 +29,7 @@ class Status(str, Enum):
     description: str
 
     def __new__(cls, name: str, description: str) -> Status:
-        """Create the member whose text is its name."""
+        """Create the member; its text is its name."""
         member = str.__new__(cls, name)
         member._value_, member.description = name, description
         return member

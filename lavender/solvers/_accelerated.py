@@ -22,7 +22,7 @@ from lavender.solvers.sweeping import (
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core.order import SYMMETRIC
 
-SWEEPS = ("pgs", "blocks")
+SWEEP_NAMES = ("pgs", "blocks")
 MAX_MEMORY = 16
 # An accelerated sweep stops as STALLED after this many iterations without progress. At large mass ratios, the residual
 # of conjugate gradients first rises for hundreds of iterations.
@@ -84,7 +84,7 @@ class Accelerated(Sweeping):
     def _check(self, problem: Problem) -> None:
         """Raise InputError if the options `sweep` and `convex` are not valid for the problem."""
         if self.sweep is not None:
-            check_name("sweep", self.sweep, SWEEPS)
+            check_name("sweep", self.sweep, SWEEP_NAMES)
         if self.sweep == "pgs" and problem.law == "cone":
             raise InputError(
                 "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give "

@@ -30,7 +30,7 @@ from lavender.solvers.sweeping import (
 )
 from lavender_ext.sweep import serial
 
-_NONE = np.empty(0, np.int32)
+_NO_ORDER = np.empty(0, np.int32)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,9 @@ class PGS(Sweeping):
         data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
         # In the given order, pass no order to the kernel: it then skips two lookups per row. The bits do not change.
         row_by_row = data.single_rows and order.is_given
-        return SweepState(problem, data, order, serial.Sweeps(data, _NONE if row_by_row else blocks, *rest))
+        return SweepState(
+            problem, data, order, serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)
+        )
 
 
 SPEC = replace(

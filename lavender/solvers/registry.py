@@ -33,7 +33,7 @@ __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available"
 # Up to this many rows, the compiled call `SolverSpec.small` is tried first, because Python's overhead dominates a
 # solve.
 SMALL_ROWS = int(DECISIONS.small_rows)
-# Modules whose SPECS are registered first. They are named by strings because they import this module.
+# Modules with the SPECS that are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
 
 

@@ -12,7 +12,7 @@
                         unless more sweeps are predicted than its cost, or stage 3, pays for
                      3. `admm` from zero, up to 0.4 times that cost and 600 iterations, if this pays for 150
                      4. the interior points of `newton` on the relaxation, until their residual of the relaxation is
-                        below `slip_ratio` times that of Coulomb's law: contacts slip
+                        below `slip_ratio` times Coulomb's: contacts slip
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
                      the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
@@ -24,7 +24,7 @@
                      `total_ratio` times the cost of the cheapest
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
-Linear problems given by a matrix, and others whose A is a narrow band, start with `direct`. A program with a singular P
+Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
 is solved by backends (`singular_programs.py`). The result is the best impulse of all stages. Costs are estimated, never
 measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
 starts only if its estimated cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of
@@ -234,7 +234,7 @@ class Newton(Step):
 class RelaxedNewton(Step):
     """Interior points on the convex relaxation, judged under Coulomb's law. They stop if contacts slip."""
 
-    like: Any = None  # `NewtonState` of the problem, whose elimination order is reused.
+    like: Any = None  # `NewtonState` of the problem; its elimination order is reused.
 
     def advance(self, n: int) -> Claim:
         """Run at most n factorisations, and compare both laws after each from the first possible end on."""

@@ -376,8 +376,8 @@ def decide_empty_rows(
     Returns
     -------
     tuple or None
-        If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all rows whose b cannot
-        be met. None otherwise.
+        If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all such rows. None
+        otherwise.
     """
     cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
     # Leave out friction rows, which have no fixed bounds.

@@ -349,9 +349,9 @@ class Prepared:
         spec, problem, deadline = self.spec, self.problem, loop.deadline
         setup_time, self.setup_time = self.setup_time, 0.0
         is_foreign = spec.external or not spec.builtin
-        given, refutation, proof = loop.impulse, "", None
+        given_start, refutation, proof = loop.impulse, "", None
         if len(problem.metric.empty):
-            given = given.copy()
+            given_start = given_start.copy()
             proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
             message, certificate, impossible = proof
@@ -376,7 +376,7 @@ class Prepared:
                 and not has_default_start
                 and not problem.has_singular_program
             ):
-                _replace_stale_islands(problem, given, loop.impulse)
+                _replace_stale_islands(problem, given_start, loop.impulse)
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             # Own solvers claim only what the judge confirms.
@@ -554,14 +554,14 @@ def check_arguments(
     )
 
 
-def _replace_stale_islands(problem: Problem, given: FloatArray, impulse: FloatArray) -> None:
+def _replace_stale_islands(problem: Problem, given_start: FloatArray, impulse: FloatArray) -> None:
     """Set `impulse` (m,) in place to zero in islands in which the given start (m,) is worse than that.
 
     The start is judged as given, as compiled calls do: without its empty rows it may be worse than zero.
     """
-    kept = given.copy()
+    kept = given_start.copy()
     replace_stale_start(problem, kept)
-    is_stale = kept != given
+    is_stale = kept != given_start
     impulse[is_stale] = kept[is_stale]
 
 
