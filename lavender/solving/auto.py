@@ -21,7 +21,9 @@
                      constraints, for other problems under Coulomb's law by a linear program
     alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued where it stopped, with doubled
                      work in each round, until no solver improves the residual in two rounds or the total cost exceeds
-                     `total_ratio` times the cost of the cheapest
+                     `total_ratio` times the cost of the cheapest. On large problems with friction, the factorising
+                     solvers, which have just run, come last in a round, and `admm` continues while one more turn is
+                     predicted to solve the problem
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
@@ -672,19 +674,36 @@ class DecisionTree:
         times *= DECISIONS.budget_ratio
         p, cost, setup = self.problem, times * self.unit, 0.0
         why = f"in turn, {times:g} times the cheapest factorising solver's cost"
-        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+        factorisations = [self.factorisation(name, cost, why) for name in self.solver_costs]
+        # On large problems with friction, the factorising solvers have just had a turn, and `admm` ends many solves
+        # from their best impulse.
+        is_large = starts_relaxed(p)
+        if not is_large:
+            yield from factorisations
         n = 0.5 * cost / self.sweep  # An iteration of the next two solvers costs as much as two sweeps.
         if p.generalized is not None:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
         if setup <= cost:
-            yield Stage("admm", n, cost, why)
+            yield from self.repeat_while_converging(Stage("admm", n, cost, why))
         yield Stage("nncg", n, cost, why)
         if not self.sweeps_failed and not p.cones.has_round:
             before = self.best
             yield self.sweeps(cost, why)
             self.sweeps_failed = self.best >= before
+        if is_large:
+            yield from factorisations
+
+    def repeat_while_converging(self, stage: Stage) -> Iterator[Stage]:
+        """Yield a stage. On large problems with friction, repeat it while one more turn is predicted to reach tol."""
+        is_converging = True
+        while is_converging:
+            before = self.best
+            yield stage
+            # One more turn of the same gain reaches tol.
+            gains = starts_relaxed(self.problem) and self.best < before
+            is_converging = gains and self.best**2 <= self.log.tol * before
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
         """Return the stage of a factorising solver with the budget `cost` [ns]."""

@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import lavender as lv
 from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
 from lavender.solvers import costs
-from lavender.solving.auto import METHODS
+from lavender.solving.auto import METHODS, DecisionTree, Stage, starts_relaxed
 
 
 @pytest.fixture(autouse=True)
@@ -209,3 +210,33 @@ def test_cones_that_sweeps_do_not_take_have_steps_that_do():
 def test_direct_gets_its_budget_on_a_narrow_band_once():
     stages = [stage for stage in lv.explain(suite.stack(n=200).problem).stages if "in turn" not in stage.why]
     assert [stage.solver for stage in stages] == ["direct", "newton"]
+
+
+def test_auto_sliding_pyramid_admm_follows_first_turn_of_newton():
+    problem = suite.case("pyramidF(k=12, sliding=0.5, mass_ratio=3)").problem
+    assert starts_relaxed(problem)
+    names = [stage.solver for stage in DecisionTree(problem).iterate_one_round(1.0)]
+    assert names == ["admm", "nncg", "anderson", "newton"]
+    small = suite.case("pyramidF(k=6, sliding=0.5)").problem
+    names = [stage.solver for stage in DecisionTree(small).iterate_one_round(1.0)]
+    assert names[0] == "newton" and names[-1] == "anderson"
+
+
+@pytest.mark.parametrize(
+    ("residuals", "turns"),
+    [
+        ([1e-2, 1e-2], 1),  # no gain
+        ([1e-2, 1e-3], 1),  # three more turns of the same gain
+        ([1e-2, 1e-4, 3e-5], 2),  # one more turn, which gains too little
+        ([1e-2, 1e-4, 2e-6, 2e-6], 3),
+    ],
+)
+def test_admm_turn_repeats_while_one_more_is_predicted_to_solve(residuals, turns):
+    log = SimpleNamespace(best=residuals[0], tol=1e-6)
+    tree = DecisionTree(suite.case("pyramidF(k=12, sliding=0.5)").problem, log=log)
+    stages = tree.repeat_while_converging(Stage("admm", 1.0, 1.0, ""))
+    done = 0
+    for _ in stages:
+        done += 1
+        log.best = residuals[done]
+    assert done == turns
