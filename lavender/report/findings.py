@@ -188,7 +188,7 @@ class Report:
         if len(self.structures) > 1 and not self.is_campaign:
             name, wanted = "structures", ["structure", target, f"time {target} [s]"]
         frame = self.sections[name].frame
-        frame = frame[[c for c in wanted if c in frame]]
+        frame = frame[[c for c in wanted if c in frame]].rename(columns={f"time {target} [s]": "time [s]"})
         return Section("overview", "", "", frame)
 
     @cached_property

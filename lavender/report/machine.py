@@ -89,32 +89,17 @@ def _map_modules_to_distributions() -> Mapping[str, list[str]]:
 
 def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
     """Describe a run that starts now; its identity is a hash of CPU, versions and plan, not of the time."""
-    facts = {
-        "lavender": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "cpu": get_cpu_name(),
-        "cores": os.cpu_count() or 1,
-        "threads": 1,
-        "versions": get_versions(packages),
-    }
-    # These facts affect a single measurement; the selection of cases and solvers does not.
-    identity_facts: dict[str, Any] = {
-        **facts,
-        "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan},
-    }
+    facts: dict[str, Any] = {
+        "lavender": __version__, "python": platform.python_version(), "platform": platform.platform(),
+        "cpu": get_cpu_name(), "cores": os.cpu_count() or 1, "threads": 1, "versions": get_versions(packages),
+    }  # fmt: skip
     build = describe_build()
-    identity_facts["build"] = build
-    digest = hashlib.sha256(json.dumps(identity_facts, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    # These facts affect a single measurement; the selection of cases and solvers does not.
+    identity = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}, "build": build}
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:12]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return Run(
-        run=digest,
-        started=started,
-        plan=dict(plan),
-        build=build | get_processor_clock(),
-        load=get_load_average(),
-        **facts,  # type: ignore[arg-type]
-    )
+    build = build | get_processor_clock()
+    return Run(run=digest, started=started, plan=dict(plan), build=build, load=get_load_average(), **facts)
 
 
 def get_load_average() -> float | None:

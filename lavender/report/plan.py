@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, UnknownName
@@ -44,6 +43,10 @@ class Plan:
     orders : sequence of str
         Sweep orders in addition to "given", each at the middle budget, for solvers with a sweep order; "random:3" is
         random with seed 3.
+    campaign : bool
+        Measure no times; see `CampaignPlan`.
+    cap : int
+        Largest number of iterations of a run to a tolerance.
 
     Raises
     ------
@@ -61,6 +64,7 @@ class Plan:
     warm: bool = True
     orders: Sequence[str] = ()
     campaign: bool = False
+    cap: int = UNLIMITED_ITERATIONS
 
     def __post_init__(self) -> None:
         for name in ("tolerances", "budgets", "orders"):
@@ -74,6 +78,7 @@ class Plan:
                 "of the two"
             )
         check_int("repeats", self.repeats, 1)
+        check_int("cap", self.cap, 1)
         check_float("time_limit", self.time_limit, above=0.0)
         check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
         for name in ("warm", "campaign"):
@@ -88,20 +93,13 @@ class Plan:
                     "integer: random:3"
                 )
         # Remove duplicates: a value given twice would be run twice and change the middle value.
-        object.__setattr__(
-            self, "tolerances", tuple(sorted({float(x) for x in self.tolerances}, reverse=True))
-        )
-        counts = {check_int("budget", n, 1) for n in self.budgets}
-        object.__setattr__(self, "budgets", tuple(sorted(counts)))
-        object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
-
-    def get_max_iterations(self) -> int:
-        """Return the maximum number of iterations of a run to a tolerance."""
-        return UNLIMITED_ITERATIONS
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields, for the description of a run."""
-        return asdict(self)
+        unique = {
+            "tolerances": sorted({float(x) for x in self.tolerances}, reverse=True),
+            "budgets": sorted({check_int("budget", n, 1) for n in self.budgets}),
+            "orders": dict.fromkeys(self.orders),
+        }
+        for name, values in unique.items():
+            object.__setattr__(self, name, tuple(values))
 
     def measure_solver(
         self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
@@ -124,7 +122,7 @@ class Plan:
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
-        max_iterations = self.get_max_iterations() if spec.resumable else 0
+        max_iterations = self.cap if spec.resumable else 0
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
                 record = measure_one("tol", tolerance, max_iterations, start)
@@ -149,22 +147,13 @@ class CampaignPlan(Plan):
 
     Its records do not depend on the machine's load or the number of workers.
 
-    Parameters
-    ----------
-    cap : int
-        Largest number of iterations of a run to a tolerance.
-    time_limit : float, s
-        After this time the process of a third-party solver is killed; only its own record depends on it.
+    After `time_limit` the process of a third-party solver is killed; only its own record depends on it.
     """
 
     repeats: int = 1
     time_limit: float = HANG_LIMIT
-    cap: int = 20_000
     campaign: bool = True
-
-    def get_max_iterations(self) -> int:
-        """Return `cap`."""
-        return self.cap
+    cap: int = 20_000
 
 
 def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str]]:
@@ -180,6 +169,4 @@ def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str
 
 def _rules_out_tighter_tolerances(record: Record) -> bool:
     """Whether a run that missed its tolerance shows that tighter tolerances cannot be reached either."""
-    return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
-        "CRASHED"
-    )
+    return record.status.startswith(("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED"))

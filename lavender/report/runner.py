@@ -12,7 +12,7 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -176,7 +176,7 @@ def run(
         items = [replace(item, sequence="", step=-1) for item in items]
     names = select_solver_names(solvers)
     packages = {module for name in names for module in registry.specs()[name].requires}
-    this = machine.describe_run({**plan.as_dict(), "solvers": names}, packages)
+    this = machine.describe_run({**asdict(plan), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
     with cluster, open_store(store) as kept, Worker(memory) as worker, limit_to_one_thread():

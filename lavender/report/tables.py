@@ -93,7 +93,11 @@ def compute_mean(times: Any, axis: int = -1) -> Any:
 
 def get_times(frame: Frame, tolerance: float) -> Frame:
     """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
-    runs = select_ranked_runs(frame)
+    return _get_times_of_runs(select_ranked_runs(frame), tolerance)
+
+
+def _get_times_of_runs(runs: Frame, tolerance: float) -> Frame:
+    """Compute `get_times` from ranked runs."""
     reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].assign(
         time=lambda x: x["time"].fillna(0.0)
     )
@@ -111,8 +115,8 @@ def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
     DataFrame
         By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `worst` [s], `hardest` (case), `tie`.
     """
-    times = get_times(frame, tolerance)
     runs = select_ranked_runs(frame)
+    times = _get_times_of_runs(runs, tolerance)
     ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"], observed=True).median()
     false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
     ranking = pd.DataFrame({

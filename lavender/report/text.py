@@ -73,49 +73,40 @@ def list_diagnostics(records: Records) -> list[tuple[str, str]]:
         for diagnostic in info.diagnostics:
             kind = diagnostic.partition(":")[0]
             seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
-    return [
-        (
-            f"{some[0][0]} and {format_count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0],
-            some[0][1],
-        )
-        for some in seen.values()
-    ]
+    found = []
+    for (name, diagnostic), *more in seen.values():
+        found.append((f"{name} and {format_count(len(more), 'more step')}" if more else name, diagnostic))
+    return found
 
 
-def _get_skip_reason(skip: Skip) -> str:
-    """Return the reason of a skip without the name of its case, so that equal reasons can be grouped."""
-    return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
+def _group_by_reason(skips: Iterable[Skip]) -> dict[str, list[Skip]]:
+    """Group skips by their reason without the name of the case."""
+    same: dict[str, list[Skip]] = {}
+    for skip in skips:
+        reason = skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
+        same.setdefault(reason, []).append(skip)
+    return same
 
 
 def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
     """Return each different reason of some skips; if it holds for several cases, with their number."""
-    same: dict[str, list[Skip]] = {}
-    for skip in skips:
-        same.setdefault(_get_skip_reason(skip), []).append(skip)
-    cases = {cause: len({skip.case for skip in some}) for cause, some in same.items()}
-    return [
-        some[0].reason if cases[cause] == 1 else f"{cause} ({cases[cause]} cases)"
-        for cause, some in same.items()
-    ]
+    same = _group_by_reason(skips)
+    cases = {reason: len({skip.case for skip in some}) for reason, some in same.items()}
+    return [same[r][0].reason if n == 1 else f"{r} ({n} cases)" for r, n in cases.items()]
 
 
 def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
     """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
-    same: dict[str, list[Skip]] = {}
-    for skip in records.left_out.get("", ()):
-        same.setdefault(_get_skip_reason(skip), []).append(skip)
-    single = [
-        (some[0].case, some[0].reason)
-        if len(some) == 1
-        else (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", cause)
-        for cause, some in same.items()
+    cases = [
+        (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", reason)
+        if len(some) > 1
+        else (some[0].case, some[0].reason)
+        for reason, some in _group_by_reason(records.left_out.get("", ())).items()
     ]
-    steps = {
-        f"{format_count(len(some), 'step')} of {name}": some
-        for name, some in records.left_out.items()
-        if name
-    }
-    return [*single, *((n_steps, some[0].reason) for n_steps, some in steps.items())]
+    for name, some in records.left_out.items():
+        if name:
+            cases.append((f"{format_count(len(some), 'step')} of {name}", some[0].reason))
+    return cases
 
 
 def format_left_out_count(lost: int) -> str:
