@@ -12,8 +12,6 @@ from random_problems import FORMS, arrays_of, as_matrix, random_contact_problem,
 from worked import python
 
 import lavender as lv
-from lavender.problem.generalized import issparse
-from lavender.problem.generalized import sp as late
 
 I2 = np.eye(2)
 
@@ -233,19 +231,6 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
     for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
         assert kept is given[name]
         assert not kept.flags.writeable
-
-
-def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
-    assert late.csgraph  # a module of its own, which has been used
-    for again in (copy.copy(late), pickle.loads(pickle.dumps(late))):
-        assert again.csr_array is sp.csr_array
-
-    class Foreign:
-        def __getattr__(self, name):
-            raise RuntimeError(name)
-
-    assert not issparse(Foreign())
-    assert issparse(sp.eye_array(2))
 
 
 def test_contact_with_rows_of_two_kinds_of_contacts_needs_tangents():

@@ -8,12 +8,8 @@ from hypothesis import assume, given
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
-from benchmarks.core_problems import fresh
 from lavender.base.lu import factor_sparse_lu
 from lavender.judge.certificates import check_certificate
-from lavender.solvers import pivoting
-from lavender.solvers.costs import estimate_result_cost
-from lavender_ext.pivot import direct
 
 
 def spd(rng, m, spread=2.0):
@@ -223,33 +219,6 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
         )
         for solver in ("direct", "auto"):
             assert lv.solve(lv.Problem.linear(full, b), solver).claim_check == "confirmed"
-
-
-@pytest.mark.parametrize("share", [0.3, 1.5, 2.5, 4.0, 20.0])
-def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeypatch):
-    """All were one turn: 4.2 ms under a limit of 1 ms."""
-    rng = np.random.default_rng(0)
-    problem = lv.Problem.lcp(laplacian(40, 2.0), rng.normal(size=1600))
-    free = lv.solve(fresh(problem), "direct")
-    each = 6e-4  # s a round
-
-    class Played(direct.Pivoting):
-        def advance(self, n):
-            before = self.n_rounds
-            code = super().advance(n)
-            clock.now += each * (self.n_rounds - before)
-            return code
-
-    monkeypatch.setattr(pivoting, "Pivoting", Played)
-    limit = 1e-9 * estimate_result_cost(fresh(problem)) + 5e-4 + share * each
-    found = lv.solve(fresh(problem), "direct", time_limit=limit)
-    assert clock.now <= limit
-    assert found.residual.relative <= lv.residual(problem, problem.start()).relative
-    assert free.iterations > 4 and free.solver.form == "band"
-    if share == 20.0:
-        assert found.success and found.impulse.tobytes() == free.impulse.tobytes()
-    else:
-        assert found.status is lv.Status.TIME_LIMIT and (found.iterations > 0) == (share > 1.0)
 
 
 def test_a_panel_that_lost_a_pivot_is_counted_and_named():
