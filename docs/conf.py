@@ -57,7 +57,7 @@ CONTENTS = {
         "commands report formats own-engine generalized quadratic-programs mujoco worlds engines engine-arrays "
         "audit tune derivatives c solvers backends generated/api"
     ),
-    "LavenderSim": "engine engine-measurements scenes towers web",
+    "LavenderSim": "engine scenes towers web",
     "Background": (
         "chapter chapter-answers chapter-engines motion newtons-method auto performance peers generated/cases "
         "generated/measured method"
