@@ -18,6 +18,11 @@ def make_problem():
 
 def record_frames(problem, name, **arguments):
     """Return (file, function) of each Python frame of the package in one solve."""
+    return record_frames_of(lambda: lv.solve(problem, name, **arguments))
+
+
+def record_frames_of(call):
+    """Return (file, function) of each Python frame of the package in a call."""
     frames = []
 
     def record(frame, event, _):
@@ -28,7 +33,7 @@ def record_frames(problem, name, **arguments):
     before = sys.getprofile()
     sys.setprofile(record)
     try:
-        lv.solve(problem, name, **arguments)
+        call()
     finally:
         sys.setprofile(before)
     return frames
@@ -60,3 +65,34 @@ def test_solve_of_new_problem_computes_each_check_and_array_once(name):
     calls = [function for _, function in record_frames(make_problem(), name)]
     once = ("check_accepted", "check_arguments", "get_zero_impulse_reference", "_compressed", "finish")
     assert {function: calls.count(function) for function in once} == dict.fromkeys(once, 1)
+
+
+def step_engine():
+    scene = lv.Scene(solver="block_gauss_seidel")
+    scene.add_plane()
+    scene.add_box(position=(0.0, 0.0, 0.5))
+    lv.Simulation(scene).step()
+
+
+def solve_program():
+    rows = np.array([[1.0, 1.0]])
+    program = lv.Problem.from_qp(np.eye(2), np.array([-1.0, -1.0]), G=rows, h=np.array([1.0]))
+    assert lv.solve_qp(program, "admm", tol=1e-6).found
+
+
+# Each caller, with a solver that has no compiled call for the problem.
+HOSTS = {
+    "solve": lambda: lv.solve(make_problem(), "pgs"),
+    "prepare": lambda: lv.prepare(make_problem(), "pgs").solve(),
+    "solve_many": lambda: lv.solve_many([make_problem(), make_problem()], "pgs"),
+    "solve_qp": solve_program,
+    "engine": step_engine,
+}
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_host_solves_by_the_one_sequence_of_prepare_step_and_finish(host):
+    files = [file for file, _ in record_frames_of(HOSTS[host])]
+    sequence = [os.path.join("solving", name) for name in ("prepared.py", "loop.py", "finish.py")]
+    first = [files.index(file) for file in sequence]
+    assert first == sorted(first)
