@@ -119,12 +119,7 @@ def compute_kkt_error(program, x, y=None, z=None, z_box=None):
         y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero without rows.
         b, h, low, high = (
             [mpmath.mpf(float(v)) for v in program.get(name, missing)]
-            for name, missing in (
-                ("b", ()),
-                ("h", ()),
-                ("lb", np.full(n, -np.inf)),
-                ("ub", np.full(n, np.inf)),
-            )
+            for name, missing in (("b", ()), ("h", ()), ("lb", np.full(n, -np.inf)), ("ub", np.full(n, np.inf)))
         )
         terms = rows(program["P"], x), map(float, program["q"]), rows(A.T, y), rows(G.T, z), box
         terms = [list(map(mpmath.mpf, term)) for term in terms]
@@ -212,9 +207,7 @@ def main():
         count["right but contradicted"] += solution.is_contradicted and here <= args.tol
         if here > max(MAX_RATIO * alone, args.tol):
             count["worse"] += 1
-            print(
-                f"{draw} {name}: {here:.1e} here, {alone:.1e} alone, {solution.status.name}: {solution.message}"
-            )
+            print(f"{draw} {name}: {here:.1e} here, {alone:.1e} alone, {solution.status.name}: {solution.message}")
     print(f"last draw {last}")
     for name, count in counts.items():
         print(name, ", ".join(f"{k} {v}" for k, v in count.items()))

@@ -89,11 +89,7 @@ def prepare_sweeps(problem, name="sequential_impulses", packs=True, **options):
 def sweep_in_parts(problem, counts, name="sequential_impulses", *, start=None, packs=True, **options):
     """Impulse and velocities of bodies after runs of those many sweeps each, and (packed records, stages)."""
     prepared = prepare_sweeps(problem, name, packs, **options)
-    lam = (
-        0.05 * np.abs(np.random.default_rng(problem.m).normal(size=problem.m))
-        if start is None
-        else start.copy()
-    )
+    lam = 0.05 * np.abs(np.random.default_rng(problem.m).normal(size=problem.m)) if start is None else start.copy()
     for n in counts:
         prepared.solver.run(prepared.state, lam, n, 0.0)
     sweeps = prepared.state.sweeps
@@ -164,9 +160,7 @@ def system_in(problem, form):
     """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     if form != "sparse":
         return make_system(problem, form)
-    with mock.patch.multiple(
-        systems, MAX_ALWAYS_DENSE_ROWS=0, CONE_DENSE_FRACTION=2.0, OTHER_DENSE_FRACTION=2.0
-    ):
+    with mock.patch.multiple(systems, MAX_ALWAYS_DENSE_ROWS=0, CONE_DENSE_FRACTION=2.0, OTHER_DENSE_FRACTION=2.0):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system

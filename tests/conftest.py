@@ -34,9 +34,7 @@ PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
 def pytest_addoption(parser):
-    parser.addoption(
-        "--nightly", action="store_true", help="also run the tests marked `nightly`, and 200 new examples"
-    )
+    parser.addoption("--nightly", action="store_true", help="also run the tests marked `nightly`, and 200 new examples")
 
 
 def pytest_configure(config):
@@ -113,9 +111,7 @@ def plug_in(register):
                 return run(state, impulse)
 
         laws = {"linear", "lcp", "coulomb", "cone"}
-        register(
-            SolverSpec(name, PlugIn, **{"laws": laws, "summary": "of a test", "resumable": False, **more})
-        )
+        register(SolverSpec(name, PlugIn, **{"laws": laws, "summary": "of a test", "resumable": False, **more}))
         return name
 
     return add

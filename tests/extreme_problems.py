@@ -21,22 +21,7 @@ import lavender as lv
 
 # The largest number that a problem may have; the smallest mass or coefficient.
 LARGEST, SMALLEST = (1e60, 1e-60)
-SPECIAL = (
-    0.0,
-    5e-324,
-    1e-300,
-    1e-61,
-    1e-60,
-    1e-59,
-    1e-30,
-    1e-20,
-    1.0,
-    1.0 + 2.0**-52,
-    1e20,
-    1e30,
-    1e59,
-    LARGEST,
-)
+SPECIAL = (0.0, 5e-324, 1e-300, 1e-61, 1e-60, 1e-59, 1e-30, 1e-20, 1.0, 1.0 + 2.0**-52, 1e20, 1e30, 1e59, LARGEST)
 SHAPES = {
     "inv_inertia": (-1, 3, 3), "v_free": (-1, 6), "jac": (-1, 12), "joint_body": (-1, 2), "contact_body": (-1, 2),
     "normal": (-1, 3), "tangent": (-1, 3), "arm_a": (-1, 3), "arm_b": (-1, 3),
@@ -55,9 +40,7 @@ def plain_data(problem):
 
 def build_problem(data):
     """Build the problem of plain data; InputError if it is not valid."""
-    cones = lv.Cones(
-        **{key: np.array(x, np.int32 if key in INDICES else float) for key, x in data["cones"].items()}
-    )
+    cones = lv.Cones(**{key: np.array(x, np.int32 if key in INDICES else float) for key, x in data["cones"].items()})
     more = {"friction": data["friction"], "guess": data.get("guess")}
     if data["operator"] == "general":
         n = len(data["v_free"])
@@ -172,9 +155,7 @@ def change(data, name, how, seed):
         return
     x = np.array(home[name], float)
     if name in ("A", "M") and how != "special numbers":
-        scale = (
-            10.0 ** rng.integers(-12, 12, len(x)) if how.startswith("scaled") else rng.integers(0, 2, len(x))
-        )
+        scale = 10.0 ** rng.integers(-12, 12, len(x)) if how.startswith("scaled") else rng.integers(0, 2, len(x))
         x = scale[:, None] * x * scale
     else:
         with np.errstate(all="ignore"):

@@ -147,11 +147,7 @@ def directions(problem, rng):
     if problem.generalized is not None:
         g = problem.generalized
         mass = rng.standard_normal((g.nv, g.nv))
-        return out | {
-            "v_free": rng.standard_normal(g.nv),
-            "J": rng.standard_normal((m, g.nv)),
-            "M": mass + mass.T,
-        }
+        return out | {"v_free": rng.standard_normal(g.nv), "J": rng.standard_normal((m, g.nv)), "M": mass + mass.T}
     r = problem.rows
     turn = rng.standard_normal((r.n_contacts, 3))
     out["frames"] = np.cross(turn, r.normal), np.cross(turn, r.tangent)

@@ -27,14 +27,10 @@ class Call:
 
     function: Callable[..., Any]
     arguments: dict[str, Any]
-    names: dict[str, str] = field(
-        default_factory=dict
-    )  # argument -> pattern of its name in messages, if another
+    names: dict[str, str] = field(default_factory=dict)  # argument -> pattern of its name in messages, if another
     accepts_nan: bool = False  # measures and batches report NaN in their results
     any_length: frozenset[str] = frozenset()  # arguments whose length (or number of dimensions) is not fixed
-    accepts: dict[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # argument -> values that are valid after all
+    accepts: dict[str, tuple[str, ...]] = field(default_factory=dict)  # argument -> values that are valid after all
 
     def __call__(self, **changed: Any) -> Any:
         return self.function(**self.arguments | changed)
@@ -162,9 +158,7 @@ LAYOUTS = {
     "columns first": np.asfortranarray,
     "reversed": lambda x: x[::-1].copy()[::-1],
     "read-only": read_only,
-    "at an odd byte": lambda x: (
-        np.frombuffer(b" " + x.tobytes(), np.uint8)[1:].view(x.dtype).reshape(x.shape)
-    ),
+    "at an odd byte": lambda x: np.frombuffer(b" " + x.tobytes(), np.uint8)[1:].view(x.dtype).reshape(x.shape),
     "lists": np.ndarray.tolist,
 }
 
@@ -229,9 +223,7 @@ def public_calls(layer, module=lv, prefix=""):
             kinds = types.FunctionType, classmethod, staticmethod
             for k in dir(x):
                 if (k == "__getitem__" or not k.startswith("_")) and takes_arguments(getattr(x, k)):
-                    names |= (
-                        {f"{prefix}{name}.{k}"} if isinstance(inspect.getattr_static(x, k), kinds) else set()
-                    )
+                    names |= {f"{prefix}{name}.{k}"} if isinstance(inspect.getattr_static(x, k), kinds) else set()
         if callable(x) and takes_arguments(x):
             names.add(f"{prefix}{name}")
     return names

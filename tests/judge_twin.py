@@ -127,12 +127,7 @@ def spec_of(problem):
     spec["compliance"] = problem.compliance.tolist()
     if problem.operator == "generalized":
         g = problem.generalized
-        given = {
-            "J": g.jac.toarray(),
-            "M": g.mass.toarray(),
-            "v_free": g.v_free,
-            "target": np.zeros(problem.m),
-        }
+        given = {"J": g.jac.toarray(), "M": g.mass.toarray(), "v_free": g.v_free, "target": np.zeros(problem.m)}
         return spec | {"operator": "general"} | {key: x.tolist() for key, x in given.items()}
     rows = {f.name: getattr(problem.rows, f.name) for f in fields(problem.rows)}
     return spec | {"rows": {key: x.tolist() for key, x in rows.items() if isinstance(x, np.ndarray)}}
@@ -160,9 +155,7 @@ class Problem:
         self.stretch = self._stretch()
         self.roundings, self.of_factor = self.m + 20, ZERO
         if general:
-            self._of_general(
-                jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L)
-            )
+            self._of_general(jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L))
         elif "rows" in spec:
             self._of_rows(spec)
         else:
@@ -244,9 +237,7 @@ class Problem:
                         size[row, body, 3:] = reach
         self.touches = np.zeros((m, n), bool)  # bodies of each row
         for k, pair in enumerate([*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]):
-            moving = [
-                i for i in pair if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))
-            ]
+            moving = [i for i in pair if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))]
             self.touches[ptr[k] : ptr[k + 1], moving] = True
         minv, minv_size = np.zeros((n, 6, 6), L), np.zeros((n, 6, 6), L)
         for i in range(n):
@@ -427,9 +418,7 @@ class Problem:
                         break
                     high = 2 * high
                 rise = high
-                while (
-                    low < (half := (low + high) / 2) < high
-                ):  # to the last bit, however small it is beside `high`
+                while low < (half := (low + high) / 2) < high:  # to the last bit, however small it is beside `high`
                     rise = half
                     low, high = (rise, high) if excess(rise) > 0 else (low, rise)
                 top = base + rise
@@ -461,18 +450,7 @@ class Problem:
         lam = np.array(impulse, L) / self.stretch
         if not np.isfinite(lam).all():
             return Judgement(
-                np.inf,
-                0.0,
-                0.0,
-                0.0,
-                np.inf,
-                np.inf,
-                np.inf,
-                False,
-                np.inf,
-                np.zeros(0),
-                np.zeros(0),
-                np.zeros(0),
+                np.inf, 0.0, 0.0, 0.0, np.inf, np.inf, np.inf, False, np.inf, np.zeros(0), np.zeros(0), np.zeros(0)
             )
         with np.errstate(all="ignore"):
             return self._judge(lam)
@@ -685,9 +663,7 @@ class Problem:
                 if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
                     return "y leaves the bounds"
                 low, high = np.maximum(low, -LARGEST), np.minimum(high, LARGEST)
-                pull += sum(
-                    x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0
-                )
+                pull += sum(x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0)
                 continue
             yk, zk = y[part], z[part]
             parts = self.parts(k)

@@ -121,12 +121,7 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, r
 def as_matrix(problem):
     """Return the same problem with A as a sparse matrix."""
     return Problem(
-        problem.b,
-        problem.cones,
-        problem.delassus(),
-        friction=problem.friction,
-        guess=problem.guess,
-        name=problem.name,
+        problem.b, problem.cones, problem.delassus(), friction=problem.friction, guess=problem.guess, name=problem.name
     )
 
 
@@ -219,9 +214,7 @@ def ancestors(parent, i):
     return chain
 
 
-def random_generalized_problem(
-    seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False
-):
+def random_generalized_problem(seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False):
     """Draw J and M of a random forest with free and bounded rows and contacts, each row on one or two chains."""
     rng = np.random.default_rng(seed)
     parent = random_tree_parents(rng, n)
@@ -305,10 +298,7 @@ def side_by_side(parts):
     cones = parts[0].cones
     for part in parts[1:]:
         cones = cones + part.cones
-    b, a = (
-        np.concatenate([part.b for part in parts]),
-        sp.block_diag([part.csr for part in parts], format="csr"),
-    )
+    b, a = (np.concatenate([part.b for part in parts]), sp.block_diag([part.csr for part in parts], format="csr"))
     return lv.Problem(b, cones, a, friction=parts[0].friction)
 
 
@@ -325,15 +315,11 @@ def with_ground_as_body(problem):
         for name in ("joint_body", "contact_body")
     }
     bodies = replace(rows, **ground, **pairs)
-    return lv.Problem(
-        problem.b, problem.cones, rows=bodies, compliance=problem.compliance, friction=problem.friction
-    )
+    return lv.Problem(problem.b, problem.cones, rows=bodies, compliance=problem.compliance, friction=problem.friction)
 
 
 #: And by a dense matrix with a guess.
-GIVEN = FORMS | {
-    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
-}
+GIVEN = FORMS | {"dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))}
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -346,12 +332,7 @@ def dragged(seed, contacts, mu=None, shape="disk", friction="coulomb"):
     target[::3] += 1.0
     cones = lv.Cones.contacts(mu, shape=shape, count=contacts if np.ndim(mu) == 0 else None)
     return lv.Problem.from_jacobian(
-        rng.normal(size=(m, nv)),
-        np.eye(nv),
-        rng.normal(size=nv),
-        target=target,
-        cones=cones,
-        friction=friction,
+        rng.normal(size=(m, nv)), np.eye(nv), rng.normal(size=nv), target=target, cones=cones, friction=friction
     )
 
 
@@ -435,9 +416,7 @@ def nearly_singular(seed):
         cones = lv.Cones.contacts(rng.uniform(0.0, 1.2, int(rng.integers(1, 6))))
     else:
         m = int(rng.integers(1, nv + 3))
-        cones = lv.Cones.bounded(
-            np.where((law == "lcp") & (rng.random(m) < 0.5), 0.0, -np.inf), np.full(m, np.inf)
-        )
+        cones = lv.Cones.bounded(np.where((law == "lcp") & (rng.random(m) < 0.5), 0.0, -np.inf), np.full(m, np.inf))
     jac = rng.normal(size=(cones.n_rows, nv))
     if rng.random() < 0.3:
         jac[rng.random(jac.shape) < 0.5] = 0.0

@@ -112,9 +112,7 @@ def test_audit_of_float32_tells_its_floor_from_an_early_stop(boxes, monkeypatch)
 
     def change(arrays, step):
         arrays["efc_force"] *= 0.99 if step in planted else 1.0
-        return {
-            name: x.astype(np.float32) for name, x in arrays.items() if name not in ("qacc", "qfrc_smooth")
-        }
+        return {name: x.astype(np.float32) for name, x in arrays.items() if name not in ("qacc", "qfrc_smooth")}
 
     monkeypatch.setattr(module, "iterate_frames", make_frames(change))
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
@@ -127,11 +125,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
 
     def change(arrays, step):
         bad = np.nan if step >= 4 else 1.0
-        return {
-            name: np.concatenate([x, bad * x]).astype(np.float32)
-            for name, x in arrays.items()
-            if name != "qacc"
-        }
+        return {name: np.concatenate([x, bad * x]).astype(np.float32) for name, x in arrays.items() if name != "qacc"}
 
     monkeypatch.setattr(module, "iterate_frames", make_frames(change))
     found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
@@ -190,9 +184,7 @@ RUNAWAY = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("threshold", [1e-6, 1e3])  # What is close enough to the user need not be exact.
 @pytest.mark.parametrize("options", ["", 'solver="PGS" iterations="1"'])
-def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
-    tmp_path, monkeypatch, options, threshold
-):
+def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(tmp_path, monkeypatch, options, threshold):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
     found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
@@ -206,9 +198,7 @@ def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
     assert ("outside the constraint solver" in found.summary_text) == exact
     # Otherwise a sentence says how to separate the solver from the model.
     assert ('audit again with <option solver="Newton"' in found.summary_text) != exact
-    assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][
-        not exact
-    ] * 3
+    assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][not exact] * 3
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -246,22 +236,16 @@ def test_rows_and_contacts_are_those_of_the_run(boxes):
 
 
 def test_an_audit_of_steps_without_contact_says_so(tmp_path):
-    (tmp_path / "high.xml").write_text(
-        BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20")
-    )
+    (tmp_path / "high.xml").write_text(BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
     found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
     assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.summary_text
     none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
-    (tmp_path / "none.xml").write_text(
-        none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"')
-    )
+    (tmp_path / "none.xml").write_text(none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"'))
     found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
     assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.summary_text
 
 
-@pytest.mark.parametrize(
-    "names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")]
-)
+@pytest.mark.parametrize("names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")])
 def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, names):
     path = boxes(EARLY)
     found = audit(path, worlds=3, steps=25, workers=1)
@@ -277,14 +261,8 @@ def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, name
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (
-            ("qpos", "qvel"),
-            "have no warm start and no controls: the first solve of each world starts cold and the",
-        ),
-        (
-            ("qpos", "qvel", "ctrl"),
-            "have no warm start: the first solve of each world starts cold. The first step",
-        ),
+        (("qpos", "qvel"), "have no warm start and no controls: the first solve of each world starts cold and the"),
+        (("qpos", "qvel", "ctrl"), "have no warm start: the first solve of each world starts cold. The first step"),
         (("qpos", "qvel", "qacc_warmstart"), "have no controls: the first step uses the controls of"),
         (("state",), ""),
         (("qpos", "qvel", "ctrl", "qacc_warmstart"), ""),
@@ -323,9 +301,7 @@ def test_worlds_start_from_keyframes(tmp_path):
     (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
     found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
     assert found.contacts[:, 0].tolist() == [4, 0]
-    assert (
-        len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
-    )
+    assert len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
 
 
 NV, NQ = 13, 15
@@ -362,9 +338,7 @@ def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
     assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
-    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(
-        found.max_velocity_error
-    )
+    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(found.max_velocity_error)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 
@@ -417,9 +391,7 @@ def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package
         assert any("floor" in name for name in frame.batch.names_of(world))
 
 
-SLEEPING = BOXES.format(options="").replace(
-    "<worldbody>", '<option><flag sleep="enable"/></option><worldbody>'
-)
+SLEEPING = BOXES.format(options="").replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>')
 
 
 def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
@@ -438,9 +410,7 @@ def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
         assert found.numbers[0, 0, step] == pytest.approx(judged.velocity, rel=1e-6, abs=1e-12)
         mj.mj_step(awake, data)
     assert "Sleep was off" in found.summary_page.warning
-    assert (
-        "Sleep" not in audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1).summary_page.warning
-    )
+    assert "Sleep" not in audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1).summary_page.warning
 
 
 def path_without_sleep(folder):
@@ -529,13 +499,8 @@ def test_audit_counts_each_verdict_once(boxes):
     counts = {row[0]: int(row[1]) for row in found.table_of_verdicts.cell_texts}
     unconverged, wrong = counts["stopped before convergence"], counts["wrong"]
     assert unconverged and wrong
-    assert (
-        f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence (" in found.summary_text
-    )
-    assert (
-        f", and {wrong} are wrong ({2.5 * wrong:.1f} %): no better than zero forces, in "
-        in found.summary_text
-    )
+    assert f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence (" in found.summary_text
+    assert f", and {wrong} are wrong ({2.5 * wrong:.1f} %): no better than zero forces, in " in found.summary_text
     assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
     assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)

@@ -44,9 +44,7 @@ def test_every_outcome_is_counted(tmp_path):
 
 
 def test_light_bodies_are_listed_by_effective_mass():
-    result = compare_claims(
-        [step_of([0.01], [1], mass=2e-3), step_of([0.01], [0], mass=30.0)], threshold=1e-4
-    )
+    result = compare_claims([step_of([0.01], [1], mass=2e-3), step_of([0.01], [0], mass=30.0)], threshold=1e-4)
     assert [[str(cell) for cell in row] for row in result.table_of_masses.rows] == [
         ["0.001 to 0.01", "1", "1"],
         ["10 to 100", "1", "0"],
@@ -132,9 +130,7 @@ def test_scenes_of_newton_start_from_states(tmp_path):
         np.testing.assert_allclose(again[name], states[name], atol=1e-6)
     assert first.outcome.shape == (4, 3) and len(running[0].batch) == n
     with pytest.raises(lv.InputError, match="body_q has"):
-        step_scene(
-            scene, "kamino", worlds=1, states={"body_q": np.zeros((1, 3, 7)), "body_qd": np.zeros((1, 3, 6))}
-        )
+        step_scene(scene, "kamino", worlds=1, states={"body_q": np.zeros((1, 3, 7)), "body_qd": np.zeros((1, 3, 6))})
     noisy = next(step_scene(scene, "kamino", worlds=3, steps=1, spread=0.1)).state
     assert np.ptp(noisy["body_qd"], axis=0).max() > 0.01
     assert not noisy["body_qd"][0].any()

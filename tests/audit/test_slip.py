@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import (
-    CAUSES,
-    REMEDY_STEPS,
-    average_slip,
-    explain_slip,
-    explain_slip_of_states,
-    summarize_slip,
-)
+from lavender.audit.slip import CAUSES, REMEDY_STEPS, average_slip, explain_slip, explain_slip_of_states, summarize_slip
 from lavender.audit.slip_figure import draw_slip
 from lavender.report.text import NONE
 
@@ -58,11 +51,7 @@ def test_creep_has_the_speed_of_the_softened_row():
     tangent = int(data.contact.efc_address[0]) + 1
     explanation = explain_slip_of_states(model, steps=1501)[0]
     force = GRAVITY * np.sin(angle) / data.ncon
-    damping = (
-        -data.efc_aref[tangent : tangent + 2]
-        @ np.ones(2)
-        / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
-    )
+    damping = -data.efc_aref[tangent : tangent + 2] @ np.ones(2) / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
     speed = data.efc_R[tangent] * force / damping
     assert explanation.variants[0].speeds == pytest.approx(np.full(data.ncon, speed), rel=0.02)
 
@@ -73,9 +62,7 @@ def test_above_the_friction_angle_the_load_is_too_large():
     explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
     assert set(explanation.causes) == {"load above the friction limit"}
     expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
-    assert explanation.variants[-1].speeds == pytest.approx(
-        np.full(len(explanation.contacts), expected), rel=0.05
-    )
+    assert explanation.variants[-1].speeds == pytest.approx(np.full(len(explanation.contacts), expected), rel=0.05)
 
 
 def test_iterations_that_are_missing_are_the_cause():
@@ -96,13 +83,7 @@ def slide(velocity, cones, friction="coulomb", compliance=None):
     jac = np.eye(3)[[2, 0, 1]]
     free = [*velocity, -1.0]
     return lv.Problem.from_jacobian(
-        jac,
-        np.eye(3),
-        free,
-        cones=cones,
-        friction=friction,
-        compliance=compliance,
-        names=["contact 0 (foot, ground)"],
+        jac, np.eye(3), free, cones=cones, friction=friction, compliance=compliance, names=["contact 0 (foot, ground)"]
     )
 
 
@@ -122,15 +103,11 @@ def test_the_shape_of_the_cone_is_a_cause():
     problem = slide([1.0, 1.0], lv.Cones.contacts(0.5).shaped("box"))
     explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
     speeds = {v.name: v.speeds[0] for v in explanation.variants}
-    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(
-        np.sqrt(2.0) - 0.5
-    )
+    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(np.sqrt(2.0) - 0.5)
     assert explanation.parts["shape of the cone"] == pytest.approx([np.sqrt(2.0) - 0.5 - np.sqrt(0.5)])
 
 
-@pytest.mark.parametrize(
-    ("grip", "cause"), [(30.0, "softness of friction"), (6.0, "load above the friction limit")]
-)
+@pytest.mark.parametrize(("grip", "cause"), [(30.0, "softness of friction"), (6.0, "load above the friction limit")])
 def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
     # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
@@ -225,9 +202,7 @@ def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
             contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)], tangent=[(1.0, 0.0, 0.0)],
             arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, 0.0)],
         )  # fmt: skip
-        return lv.Problem.from_rows(
-            rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance]
-        )
+        return lv.Problem.from_rows(rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance])
     return lv.Problem.from_jacobian(
         np.eye(3)[[2, 0, 1]], np.eye(3), [1.0, 0.0, -0.1], target=[0.0, belt, 0.0], cones=lv.Cones.contacts(mu),
         compliance=[0.0, compliance, compliance],

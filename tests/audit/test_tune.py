@@ -66,9 +66,7 @@ def test_a_line_means_in_a_model_what_was_measured(options):
 
 
 def measured(time, error, **options):
-    return Measured(
-        Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time)
-    )
+    return Measured(Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time))
 
 
 def chosen(*some, held=(), threshold=1e-6):
@@ -172,11 +170,7 @@ def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
 
 
 def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
-    now, quick, exact = (
-        measured(10.0, 1e-3),
-        measured(8.0, 1e-3, iterations=9),
-        measured(10.0, 1e-5, tolerance=1e-9),
-    )
+    now, quick, exact = (measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9), measured(10.0, 1e-5, tolerance=1e-9))
     # Times within 5 % are equal: no gain.
     for time, error, refuted in ((7.0, 1e-5, False), (9.8, 1e-3, True), (11.0, 2e-3, True)):
         held = [now, measured(time, 1e-3, iterations=9), measured(10.0, error, tolerance=1e-9)]

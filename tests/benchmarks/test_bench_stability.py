@@ -23,9 +23,7 @@ def left_by_sweeps(n, sweeps):
         for sign in (1.0, -1.0):
             start = rest.copy()
             start[k] += sign * size
-            pair.append(
-                lv.solve(problem, "sequential_impulses", tol=0, max_iter=sweeps, impulse=start).impulse
-            )
+            pair.append(lv.solve(problem, "sequential_impulses", tol=0, max_iter=sweeps, impulse=start).impulse)
         columns.append((pair[0] - pair[1]) / (2 * size))
     values = np.abs(np.linalg.eigvals(np.array(columns).T))
     return values[values < 1 - 1e-7].max()

@@ -71,13 +71,7 @@ def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(tmp_path, a
 
 def test_command_reads_measurements_prints_their_exponent_and_draws_them(tmp_path):
     def line(m, sliding, time, solved):
-        auto = {
-            "time": time,
-            "memory": 1.0,
-            "residual": 1e-7 if solved else 1e-3,
-            "solved": solved,
-            "work": {},
-        }
+        auto = {"time": time, "memory": 1.0, "residual": 1e-7 if solved else 1e-3, "solved": solved, "work": {}}
         runs = {"auto": auto, "newton": auto | {"time": 2.0 * time, "solved": True}}
         return {"structure": "wall", "m": m, "sliding": sliding, "spread": 0.0, "seed": 7, "runs": runs}
 

@@ -154,10 +154,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
         (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
-        (
-            ("report", "a.jsonl", "--tolerances", "1e-3"),
-            "--tolerances has no effect if records are shown again",
-        ),
+        (("report", "a.jsonl", "--tolerances", "1e-3"), "--tolerances has no effect if records are shown again"),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
@@ -210,16 +207,7 @@ def test_help_is_quick_and_names_every_command():
     # What takes time to load is loaded by the command that needs it.
     assert (
         set(done.stderr.split())
-        & {
-            "matplotlib",
-            "h5py",
-            "qpsolvers",
-            "pandas",
-            "rich.table",
-            "jinja2",
-            "lavender.report",
-            "lavender.audit",
-        }
+        & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2", "lavender.report", "lavender.audit"}
         == set()
     )
 
@@ -229,9 +217,7 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
     assert "auto: CONVERGED" in lavender("solve", path)[1]
     assert "8 rows" in lavender("solve", "stack(n=8)", "--solver", "direct")[1]
     assert lavender("solve", path, "--solver", "pgs", "--max-iter", 1)[0] == cli.EXIT_UNMET
-    assert (
-        lavender("solve", path, "--solver", "pgs", "--tol", 0, "--max-iter", 1)[0] == 0
-    )  # a budget, as asked
+    assert lavender("solve", path, "--solver", "pgs", "--tol", 0, "--max-iter", 1)[0] == 0  # a budget, as asked
     impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.ones(2))
     io.save(impossible, tmp_path / "impossible.npz")
     code, out, _ = lavender("solve", tmp_path / "impossible.npz", "--solver", "direct")
@@ -329,9 +315,7 @@ for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot b
 
 
 @pytest.mark.parametrize("columns", ["0", "19"])
-@pytest.mark.parametrize(
-    "words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")]
-)
+@pytest.mark.parametrize("words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")])
 def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words, columns):
     wide = lavender(*words)[1]
     monkeypatch.setenv("COLUMNS", columns)
@@ -346,10 +330,7 @@ def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
     assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
     assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
-    assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [
-        1,
-        2,
-    ]
+    assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [1, 2]
     assert lavender("doctor", tmp_path / "none.npz")[0] == 2
 
 
@@ -392,21 +373,14 @@ def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkey
     assert code == cli.EXIT_BAD_INPUT and "ffmpeg" in err
 
 
-@pytest.mark.skipif(
-    sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder"
-)
+@pytest.mark.skipif(sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder")
 @pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
 def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, words):
     os.rmdir(os.getcwd())
     words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
     code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
     assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err)
-    for words in (
-        "run stack --steps 2 --record r",
-        "export c c",
-        "solve toy_stack --output x.npz",
-        "report toy_stack",
-    ):
+    for words in ("run stack --steps 2 --record r", "export c c", "solve toy_stack --output x.npz", "report toy_stack"):
         code, _, err = lavender(*words.split())
         assert code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err
 

@@ -62,18 +62,7 @@ def test_record_then_report_from_the_command_line(lavender, tmp_path):
         (tmp_path / "torn.xml").write_text(text)
         code, _, said = lavender("report", tmp_path / "torn.xml", "--out", page)
         assert code == EXIT_BAD_INPUT and "torn.xml: " in said
-    words = (
-        "report",
-        model,
-        "--steps",
-        30,
-        "--record-every",
-        10,
-        "--controls",
-        "zero",
-        "--solvers",
-        "auto,newton",
-    )
+    words = ("report", model, "--steps", 30, "--record-every", 10, "--controls", "zero", "--solvers", "auto,newton")
     for again in range(2):  # the second time nothing is recorded anew
         code, told, _ = lavender(*words, "--no-figures", "--tables", "--out", page)
         assert code == 0 and ("3 problems" in told) == (again == 0)

@@ -22,9 +22,7 @@ def test_folder_of_a_recorder_with_states_is_read_by_the_commands(lavender, tmp_
     code, printed, err = lavender(words[0], tmp_path / "r", *words[1:], *out)
     assert code == 0 and "states" not in printed + err
     code, printed, err = lavender(words[0], tmp_path / "r" / "states" / recorder.files[0], *words[1:], *out)
-    assert code != 0 and "holds the state before a recorded step; its problem is" in " ".join(
-        (printed + err).split()
-    )
+    assert code != 0 and "holds the state before a recorded step; its problem is" in " ".join((printed + err).split())
 
 
 def test_folder_of_an_audit_is_read_as_its_worst_problems(lavender, tmp_path):

@@ -82,9 +82,7 @@ def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
 
 
 def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
-    code, *_ = lavender(
-        "report", path, "--solvers", "pgs", "jacobi", "newton", *QUICK, "--out", tmp_path / "out"
-    )
+    code, *_ = lavender("report", path, "--solvers", "pgs", "jacobi", "newton", *QUICK, "--out", tmp_path / "out")
     assert code == 0
     records = tmp_path / "out" / "records.jsonl"
     again = ("--no-figures", "--out", tmp_path / "again")
@@ -92,9 +90,7 @@ def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
     page = (tmp_path / "again" / "tables" / "times.csv").read_text(encoding="utf-8")
     assert code == 0 and "newton" not in out + page
     assert "jacobi" in page and "pgs" in page
-    assert (
-        len(report.read(records)) > len(report.read(records).select_solvers(["pgs"])) > 0
-    )  # the file keeps all
+    assert len(report.read(records)) > len(report.read(records).select_solvers(["pgs"])) > 0  # the file keeps all
     code, _, err = lavender("report", records, "--solvers", "nncg", *again)
     assert code == cli.EXIT_BAD_INPUT
     assert "no records of solver 'nncg'; there are records of jacobi, newton, pgs" in err
@@ -146,9 +142,7 @@ def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monke
 
 def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
     report.run([path], ["pgs"], report.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
-    head = (
-        (tmp_path / "r.jsonl").read_bytes().splitlines(keepends=True)[0]
-    )  # of a run that was stopped at once
+    head = (tmp_path / "r.jsonl").read_bytes().splitlines(keepends=True)[0]  # of a run that was stopped at once
     for left in (b"", b"\n", head):
         (tmp_path / "r.jsonl").write_bytes(left)
         code, _, said = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again")
@@ -172,9 +166,7 @@ def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
     assert code == cli.EXIT_UNMET
     said = "; ".join(
         f"robots need {package}: pip install {package} ({n} cases)"
-        for package, n in Counter(
-            map(steps.get_package_name_of_case, suite.get_case_names_of_set("@robots"))
-        ).items()
+        for package, n in Counter(map(steps.get_package_name_of_case, suite.get_case_names_of_set("@robots"))).items()
     )
     assert f"nothing was measured: {said}\n" in out
     summary = (tmp_path / "out" / "summary.md").read_text()
@@ -194,9 +186,7 @@ def test_report_stopped_by_a_signal_keeps_records_and_writes_the_page(stop, tmp_
     io.save(stack(8), tmp_path / "easy.npz")
     command = [sys.executable, "-m", "lavender.cli", "report", tmp_path / "easy.npz", tmp_path / "hard.npz"]
     command += ["--solvers", "pgs,jacobi", "--time-limit", "60", "--no-figures", "--out", out]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
     records = out / "records.jsonl"
     while not (records.exists() and '"case": "hard"' in records.read_text()):
         assert process.poll() is None
@@ -215,9 +205,7 @@ def test_campaigns_put_together_are_one(lavender, tmp_path):
     more = ("--solvers", "pgs", "--tolerances", "1e-3", "--budgets", "4", "--workers", 1)
     parts = []
     for name, seeds in (("a", (0, 1)), ("b", (2, 3))):
-        code, *_ = lavender(
-            "report", *(f"granular(n=2, seed={i})" for i in seeds), *more, "--out", tmp_path / name
-        )
+        code, *_ = lavender("report", *(f"granular(n=2, seed={i})" for i in seeds), *more, "--out", tmp_path / name)
         assert code == 0
         parts.append((tmp_path / name / "records.jsonl").read_text())
     (tmp_path / "all.jsonl").write_text("".join(parts))
@@ -355,9 +343,7 @@ def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender,
         pytest.skip("this MuJoCo does not tell what a model includes")
     model, part, played = (tmp_path / name for name in ("scene.xml", "part.xml", "played.npy"))
     body = ARM.format(height=0.1, kind="box")
-    part.write_text(
-        f"<mujocoinclude>{body[body.index('<worldbody>') : body.index('</mujoco>')]}</mujocoinclude>"
-    )
+    part.write_text(f"<mujocoinclude>{body[body.index('<worldbody>') : body.index('</mujoco>')]}</mujocoinclude>")
     model.write_text('<mujoco><include file="part.xml"/></mujoco>')
     np.save(played, np.zeros((1, 0)))
     calls, kept = [], recording.record_file

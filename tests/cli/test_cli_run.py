@@ -131,9 +131,7 @@ def test_command_writes_a_page_without_outside_addresses(lavender, module, tmp_p
     pytest.importorskip("Cython", reason="the command translates the kernels (extra: test)")
     assert lavender("web", "page", tmp_path / "site")[0] == 0
     files = {
-        path.relative_to(tmp_path / "site").as_posix()
-        for path in (tmp_path / "site").rglob("*")
-        if path.is_file()
+        path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*") if path.is_file()
     }
     assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
     assert {"lavender.wasm", "newton.wasm"} <= files

@@ -21,9 +21,7 @@ def test_the_table_names_the_cause(lavender, tmp_path):
 
 def test_the_figure_is_written(lavender, tmp_path):
     (tmp_path / "slope.xml").write_text(SLOPE)
-    code, output, error = lavender(
-        "slip", tmp_path / "slope.xml", "--steps", 15, "--out", tmp_path / "slip.svg"
-    )
+    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15, "--out", tmp_path / "slip.svg")
     assert code == 0, error
     assert "<svg" in (tmp_path / "slip.svg").read_text() and "load above the friction limit" in output
     code, _, error = lavender("slip", tmp_path / "slope.xml", "--out", tmp_path / "slip.xyz")

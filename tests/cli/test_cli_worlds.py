@@ -13,18 +13,7 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contac
 
 
 def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
-    words = (
-        "--worlds",
-        2,
-        "--steps",
-        20,
-        "--workers",
-        1,
-        "--out",
-        tmp_path / "out",
-        "--max-velocity-error",
-        "1e-3",
-    )
+    words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--max-velocity-error", "1e-3")
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
     assert len(out.splitlines()) <= 27
@@ -106,9 +95,7 @@ def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path,
 
 def test_recordings_start_from_states(lavender, tmp_path, boxes):
     path = boxes()
-    assert (
-        lavender("audit", path, "--worlds", 1, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")[0] == 0
-    )
+    assert lavender("audit", path, "--worlds", 1, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")[0] == 0
     low = [0, 0, 0.099, 1, 0, 0, 0, 0.02, 0, 0.32, 1, 0, 0, 0, 0]
     states = {
         "qpos": np.array([low, [0, 0, 7, *low[3:]]]),
@@ -118,9 +105,7 @@ def test_recordings_start_from_states(lavender, tmp_path, boxes):
     np.savez(tmp_path / "two.npz", **states)
     words = (path, "--steps", 10, "--record-every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
     assert lavender("record", *words, "--out", tmp_path / "steps")[0] == 0
-    rows = [
-        json.loads(line)["rows"] for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()
-    ]
+    rows = [json.loads(line)["rows"] for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
     assert rows[0] > rows[-1]  # The lower box of the second state is far above the floor.
     words = ("report", *words, "--solvers", "auto", "--no-figures", "--out", tmp_path / "page")
     assert lavender(*words)[0] == 0

@@ -10,18 +10,7 @@ from click.testing import CliRunner
 from lavender.cli.entry import cli
 from lavender.report import doctor, machine
 
-NEEDED = {
-    "lavender",
-    "python",
-    "platform",
-    "cpu",
-    "cores",
-    "versions",
-    "build",
-    "backends",
-    "self_test",
-    "same_bits",
-}
+NEEDED = {"lavender", "python", "platform", "cpu", "cores", "versions", "build", "backends", "self_test", "same_bits"}
 
 
 def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
@@ -34,9 +23,7 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
     facts = machine.describe_run({}).build
     assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
-    assert {k: found["build"][k] for k in facts if k != "clock"} == {
-        k: facts[k] for k in facts if k != "clock"
-    }
+    assert {k: found["build"][k] for k in facts if k != "clock"} == {k: facts[k] for k in facts if k != "clock"}
 
 
 def test_another_bit_is_told_and_is_status_1(monkeypatch):

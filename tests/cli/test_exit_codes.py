@@ -27,10 +27,7 @@ ENDS = [
     (1, "explain FOLDER"),
     (2, "explain nothing.npz"),
     (0, "report PROBLEM --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
-    (
-        0,
-        "report PROBLEM --solvers pgs --tolerances 1e-12 --time-limit 1e-9 --budgets 2 --repeats 1 --no-figures",
-    ),
+    (0, "report PROBLEM --solvers pgs --tolerances 1e-12 --time-limit 1e-9 --budgets 2 --repeats 1 --no-figures"),
     (1, "report FOLDER --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
     (2, "report nothing.npz"),
     (0, "doctor PROBLEM"),
@@ -69,18 +66,12 @@ def test_command_ends_with_its_documented_code(lavender, tmp_path, code, words):
     folder.mkdir()
     stack(4).save(folder / "good.npz")
     (folder / "bad.npz").write_bytes(b"no problem")
-    places = {
-        "PROBLEM": tmp_path / "PROBLEM.npz",
-        "INFEASIBLE": tmp_path / "INFEASIBLE.npz",
-        "FOLDER": folder,
-    }
+    places = {"PROBLEM": tmp_path / "PROBLEM.npz", "INFEASIBLE": tmp_path / "INFEASIBLE.npz", "FOLDER": folder}
     ended, out, err = lavender(*(places.get(word, word) for word in words.split()))
     assert ended == code, out + err
 
 
-@pytest.mark.parametrize(
-    ("code", "words"), MUJOCO_ENDS, ids=[f"{words} is {code}" for code, words in MUJOCO_ENDS]
-)
+@pytest.mark.parametrize(("code", "words"), MUJOCO_ENDS, ids=[f"{words} is {code}" for code, words in MUJOCO_ENDS])
 def test_mujoco_command_ends_with_its_documented_code(lavender, tmp_path, code, words):
     pytest.importorskip("mujoco", reason="these commands step MuJoCo models")
     (tmp_path / "air.xml").write_text(AIR)

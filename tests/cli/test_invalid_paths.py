@@ -25,14 +25,7 @@ from worked import python
 
 import lavender as lv
 from lavender import cli, io, report
-from lavender.io.stored import (
-    FOLDER_LOCK,
-    TEMPORARY_NAME,
-    lock_output,
-    lock_step_folder,
-    write_atomically,
-    write_text,
-)
+from lavender.io.stored import FOLDER_LOCK, TEMPORARY_NAME, lock_output, lock_step_folder, write_atomically, write_text
 from lavender.report import machine
 from lavender.report.files import summarise
 from lavender.report.findings import Report
@@ -88,9 +81,7 @@ needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files
 
 def each_of(table):
     """Parametrize a test by the suffix of a file and the call that reads or writes it."""
-    cases = [
-        pytest.param(*case, marks=[needs_hdf5] if "hdf5" in name else []) for name, case in table.items()
-    ]
+    cases = [pytest.param(*case, marks=[needs_hdf5] if "hdf5" in name else []) for name, case in table.items()]
     return pytest.mark.parametrize(("suffix", "call"), cases, ids=table)
 
 
@@ -330,9 +321,7 @@ def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
         assert "is being written by another command" in other.stderr
         store.close()
         report.Store(path).close()
-    killed = (
-        f"import os; from lavender import report; s = report.Store({str(path)!r}); os.kill(os.getpid(), 9)"
-    )
+    killed = f"import os; from lavender import report; s = report.Store({str(path)!r}); os.kill(os.getpid(), 9)"
     python("-c", killed, status=-9)
     report.Store(path).close()
     assert list(tmp_path.iterdir()) == [path]
@@ -540,9 +529,7 @@ NAMES = (
 )  # fmt: skip
 HTML, A = "<img src=x onerror=alert(1)>", np.array([[2.0, 0.5], [0.5, 1.0]])
 PROBLEMS = {
-    "names": lambda: lv.Problem.lcp(
-        A, [1.0, 1.0], names=["[/x]", "<script>alert(1)</script>"], name=f"[bold]{HTML}"
-    ),
+    "names": lambda: lv.Problem.lcp(A, [1.0, 1.0], names=["[/x]", "<script>alert(1)</script>"], name=f"[bold]{HTML}"),
     "a name": lambda: lv.Problem.lcp(A, [1.0, -1.0], name="a\nb$\\frac$|`"),
     "a lone surrogate": lambda: lv.Problem.lcp(A, [1.0, 1.0], names=["\ud800", "b"], name="\udcff"),
     "huge numbers": lambda: lv.Problem.lcp(1e59 * A, [1e59, -1e59]),
@@ -632,9 +619,7 @@ def test_a_folder_of_anything_gives_a_documented_status_and_escaped_text(lavende
     command=st.sampled_from(("report", "check", "files")),
     again=st.booleans(),
 )
-def test_drawn_folders_give_a_documented_status_and_escaped_text(
-    lavender, tmp_path_factory, entries, command, again
-):
+def test_drawn_folders_give_a_documented_status_and_escaped_text(lavender, tmp_path_factory, entries, command, again):
     check_folder(lavender, tmp_path_factory.mktemp("drawn"), entries, command, again=again)
 
 
@@ -737,9 +722,7 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
     first = {kind: next(i for i, e in enumerate(entries) if e["kind"] == kind) for kind in KINDS}
 
     def read(changes):
-        changed = [
-            e | changes.get(e["kind"], {}) if i in first.values() else e for i, e in enumerate(entries)
-        ]
+        changed = [e | changes.get(e["kind"], {}) if i in first.values() else e for i, e in enumerate(entries)]
         write_entries(path, changed)
         try:
             return report.read(path)
@@ -784,9 +767,7 @@ def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
 
 def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
     write_entries(tmp_path / "records.jsonl", [e for e in entries if e["kind"] != "case"])
-    with pytest.raises(
-        lv.InputError, match="line 4: the record belongs to a case that no earlier line describes"
-    ):
+    with pytest.raises(lv.InputError, match="line 4: the record belongs to a case that no earlier line describes"):
         report.read(tmp_path)
 
 

@@ -74,9 +74,7 @@ def batch(**changes):
 def late_batch(jac):
     """Build worlds of one row whose A_ii is the square of `jac`."""
     ones = np.ones((3, 1))
-    return lv.Batch(
-        np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * ones, target=ones, cones=lv.Cones.free(1)
-    )
+    return lv.Batch(np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * ones, target=ones, cones=lv.Cones.free(1))
 
 
 def solved_builder():

@@ -104,9 +104,7 @@ def in_two_units(kind, form, seed, exponent):
     """Return a problem, the maker of the same in other units, the impulses' scale, and whether it is valid."""
     problem, angular = make_problem(kind, form, seed)
     data, impulse, b, d = in_units(problem, angular, exponent)
-    largest = (
-        np.abs(problem.dense()).max(axis=1) if problem.matrix is not None else problem.delassus().diagonal()
-    )
+    largest = np.abs(problem.dense()).max(axis=1) if problem.matrix is not None else problem.delassus().diagonal()
     is_valid = is_in_range(data, problem.b * b, problem.d * d)
     is_empty = bool(np.any(largest * d < SMALLEST))  # rows that count as empty have another metric
     return build_problem(plain_data(problem)), partial(build_problem, data), impulse, is_valid, is_empty
@@ -221,18 +219,7 @@ def bits(solution):
 def hash_of(problem):
     """Return a hash of everything that a solver could have changed."""
     digest, c = hashlib.sha256(), problem.cones
-    arrays = [
-        problem.b,
-        problem.d,
-        problem.guess,
-        c.ptr,
-        c.kind,
-        c.lower,
-        c.upper,
-        c.mu,
-        c.patch_radius,
-        c.rolling,
-    ]
+    arrays = [problem.b, problem.d, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, c.rolling]
     matrices = [problem.csr] if problem.generalized is None else [problem.jacobian, problem.generalized.mass]
     for matrix in matrices:
         arrays += [matrix.indptr, matrix.indices, matrix.data] if hasattr(matrix, "indptr") else [matrix]
@@ -294,9 +281,7 @@ def check_claims(data, problem, solution, options):
         assert solution.iterations == budget
     is_finite = bool(np.isfinite(solution.impulse).all())
     assert is_finite or status in ("DIVERGED", "NUMERICAL_ERROR")
-    assert not any(
-        math.isnan(getattr(r, name)) for name in ("relative", "energy", "velocity", "roundoff_floor")
-    )
+    assert not any(math.isnan(getattr(r, name)) for name in ("relative", "energy", "velocity", "roundoff_floor"))
     try:
         solution.raise_for_status()
         accepted = True
@@ -310,9 +295,7 @@ def check_claims(data, problem, solution, options):
     if j.nothing or twin.d_edge or twin.of_factor > ILL_CONDITIONED:
         return
     slop = 1.0 + 1e-6
-    unrefined = min(
-        j.unrefined, 0.1 * max(solution.tol, j.relative)
-    )  # A pass of this accuracy is not refined.
+    unrefined = min(j.unrefined, 0.1 * max(solution.tol, j.relative))  # A pass of this accuracy is not refined.
     within = solution.tol * slop + j.allowed + unrefined
     floor = 2.0 * max(j.roundoff_floor, min(r.roundoff_floor, j.floor_most)) * slop + j.allowed + unrefined
     confirmed = solution.claim_check == "confirmed"
@@ -326,9 +309,7 @@ def check_claims(data, problem, solution, options):
     # A judge that reports a floor above 1e-5 accepts nothing: it says that float64 cannot measure this impulse.
     if is_finite and j.range < MODERATE and not r.relative <= r.roundoff_floor > 1e-5:
         both_infinite = r.relative == j.relative == math.inf  # Zero impulses solve the problem, these do not.
-        assert both_infinite or abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + unrefined, (
-            numbers
-        )
+        assert both_infinite or abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + unrefined, numbers
         d = np.array(twin.d, float)
         rounding = 1e-6 + float(twin.of_factor) * 2.0**-53  # The second term is that of the factor of M.
         assert abs(problem.disk.d - d).max(initial=0.0) <= rounding * d.max(initial=0.0)
@@ -344,9 +325,7 @@ def test_claims_about_extreme_problems_hold_in_long_double(case):
         reject()  # an order or an option that this solver does not have for this problem
 
 
-FOUND = [
-    json.loads(line) for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()
-]
+FOUND = [json.loads(line) for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.filterwarnings("error")

@@ -29,11 +29,7 @@ EXACT = lv.solve(GENERAL, tol=1e-12)
 DERIVATIVE = lv.derivative(GENERAL, EXACT)
 BODIES = ROW_ARRAYS | {"v_free": np.array([ROWS.v_free] * 2)}
 INDEX = {"i": "index of worlds"}
-PLACES, AT, AXIS = (
-    np.array([(0.0, 0.0, 0.0), (1.0, 0.5, 0.2)]),
-    np.array([0.5, 0.2, 0.1]),
-    np.array([0.0, 0.6, 0.8]),
-)
+PLACES, AT, AXIS = (np.array([(0.0, 0.0, 0.0), (1.0, 0.5, 0.2)]), np.array([0.5, 0.2, 0.1]), np.array([0.0, 0.6, 0.8]))
 PAIR = {"a": 0, "b": 1, "feature": 3}
 LIMITS = {"tol": 1e-6, "max_iter": 100, "time_limit": 1.0}
 
@@ -341,15 +337,7 @@ NOT_CALLED = {
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "Batch",
-        "Batch, triangle of M",
-        "Batch.of_matrices",
-        "Batch.of_bodies",
-        "Problem.from_jacobian",
-        "Rows",
-    ],
+    "name", ["Batch", "Batch, triangle of M", "Batch.of_matrices", "Batch.of_bodies", "Problem.from_jacobian", "Rows"]
 )
 def test_float32_of_either_byte_order_is_single_precision(name):
     check_float32(CALLS[name])
@@ -362,8 +350,7 @@ def test_the_residual_of_a_nan_is_infinite_and_products_keep_it():
 
 
 @pytest.mark.parametrize(
-    ("solver", "option"),
-    [(name, option) for name in lv.available(external=False) for option in lv.get(name).options],
+    ("solver", "option"), [(name, option) for name in lv.available(external=False) for option in lv.get(name).options]
 )
 def test_every_option_of_every_solver_is_validated(solver, option):
     spec = lv.get(solver)

@@ -59,12 +59,7 @@ class Halves:
         return problem
 
     def run(
-        self,
-        state: lv.Problem,
-        impulse: npt.NDArray[np.float64],
-        n: int,
-        tol: float,
-        time_limit: float | None,
+        self, state: lv.Problem, impulse: npt.NDArray[np.float64], n: int, tol: float, time_limit: float | None
     ) -> lv.Claim:
         impulse *= 0.5**n
         return lv.Claim(lv.Status.MAX_ITERATIONS, n)
@@ -96,9 +91,7 @@ def test_empty_lists_mean_no_contacts_joints_or_bodies(bodies: int) -> None:
     problem = lv.Problem.from_rows(rows, target=EMPTY, mu=EMPTY)
     assert problem.m == 0 and lv.solve(problem).success
     with pytest.raises(lv.InputError, match=r"contact_body has shape \(1, 2\); \(0, 2\) is needed"):
-        lv.Rows(
-            mass, inertia, free, contact_body=[(-1, 0)], normal=EMPTY, tangent=EMPTY, arm_a=EMPTY, arm_b=EMPTY
-        )
+        lv.Rows(mass, inertia, free, contact_body=[(-1, 0)], normal=EMPTY, tangent=EMPTY, arm_a=EMPTY, arm_b=EMPTY)
 
 
 def test_an_unknown_name_is_an_error_for_mypy_and_has_a_hint() -> None:

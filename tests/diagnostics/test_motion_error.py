@@ -29,10 +29,7 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     delta = x - e.reference
     if form == "rows":
         dv = p.velocity(x) - p.velocity(e.reference)
-        mass, speeds = (
-            np.linalg.inv(p.rows.inverse_mass_matrix().toarray()),
-            np.linalg.norm(dv[:, :3], axis=1),
-        )
+        mass, speeds = (np.linalg.inv(p.rows.inverse_mass_matrix().toarray()), np.linalg.norm(dv[:, :3], axis=1))
         assert e.spin == pytest.approx(np.linalg.norm(dv[:, 3:], axis=1).max(), rel=1e-9)
         assert e.body_name == f"body {speeds.argmax()}"
     else:
@@ -50,12 +47,7 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     ("problem", "none", "some", "word"),
     [
         (random_lcp(4), ("kinetic", "speed"), ("energy", "rows", "relative"), ""),
-        (
-            lv.Problem.lcp([[2.0, 0.5], [0.0, 2.0]], [1.0, -1.0]),
-            ("energy", "relative"),
-            ("rows",),
-            "symmetric",
-        ),
+        (lv.Problem.lcp([[2.0, 0.5], [0.0, 2.0]], [1.0, -1.0]), ("energy", "relative"), ("rows",), "symmetric"),
         (lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, -1.0], 0.0, 1.0), ("energy",), ("rows",), "semidefinite"),
         (lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ("energy", "rows"), (), "no estimate"),
     ],
@@ -113,9 +105,7 @@ def test_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
 def test_rows_of_friction_ellipses_are_the_problems_own(form):
     p = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.005)], friction="cone")
     if form == "bodies":
-        p = lv.Problem.from_jacobian(
-            np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone"
-        )
+        p = lv.Problem.from_jacobian(np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone")
     x = lv.solve(p, tol=1e-13).impulse
     y = x.copy()
     y[2] *= 0.5

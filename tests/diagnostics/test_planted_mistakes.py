@@ -85,9 +85,7 @@ class Step:
     def with_angles_of_friction(self):
         """Return the step with coefficients of friction as angles in degrees."""
         c = self.cones
-        return replace(
-            self, cones=replace(c, mu=np.where(c.kind == lv.ROW, c.mu, np.degrees(np.arctan(c.mu))))
-        )
+        return replace(self, cones=replace(c, mu=np.where(c.kind == lv.ROW, c.mu, np.degrees(np.arctan(c.mu)))))
 
 
 NONE = "none"
@@ -199,9 +197,7 @@ def test_a_conveyor_and_speeds_in_another_unit_are_not_reported(scenes):
         assert kinds(at_rest.problem) == expected
 
 
-@pytest.mark.parametrize(
-    ("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])]
-)  # m, at 60 steps per second
+@pytest.mark.parametrize(("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])])  # m, at 60 steps per second
 def test_anchors_in_a_wrong_frame_are_reported(offset, kinds):
     builder = lv.RowBuilder([1.0], np.eye(3)[None], np.zeros((1, 6)), 1 / 60, [(1.0, 0.0, 0.0)])
     builder.hinge(-1, 0, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), anchor_b=(0.0, 0.0, offset))

@@ -97,9 +97,7 @@ def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
     m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
     g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
     a = g * signs @ g.T
-    a = np.block(
-        [[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]]
-    )
+    a = np.block([[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]])
     problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
     found = redundancy(problem)
     assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))

@@ -30,12 +30,7 @@ def made(problem, rows, target):
     c, kj = problem.cones, problem.rows.n_joints
     mj = len(rows["jac"])
     return lv.Problem.from_rows(
-        lv.Rows(**rows),
-        target,
-        lower=c.lower[:mj],
-        upper=c.upper[:mj],
-        mu=c.mu[kj:],
-        tangents=c.n_tangents[kj:],
+        lv.Rows(**rows), target, lower=c.lower[:mj], upper=c.upper[:mj], mu=c.mu[kj:], tangents=c.n_tangents[kj:]
     )
 
 
@@ -163,9 +158,7 @@ def test_generalised_coordinates_out_of_order_are_told():
     rows = np.arange(36).reshape(-1, 3)
     for grouped in (rows.T.ravel(), np.r_[rows[:, 0], rows[:, 1:].ravel()]):
         assert kinds(problem(j[grouped])) == {"all normals first"}
-        target = (j @ v + np.where(np.arange(36) % 12 == 0, 0.01, 0.0))[
-            grouped
-        ]  # which does not tell the order
+        target = (j @ v + np.where(np.arange(36) % 12 == 0, 0.01, 0.0))[grouped]  # which does not tell the order
         (found,) = lv.diagnose(problem(j[grouped], target=target))
         assert "if all normals come first" in found.reason
     moving = np.arange(len(mass)) % 6 < 3
@@ -175,9 +168,7 @@ def test_generalised_coordinates_out_of_order_are_told():
         (np.where(moving[:, None] & moving, inverse, mass), "inverse mass for mass"),
     ):
         assert kinds(problem(j, wrong)) == {"masses"} and words in lv.diagnose(problem(j, wrong))[0].reason
-    assert (
-        kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()
-    )  # one of twelve: collision detection does that
+    assert kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()  # one of twelve: collision detection does that
     assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
     flat = j[:6, :6]  # two contacts of one box: as many rows as velocities
     pair = lv.Cones.contacts(0.5, count=2)
@@ -345,9 +336,7 @@ def thin_wall(entry, as_bodies):
     cones = lv.Cones.contacts(0.0, count=2, tangents=0)
     if not as_bodies:
         jac = np.array([[entry, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        return lv.Problem.from_jacobian(
-            jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones
-        )
+        return lv.Problem.from_jacobian(jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones)
     jac = np.zeros((2, 12))
     jac[0, 6], jac[1, 8] = entry, 1.0
     rows = lv.Rows(

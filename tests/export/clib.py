@@ -13,17 +13,7 @@ from lavender.export import HEADER
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
-COUNTS = (
-    "form",
-    "law",
-    "n_blocks",
-    "n_rows",
-    "n_entries",
-    "n_bodies",
-    "n_joints",
-    "n_velocities",
-    "n_mass_entries",
-)
+COUNTS = ("form", "law", "n_blocks", "n_rows", "n_entries", "n_bodies", "n_joints", "n_velocities", "n_mass_entries")
 
 
 def functions(header):
@@ -44,9 +34,7 @@ def _struct(name):
 
 
 Verdict, Motion = _struct("lav_verdict"), _struct("lav_motion")
-Problem, Options, Budget, Result = (
-    _struct(f"lav_{name}") for name in ("problem", "options", "budget", "result")
-)
+Problem, Options, Budget, Result = (_struct(f"lav_{name}") for name in ("problem", "options", "budget", "result"))
 
 
 class Library:

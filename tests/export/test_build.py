@@ -56,9 +56,7 @@ def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, share
     ours = {"sqrt", "floor", "ceil", "memcpy", "memset", "memmove"}
     assert {name for name in wanted if not name.startswith("_")} <= ours
     given = {line.split()[-1] for line in run("nm", "-D", "--defined-only", shared).splitlines()}
-    assert {name for _, name, _ in functions(export.HEADER.read_text())} == {
-        n for n in given if n.startswith("lav_")
-    }
+    assert {name for _, name, _ in functions(export.HEADER.read_text())} == {n for n in given if n.startswith("lav_")}
 
 
 @pytest.mark.parametrize(
@@ -151,9 +149,7 @@ def write_vectors(out):
         *((of_matrix(given), "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
         (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
     ]  # fmt: skip
-    packed = [
-        vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given
-    ]
+    packed = [vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]
     (out / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(packed)
 
@@ -163,9 +159,7 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     link = [CHECK, shared, f"-Wl,-rpath,{shared.parent}"]
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
-    assert (
-        len(re.findall("^same ", said, re.MULTILINE)) == count - 2
-    )  # `admm`, `auto` are held to the residual
+    assert len(re.findall("^same ", said, re.MULTILINE)) == count - 2  # `admm`, `auto` are held to the residual
     assert len(re.findall("^met ", said, re.MULTILINE)) == 2
     data = bytearray((tmp_path / "vectors.bin").read_bytes())
     data[-8] ^= 1  # the last bit of the last impulse

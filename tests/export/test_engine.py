@@ -57,14 +57,7 @@ def test_an_image_with_a_changed_bit_is_refused(library):
     image = bytearray(engine_image(lv.Simulation(lv.Scene("stack"))))
     workspace = ct.c_uint64()
     image[len(image) // 2] ^= 4
-    assert (
-        library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -4
-    )
-    assert (
-        library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image) - 8), ct.byref(workspace))
-        == -3
-    )
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -4
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image) - 8), ct.byref(workspace)) == -3
     image[0] ^= 1
-    assert (
-        library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -2
-    )
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -2

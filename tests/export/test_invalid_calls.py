@@ -18,9 +18,7 @@ import lavender as lv
 from lavender.export import HEADER
 
 ERRORS = {
-    value: name
-    for name, value in parse_enum_constants(HEADER.read_text()).items()
-    if name.startswith("LAV_ERROR")
+    value: name for name, value in parse_enum_constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")
 }
 CANARY = 0xA5
 
@@ -172,9 +170,7 @@ def test_null_and_memory_without_a_solver_have_different_errors(library):
     assert solver.is_intact()
 
 
-@pytest.mark.parametrize(
-    "method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"]
-)
+@pytest.mark.parametrize("method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"])
 def test_too_little_memory_is_an_error_and_nothing_is_written_behind_it(library, method):
     problem, options = library.problem(self_test_problem()), library.options(method)
     seen, workspace = set(), library.workspace(problem, options).value
@@ -200,12 +196,7 @@ def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, m
     more = lv.Problem.linear(np.eye(60) + 0.01, rng.normal(size=60))
     free = lv.Problem.linear(np.eye(3) + 0.01, rng.normal(size=3))
     towers, grown = [stack_of(n) for n in (1, 6)], 0
-    for few, many in (
-        (free, more),
-        (small, random_lcp(2, m=60)),
-        (as_matrix(bodies), as_matrix(towers[1])),
-        towers,
-    ):
+    for few, many in ((free, more), (small, random_lcp(2, m=60)), (as_matrix(bodies), as_matrix(towers[1])), towers):
         problems = [library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)]
         options = library.options(method)
         if any(c.lav_takes(ct.byref(q), ct.byref(options)) for q in problems):
@@ -342,9 +333,7 @@ def test_the_verdict_of_the_library_equals_that_of_the_package(library, seed, me
             code = library.c.lav_set(solver.at, ct.byref(problem))
             workspace.value = library.c.lav_needed(solver.at)
         if code:
-            assert (
-                ERRORS[code] == "LAV_ERROR_UNSUPPORTED"
-            )  # `admm` finds an asymmetric A when it has its numbers
+            assert ERRORS[code] == "LAV_ERROR_UNSUPPORTED"  # `admm` finds an asymmetric A when it has its numbers
             continue
         out, impulse = Result(), np.zeros(source.m)
         out.size = ct.sizeof(Result)
@@ -373,9 +362,7 @@ def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, fold
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
     made += [f"{name} = {value}" for name, value in parse_enum_constants(header).items()]
     for name in STRUCTS:
-        made += [
-            f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(parse_struct_fields(header, name))
-        ]
+        made += [f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(parse_struct_fields(header, name))]
     kept = (Path(__file__).parent / "abi.txt").read_text().splitlines()
     lost = [line for line in kept if line not in made]
     assert not lost, "what a release had is gone or is another"

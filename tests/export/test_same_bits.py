@@ -60,9 +60,7 @@ def kinds_of(friction, mu=0.4):
         cones = lv.Cones.contacts(mu, count=3, **given)
         jac = rng.normal(size=(3 * rows, 20))
         yield lv.Problem(rng.normal(size=3 * rows), cones, jac @ jac.T, friction=friction)
-        yield lv.Problem.from_jacobian(
-            jac[:, :4], np.eye(4), rng.normal(size=4), cones=cones, friction=friction
-        )
+        yield lv.Problem.from_jacobian(jac[:, :4], np.eye(4), rng.normal(size=4), cones=cones, friction=friction)
 
 
 def is_formed(given, found):
@@ -143,9 +141,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
         assert solver.impulse().tobytes() == found.impulse.tobytes(), case
         assert said.verdict.relative == found.residual.relative, case
         assert said.verdict.floor == found.residual.roundoff_floor, case
-        assert (
-            said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
-        )
+        assert said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
         if (tol or name == "lemke") and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case
     assert ran >= 4 and (formed or at < len(GIVEN))
@@ -153,13 +149,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
 
 @pytest.mark.parametrize(
     ("name", "friction"),
-    [
-        ("pgs", "coulomb"),
-        ("block_gauss_seidel", "cone"),
-        ("anderson", "coulomb"),
-        ("nncg", "cone"),
-        ("newton", "cone"),
-    ],
+    [("pgs", "coulomb"), ("block_gauss_seidel", "cone"), ("anderson", "coulomb"), ("nncg", "cone"), ("newton", "cone")],
 )
 def test_what_float64_loses_by_an_ill_conditioned_m_is_no_claim(library, name, friction):
     """The residual is refined in the library as well: with the package's status, and at its floor where it is."""
@@ -237,9 +227,7 @@ def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_b
     )  # fmt: skip
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
     options = library.options(method)
-    assert (
-        library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
-    )
+    assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
 
 
 def test_impulses_are_carried_by_key(library):
@@ -268,9 +256,7 @@ def test_velocities_are_those_of_the_problem(library):
 
 
 def count_islands(library, given, **arrays):
-    method = (
-        "pgs" if given.matrix is not None else "sequential_impulses" if given.rows is not None else "nncg"
-    )
+    method = "pgs" if given.matrix is not None else "sequential_impulses" if given.rows is not None else "nncg"
     solver = library.open(library.problem(given, **arrays), library.options(method))
     label = np.full(given.n_blocks, -1, np.int32)
     return library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
@@ -323,10 +309,7 @@ def row_of_boxes(n):
     up, along = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n - 1, 1))
     normal = np.vstack([up, along])
     body = np.vstack(
-        [
-            np.column_stack([np.full(n, -1), np.arange(n)]),
-            np.column_stack([np.arange(n - 1), np.arange(1, n)]),
-        ]
+        [np.column_stack([np.full(n, -1), np.arange(n)]), np.column_stack([np.arange(n - 1), np.arange(1, n)])]
     )
     v_free = np.tile([0.0, 0.0, -0.1, 0.0, 0.0, 0.0], (n, 1))
     v_free[0, 0] = 0.02
@@ -361,16 +344,10 @@ def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library
     """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
     ran = 0
     for given in GIVEN:
-        if given.m == 0 or library.c.lav_takes(
-            ct.byref(library.problem(given)), ct.byref(library.options("newton"))
-        ):
+        if given.m == 0 or library.c.lav_takes(ct.byref(library.problem(given)), ct.byref(library.options("newton"))):
             continue
         rng = np.random.default_rng(given.m)
-        for start in (
-            given.start(),
-            given.start() + 0.1 * rng.normal(size=given.m),
-            1e3 * rng.normal(size=given.m),
-        ):
+        for start in (given.start(), given.start() + 0.1 * rng.normal(size=given.m), 1e3 * rng.normal(size=given.m)):
             least = min(1.0, lv.residual(given, start).relative)
             for n in (0, 1, 2, 3, 5, 10):
                 solver = library.open(library.problem(given, impulse=start), library.options("newton"))
@@ -414,9 +391,7 @@ def test_motion_errors_are_those_of_the_package(library):
             continue
         looked += 1
         assert out.energy == pytest.approx(wanted.energy, rel=1e-6)
-        assert out.kinetic == pytest.approx(
-            wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6
-        )
+        assert out.kinetic == pytest.approx(wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6)
         assert out.relative == pytest.approx(wanted.relative, rel=1e-6)
         assert (out.row, out.rows) == (wanted.row, pytest.approx(wanted.rows, rel=1e-6))
         if wanted.speed is not None:
@@ -465,9 +440,7 @@ def test_a_dumped_problem_is_the_problem_to_the_last_bit(library, folder, compil
         solver = library.open(problem, library.options("block_gauss_seidel"))
         assert c.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
         found = lv.load(path)
-        assert (
-            found.b.tobytes() == given.b.tobytes() and found.cones == given.cones and found.rows == given.rows
-        )
+        assert found.b.tobytes() == given.b.tobytes() and found.cones == given.cones and found.rows == given.rows
         assert np.array_equal(found.key, key) and found.friction == given.friction
         again = library.open(library.problem(found), library.options("block_gauss_seidel"))
         solver.run(7, 0.0), again.run(7, 0.0)

@@ -77,9 +77,7 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
     """
     c = problem.cones
     if c.has_ellipse:
-        raise NotSupported(
-            "the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents"
-        )
+        raise NotSupported("the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
@@ -109,9 +107,7 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
         if values is not None:
             arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
     law = int(problem.friction == "cone")
-    return ProblemView(
-        (form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays
-    )
+    return ProblemView((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
 
 
 def is_accepted_by_library(problem: lv.Problem, solver: str) -> bool:
@@ -147,8 +143,7 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     if remaining or order not in ORDERS or solver not in METHODS:
         unsupported = ", ".join(remaining) or (f"order={order!r}" if order not in ORDERS else solver)
         raise NotSupported(
-            f"{unsupported} is not in the C library; choose a solver and options that the header lavender.h "
-            "lists"
+            f"{unsupported} is not in the C library; choose a solver and options that the header lavender.h lists"
         )
     return (ORDERS[order], *numbers), float(omega)
 
@@ -243,9 +238,7 @@ def make_test_vector(
         relative = lv.residual(problem, impulse, tol=tol).relative
     is_met = solver in OTHER_BITS
     out = struct.pack("<q", len(steps)) + b"".join(step.to_bytes() for step in steps) + packed_problem
-    return out + struct.pack("<qd", is_met, tol if is_met else relative) + (
-        b"" if is_met else impulse.tobytes()
-    ), steps
+    return out + struct.pack("<qd", is_met, tol if is_met else relative) + (b"" if is_met else impulse.tobytes()), steps
 
 
 def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[np.ndarray, int]:
@@ -264,9 +257,7 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[n
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
     driver, outcome = Driver(problem.metric), OUTCOMES["more"]
     if not driver.fits:
-        raise NotSupported(
-            "the C library's newton does not accept this problem; choose another solver (--solver)"
-        )
+        raise NotSupported("the C library's newton does not accept this problem; choose another solver (--solver)")
     driver.start(impulse, tol, budget)
     while outcome in (OUTCOMES["more"], OUTCOMES["certificate"]):
         outcome = driver.step(10**6, impulse)

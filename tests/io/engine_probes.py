@@ -273,9 +273,7 @@ def drake_drops_mimic_with_tamsi():
 NEWTON = "newton", "newton", "1.8.0"
 
 
-@fact(
-    *NEWTON, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint become limits."
-)
+@fact(*NEWTON, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint become limits.")
 def newton_limits_continuous_joints():
     import newton
 
@@ -385,9 +383,7 @@ def mjx_ignores_noslip():
     return speed[0] == speed[1] > 1e-4
 
 
-@fact(
-    *MJX, '`integrator="discrete"`', "`put_model` accepts it, and the first step raises NotImplementedError."
-)
+@fact(*MJX, '`integrator="discrete"`', "`put_model` accepts it, and the first step raises NotImplementedError.")
 def mjx_has_no_discrete_integrator():
     try:
         run_mjx('integrator="discrete">', n=1)
@@ -494,8 +490,4 @@ def sapien_impulses_have_no_friction():
         scene.step()
         points = [p for contact in scene.physx_system.get_contacts() for p in contact.points]
         found.append(sum((np.array(p.impulse) for p in points), np.zeros(3)))
-    return (
-        abs(found[99][0]) < 1e-6 < found[99][2]
-        and body.is_sleeping
-        and np.array_equal(found[298], found[299])
-    )
+    return abs(found[99][0]) < 1e-6 < found[99][2] and body.is_sleeping and np.array_equal(found[298], found[299])

@@ -52,9 +52,7 @@ def step_scene(with_arm, **options):
     names = {"friction_cone": gs.friction_cone, "contact_resolution": gs.contact_resolution}
     options = {key: getattr(names[key], value) if key in names else value for key, value in options.items()}
     scene = gs.Scene(
-        show_viewer=False,
-        sim_options=gs.options.SimOptions(dt=DT),
-        rigid_options=gs.options.RigidOptions(**options),
+        show_viewer=False, sim_options=gs.options.SimOptions(dt=DT), rigid_options=gs.options.RigidOptions(**options)
     )
     scene.add_entity(gs.morphs.Plane())
     if with_arm:
@@ -88,9 +86,7 @@ def main(out):
             values = np.array(qd_to_numpy(read(scene, path)))
             arrays[f"{name}/{path}"] = values[: rows + 2] if path.rsplit(".", 1)[1] in ROWS else values
         for key in CONFIG:
-            arrays[f"{name}/{SOLVER}.rigid_config.{key}"] = np.array(
-                getattr(scene.sim.rigid_solver.rigid_config, key)
-            )
+            arrays[f"{name}/{SOLVER}.rigid_config.{key}"] = np.array(getattr(scene.sim.rigid_solver.rigid_config, key))
         arrays[f"{name}/{SOLVER}.substep_dt"] = np.array(scene.sim.rigid_solver.substep_dt)
     np.savez_compressed(out, **arrays)
 

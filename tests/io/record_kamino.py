@@ -41,8 +41,7 @@ PATHS = (
 )
 DENSE_JACOBIAN = ("_solver_kamino._jacobians.data.J_cts_data", "_solver_kamino._jacobians.data.J_cts_offsets")
 SPARSE_JACOBIAN = tuple(
-    f"_solver_kamino._jacobians._J_cts.bsm.{name}"
-    for name in ("num_nzb", "nzb_start", "nzb_coords", "nzb_values")
+    f"_solver_kamino._jacobians._J_cts.bsm.{name}" for name in ("num_nzb", "nzb_start", "nzb_coords", "nzb_values")
 )
 LABELS = ("_solver_kamino._model.joints.label", "_solver_kamino._model.bodies.label")
 

@@ -74,8 +74,7 @@ def test_arrays_of_other_libraries_give_the_same_answers(wrap):
     np.testing.assert_array_equal(many.impulse, expected.impulse)
     batch = lv.Batch(*ARRAYS.values(), cones=CONES)
     np.testing.assert_array_equal(
-        lv.residual_many(batch, wrap(many.impulse.copy())).relative,
-        lv.residual_many(batch, many.impulse).relative,
+        lv.residual_many(batch, wrap(many.impulse.copy())).relative, lv.residual_many(batch, many.impulse).relative
     )
     problem = lv.Problem.lcp(wrap(np.eye(2)), wrap(np.ones(2)))
     assert lv.solve(problem, tol=1e-9).impulse.tolist() == pytest.approx([1.0, 1.0])
@@ -108,8 +107,7 @@ def test_tensors_of_pytorch():
     np.testing.assert_array_equal(solve(torch.from_numpy).impulse, solve(np.asarray).impulse)
     with pytest.raises(lv.InputError, match="requires a gradient"):
         lv.residual_many(
-            lv.Batch(*ARRAYS.values(), cones=CONES),
-            torch.zeros((3, 2), dtype=torch.float64, requires_grad=True),
+            lv.Batch(*ARRAYS.values(), cones=CONES), torch.zeros((3, 2), dtype=torch.float64, requires_grad=True)
         )
 
 
@@ -136,11 +134,7 @@ def check_results(like, to_numpy, rtol=0.0):
     impulse = np.full((3, 2), 0.25)
     for expected, results, names in (
         (lv.solve_many(batch, tol=1e-9), lv.solve_many(batch, tol=1e-9, like=like), SOLUTION_ARRAYS),
-        (
-            lv.residual_many(batch, impulse),
-            lv.residual_many(batch, impulse, like=like),
-            (*RESIDUAL_ARRAYS, "excess"),
-        ),
+        (lv.residual_many(batch, impulse), lv.residual_many(batch, impulse, like=like), (*RESIDUAL_ARRAYS, "excess")),
     ):
         for name in names:
             array, own = getattr(results, name), getattr(expected, name)
@@ -154,9 +148,7 @@ def check_results(like, to_numpy, rtol=0.0):
 def test_results_return_in_the_callers_library():
     many = check_results(StandardArray(np.zeros(1)), lambda x: x.array)
     assert "3 to 1e-09" in repr(many)
-    assert isinstance(
-        lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray
-    )
+    assert isinstance(lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray)
     batch = lv.Batch(*ARRAYS.values(), cones=CONES)
     with pytest.raises(lv.InputError, match="like is a list"):
         lv.solve_many(batch, like=[0.0])

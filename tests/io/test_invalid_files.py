@@ -55,12 +55,10 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("io.Recording", "io.Stored", "io.Claims", "io.EngineStep", "io.StepVerdict"),
-        "a result: the package makes it",
+        ("io.Recording", "io.Stored", "io.Claims", "io.EngineStep", "io.StepVerdict"), "a result: the package makes it"
     ),
     **dict.fromkeys(
-        ("io.Recorder", "io.Recorder.add", "io.Recorder.close", "io.read_recorded_state"),
-        "test_io_recorder.py",
+        ("io.Recorder", "io.Recorder.add", "io.Recorder.close", "io.read_recorded_state"), "test_io_recorder.py"
     ),
     **dict.fromkeys(
         ("io.load", "io.load_solution", "io.read", "io.record", "io.save", "load"),
@@ -160,8 +158,7 @@ def hdf5(path, parts):
 def matrix(name, m, n, nz, p, i, x):
     parts = {"m": [m], "n": [n], "nz": [nz], "nzmax": [max(nz, 0)], "p": p, "i": i, "x": x}
     return {
-        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v
-        for key, v in parts.items()
+        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v for key, v in parts.items()
     }
 
 
@@ -187,13 +184,7 @@ def one_wide_body(path):
 def large_chunk(path):
     with h5py.File(path, "w") as out:
         out.create_dataset(
-            "fclib_local/spacedim",
-            (1,),
-            "i4",
-            maxshape=(None,),
-            chunks=(2**27,),
-            compression="gzip",
-            fillvalue=3,
+            "fclib_local/spacedim", (1,), "i4", maxshape=(None,), chunks=(2**27,), compression="gzip", fillvalue=3
         )
     return path
 
@@ -328,9 +319,7 @@ def problems(n):
     a, contacts = np.eye(3 * n) + 0.1, lv.Cones.contacts(0.5, count=n)
     yield lv.Problem.lcp(a, np.ones(3 * n), guess=np.ones(3 * n))
     yield lv.Problem(np.ones(3 * n), contacts, sp.csr_array(a), friction="cone")
-    yield lv.Problem.from_jacobian(
-        a, np.eye(3 * n), np.ones(3 * n), cones=contacts, compliance=np.ones(3 * n)
-    )
+    yield lv.Problem.from_jacobian(a, np.eye(3 * n), np.ones(3 * n), cones=contacts, compliance=np.ones(3 * n))
     yield random_contact_problem(n, tangents=2, spin=False, bodies=3, joints=0, contacts=n)
 
 
@@ -347,12 +336,7 @@ def valid_files(folder):
                 continue
             files.append((suffix, path.read_bytes()))
     three = {"b": np.ones(3), "lo": np.zeros(3), "hi": np.ones(3)}
-    sparse = {
-        "A_data": np.ones(3),
-        "A_indices": np.arange(3),
-        "A_indptr": np.arange(4),
-        "A_shape": np.array([3, 3]),
-    }
+    sparse = {"A_data": np.ones(3), "A_indices": np.arange(3), "A_indptr": np.arange(4), "A_shape": np.array([3, 3])}
     for arrays in (
         three | {"A": np.eye(3), "l_ref": np.ones(3), "w_ref": np.zeros(3), "compare": "l,w"},
         three | sparse | {"cone_start": np.array([0]), "cone_dim": np.array([3]), "cone_mu": np.array([0.5])},

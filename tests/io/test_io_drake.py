@@ -39,9 +39,7 @@ def robot(approximation=DiscreteContactApproximation.kSap, damping=0.3, sampled=
     rail = plant.AddFrame(FixedOffsetFrame("rail", plant.world_frame(), RigidTransform([0.0, 0.0, 0.0597])))
     slide = plant.AddJoint(PrismaticJoint("slide", rail, cart.body_frame(), [1, 0, 0], -0.5, 0.25, damping))
     arm = plant.AddRigidBody("arm", SpatialInertia.SolidBoxWithMass(0.3, 0.4, 0.05, 0.05))
-    hinge = plant.AddJoint(
-        RevoluteJoint("hinge", cart.body_frame(), arm.body_frame(), [0, 1, 0], -2.0, 2.0, damping)
-    )
+    hinge = plant.AddJoint(RevoluteJoint("hinge", cart.body_frame(), arm.body_frame(), [0, 1, 0], -2.0, 2.0, damping))
     plant.RegisterCollisionGeometry(arm, RigidTransform([0.4, 0, 0]), Sphere(0.02), "tip", friction)
     plant.Finalize()
     diagram = builder.Build()
@@ -181,9 +179,7 @@ def test_velocities_that_do_not_add_up_are_refused(monkeypatch):
         lv.io.from_drake(plant, context)
 
 
-@pytest.mark.parametrize(
-    "what", ["another context", "root", "unconnected", "rotation", "huge", "dt", "correction"]
-)
+@pytest.mark.parametrize("what", ["another context", "root", "unconnected", "rotation", "huge", "dt", "correction"])
 def test_what_drake_cannot_take_is_an_input_error(what):
     _, whole, plant, context = robot()
     more = {}

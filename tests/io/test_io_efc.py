@@ -30,9 +30,7 @@ def forwarded(model, state):
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-@pytest.mark.parametrize(
-    ("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)]
-)
+@pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)])
 def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim, jacobian=jacobian))
     states = states_of(model, 6)
@@ -93,9 +91,7 @@ def test_a_model_in_which_nothing_moves_has_worlds_without_rows():
     model = mj.MjModel.from_xml_string("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
     batch, impulse = lv.io.from_mujoco_many(model, np.zeros((3, 0)))
     assert (
-        batch.velocity_shape == (0,)
-        and impulse.shape == (0,)
-        and lv.solve_many(batch).success.tolist() == 3 * [True]
+        batch.velocity_shape == (0,) and impulse.shape == (0,) and lv.solve_many(batch).success.tolist() == 3 * [True]
     )
 
 

@@ -87,9 +87,7 @@ def test_a_global_file_keeps_the_matrices_to_the_bit_and_condenses_to_A(tmp_path
     assert (file.form, file.spacedim) == ("global", spacedim)
     assert np.array_equal(file.H.toarray(), problem.jacobian.toarray().T)
     n = problem.rows.n_bodies
-    assert np.array_equal(
-        file.M.diagonal().reshape(n, 6)[:, :3], np.repeat(1 / problem.rows.inv_mass, 3).reshape(n, 3)
-    )
+    assert np.array_equal(file.M.diagonal().reshape(n, 6)[:, :3], np.repeat(1 / problem.rows.inv_mass, 3).reshape(n, 3))
     assert np.array_equal(file.mu, problem.cones.mu)
     # M came from inverting inertia tensors of condition below 10: a few units of rounding, amplified by 10.
     unit = file.M @ problem.rows.inverse_mass_matrix()
@@ -116,9 +114,7 @@ def assert_same(x, y):
         if isinstance(thing, (list, tuple)):
             return [told(value) for value in thing]
         parts = ("indptr", "indices", "data") if sp.issparse(thing) else ()
-        return [getattr(thing, part).tobytes() for part in parts] or getattr(
-            thing, "tobytes", lambda: thing
-        )()
+        return [getattr(thing, part).tobytes() for part in parts] or getattr(thing, "tobytes", lambda: thing)()
 
     assert told(dataclasses.asdict(x)) == told(dataclasses.asdict(y))
 
@@ -183,9 +179,7 @@ def test_every_storage_is_read(tmp_path, nz, spare):
     assert np.array_equal(problem.generalized.jac.toarray(), h.T)
     assert np.array_equal(problem.generalized.mass.toarray(), m)
     np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-15)
-    assert np.array_equal(
-        problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0))
-    )  # powers of two: exact
+    assert np.array_equal(problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0)))  # powers of two: exact
 
 
 def test_repeated_triplets_are_summed(tmp_path):
@@ -229,11 +223,7 @@ def test_a_global_file_whose_m_is_no_mass_matrix_is_condensed(tmp_path):
 
 def test_equations_become_free_rows(tmp_path):
     """Local V, R, s and global G, b: the same mechanism, joined rigidly at one row."""
-    m, h, g = (
-        np.diag([2.0, 4.0, 0.5, 1.0]),
-        np.vstack([W, np.ones(3)]),
-        np.array([[1.0], [0.0], [0.0], [-1.0]]),
-    )
+    m, h, g = (np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)]), np.array([[1.0], [0.0], [0.0], [-1.0]]))
     f, w, b = np.arange(4.0), np.ones(3), np.array([0.25])
     glob = lavender.io.load(
         make(tmp_path / "g.h5", M=encoded(m, -2), H=encoded(h, -2), G=encoded(g, -2), f=f, w=w, b=b, mu=[0.5])
@@ -241,9 +231,7 @@ def test_equations_become_free_rows(tmp_path):
     inv = np.linalg.inv(m)
     local = {"W": h.T @ inv @ h, "V": h.T @ inv @ g, "R": g.T @ inv @ g}
     parts = {name: encoded(x, -2) for name, x in local.items()}
-    loc = lavender.io.load(
-        make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts)
-    )
+    loc = lavender.io.load(make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts))
     assert glob.cones.kind.tolist() == [lv.CONTACT, lv.ROW]
     np.testing.assert_allclose(glob.dense(), loc.dense(), rtol=1e-15, atol=1e-15)
     assert np.array_equal(glob.b, loc.b)
@@ -330,17 +318,13 @@ def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
 
     count = rolls.n_blocks
     changed(
-        lambda file: file.copy("fclib_local_rolling", "fclib_local"),
-        "a problem with rolling friction and one without",
+        lambda file: file.copy("fclib_local_rolling", "fclib_local"), "a problem with rolling friction and one without"
     )
     changed(lambda file: put(file, None), "mu_r is missing")
     changed(lambda file: put(file, np.full(count, -0.1)), "rolling.*-0.1")
     changed(lambda file: put(file, np.full(count, np.nan)), "mu_r")
     changed(lambda file: put(file, np.ones(count + 1)), f"{count + 1} entries; {count} are needed")
-    changed(
-        lambda file: file["fclib_local_rolling/spacedim"].write_direct(np.array([3], np.int32)),
-        "spacedim is 3",
-    )
+    changed(lambda file: file["fclib_local_rolling/spacedim"].write_direct(np.array([3], np.int32)), "spacedim is 3")
     with pytest.raises(lv.CapabilityError, match="with and without rolling rows"):
         lavender.io.save(side_by_side([plain, rolls]), path)
     with_spin = random_contact_problem(5, rolling=True, joints=0)
@@ -368,10 +352,7 @@ GOOD = encoded(W, -2)
         ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
         ({"W": GOOD | {"m": np.array([3, 3], np.int32)}}, "1 are needed"),
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
-        (
-            {"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}},
-            "nz announces 5 triplets",
-        ),
+        ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
         (
             {"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}},
             "3 rows and 3 columns are declared",

@@ -68,9 +68,7 @@ def test_matrix_and_vector_equal_the_arrays_of_mujoco():
     a = jac @ np.linalg.solve(mass, jac.T) + np.diag(data.efc_R)
     # 1e-12: rounding of a dense solve with the condition number of M, about 1e3.
     np.testing.assert_allclose(problem.dense(), a, atol=1e-12 * np.abs(a).max())
-    np.testing.assert_allclose(
-        problem.b, -model.opt.timestep * data.efc_b, atol=1e-14 * np.abs(data.efc_b).max()
-    )
+    np.testing.assert_allclose(problem.b, -model.opt.timestep * data.efc_b, atol=1e-14 * np.abs(data.efc_b).max())
     assert problem.asymmetry == 0.0
 
 
@@ -82,9 +80,7 @@ def test_blocks_are_named_and_of_their_kind():
     assert list(c.ptr[:2]) == [0, 3] and np.isinf(c.upper[:3]).all()
     door = problem.names.index("friction of joint door")
     row = c.ptr[door]
-    assert (c.lower[row], c.upper[row]) == pytest.approx(
-        (-0.1 * model.opt.timestep, 0.1 * model.opt.timestep)
-    )
+    assert (c.lower[row], c.upper[row]) == pytest.approx((-0.1 * model.opt.timestep, 0.1 * model.opt.timestep))
     spin = np.flatnonzero(c.kind == lv.ROUND)
     assert len(spin)
     assert c.mu[spin] == pytest.approx(0.5)
@@ -106,9 +102,7 @@ def test_nothing_touches():
 @pytest.mark.parametrize("condim", [3, 4, 6])
 def test_coefficients_that_differ_are_made_round_without_changing_the_problem(condim):
     text = scene(condim=condim)
-    pair = (
-        '<contact><pair geom1="low" geom2="high" condim="{}" friction="0.6 0.2 0.02 0.003 0.001"/></contact>'
-    )
+    pair = '<contact><pair geom1="low" geom2="high" condim="{}" friction="0.6 0.2 0.02 0.003 0.001"/></contact>'
     model = mj.MjModel.from_xml_string(text.replace("<equality>", pair.format(condim) + "<equality>"))
     data = mj.MjData(model)
     for _ in range(25):
@@ -159,9 +153,7 @@ def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
 @pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
 @pytest.mark.parametrize("solver", ["NEWTON", "CG", "PGS"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_judged(
-    jacobian, solver, integrator
-):
+def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_judged(jacobian, solver, integrator):
     model, data = state(jacobian=jacobian)
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
     model.opt.solver = getattr(mj.mjtSolver, f"mjSOL_{solver}")
@@ -281,9 +273,7 @@ FLEXES = {
 
 
 @pytest.mark.parametrize("kind", FLEXES)
-@pytest.mark.parametrize(
-    ("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)]
-)
+@pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)])
 def test_what_bends_is_moved_as_mujoco_moves_it(cone, condim, kind):
     more, edge = FLEXES[kind]
     try:
@@ -327,16 +317,7 @@ def test_after_a_step_of_rk4_the_accelerations_are_the_mean_of_four_passes(cone)
 
 # -- data that were changed -----------------------------------------------------------------------------
 
-INDICES = (
-    "efc_id",
-    "efc_J_colind",
-    "efc_J_rowadr",
-    "efc_J_rownnz",
-    "dim",
-    "M_colind",
-    "M_rowadr",
-    "M_rownnz",
-)
+INDICES = ("efc_id", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "M_colind", "M_rowadr", "M_rownnz")
 NUMBERS = ("qacc", "qvel", "qacc_smooth", "efc_aref", "efc_force", "efc_vel", "efc_J", "efc_R", "M")
 
 
@@ -488,9 +469,7 @@ def test_data_of_a_second_model_are_refused():
     text = scene()
     # As many velocities, of six joints where one was.
     ways = "".join(
-        f'<joint type="{kind}" axis="{axis}"/>'
-        for kind in ("slide", "hinge")
-        for axis in ("1 0 0", "0 1 0", "0 0 1")
+        f'<joint type="{kind}" axis="{axis}"/>' for kind in ("slide", "hinge") for axis in ("1 0 0", "0 1 0", "0 0 1")
     )
     bob = '<body name="bob" pos="0 2 1">'
     other = mj.MjModel.from_xml_string(text.replace(f"{bob}<freejoint/>", bob + ways))

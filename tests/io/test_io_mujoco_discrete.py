@@ -23,11 +23,7 @@ BALL = '<body pos=".8 0 .09"><freejoint/><geom size=".1"/></body>'
 
 def make_sheet(elastic="both", contact=""):
     return FLEX.format(
-        count="4 4 1",
-        dim=2,
-        dof="full",
-        contact=contact,
-        elasticity=f'thickness="4e-3" elastic2d="{elastic}"',
+        count="4 4 1", dim=2, dof="full", contact=contact, elasticity=f'thickness="4e-3" elastic2d="{elastic}"'
     )
 
 
@@ -38,9 +34,7 @@ def make_arm(first="", second='axis="0 1 0"'):
 TENDONS = """<tendon><spatial name="rope" stiffness="100" damping="3"><site site="ceiling"/><site site="tip"/></spatial>
 <fixed name="belt" damping="4" stiffness="3"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="-2"/></fixed>
 </tendon>"""
-ACTUATORS = (
-    """<actuator><position joint="shoulder" kp="100" kv="3"/><velocity joint="elbow" kv="3"/></actuator>"""
-)
+ACTUATORS = """<actuator><position joint="shoulder" kp="100" kv="3"/><velocity joint="elbow" kv="3"/></actuator>"""
 MODELS = {
     "damped hinge": MODEL.format(options="", bodies=make_arm('damping=".3"'), more=""),
     "stiff ball joint": MODEL.format(
@@ -54,9 +48,7 @@ MODELS = {
     "bent sheet": MODEL.format(options="", bodies=make_sheet("bend"), more=""),
     "passive contact": MODEL.format(options="", bodies=make_sheet(contact='passive="true"') + BALL, more=""),
     "trilinear solid": MODEL.format(
-        options="",
-        bodies=FLEX.format(count="3 3 3", dim=3, dof="trilinear", contact="", elasticity=""),
-        more="",
+        options="", bodies=FLEX.format(count="3 3 3", dim=3, dof="trilinear", contact="", elasticity=""), more=""
     ),
 }
 
@@ -143,13 +135,9 @@ def test_from_mujoco_many_of_discrete_steps_equals_from_mujoco(name):
 
 def test_from_mujoco_of_a_flex_whose_stiffness_is_not_stored_names_it():
     # Conjugate gradients multiply by the bending stiffness without storing it.
-    model = mj.MjModel.from_xml_string(
-        MODEL.format(options='solver="CG"', bodies=make_sheet("bend") + BALL, more="")
-    )
+    model = mj.MjModel.from_xml_string(MODEL.format(options='solver="CG"', bodies=make_sheet("bend") + BALL, more=""))
     data = mj.MjData(model)
-    mj.mj_forward(
-        model, data
-    )  # The sheet falls as a whole, so that its stiffness does not act on qacc_smooth.
+    mj.mj_forward(model, data)  # The sheet falls as a whole, so that its stiffness does not act on qacc_smooth.
     for convert in (
         lambda: lv.io.from_mujoco(model, data),
         lambda: lv.io.from_mujoco_many(model, np.r_[data.qpos, data.qvel][None]),

@@ -93,9 +93,7 @@ def test_rows_without_memory_are_counted():
     solver.mjw_data.nefc = Array(solver.mjw_data.nefc.numpy() + MAX_ROWS)
     step = lv.io.from_newton_mujoco(solver, velocity)
     assert (step.batch.row_counts == MAX_ROWS).all()
-    assert (
-        step.claims.residuals["dropped_rows"].tolist() == (solver.mjw_data.nefc.numpy() - MAX_ROWS).tolist()
-    )
+    assert step.claims.residuals["dropped_rows"].tolist() == (solver.mjw_data.nefc.numpy() - MAX_ROWS).tolist()
 
 
 def test_other_solvers_and_versions_are_rejected():

@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import (
-    CONTACTS,
-    FORMS,
-    random_contact_problem,
-    random_generalized_problem,
-    random_lcp,
-    seeds,
-)
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_generalized_problem, random_lcp, seeds
 
 import lavender as lv
 import lavender.io
@@ -146,13 +139,7 @@ def own(tmp_path, problem=None, **changes):
 
 def npy(descr, shape, data=b"", fortran=False, version=1):
     header = repr({"descr": descr, "fortran_order": fortran, "shape": shape}).encode() + b"\n"
-    return (
-        b"\x93NUMPY"
-        + bytes([version, 0])
-        + struct.pack("<H" if version == 1 else "<I", len(header))
-        + header
-        + data
-    )
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H" if version == 1 else "<I", len(header)) + header + data
 
 
 class Bomb:
@@ -164,10 +151,7 @@ def test_nothing_is_unpickled(tmp_path, monkeypatch):
     trace = tmp_path / "executed"
     monkeypatch.setenv("LAVENDER_TEST_BOMB", str(trace))
     for entry in (np.array(Bomb(), object), npy("|O", (1,), pickle.dumps(Bomb())), pickle.dumps(Bomb())):
-        for path in (
-            own(tmp_path, b=entry),
-            archive(tmp_path / "box.npz", {"b": entry, "lo": 0, "hi": 0, "A": 0}),
-        ):
+        for path in (own(tmp_path, b=entry), archive(tmp_path / "box.npz", {"b": entry, "lo": 0, "hi": 0, "A": 0})):
             with pytest.raises(lv.InputError, match="'b'"):
                 lavender.io.load(path)
     assert not trace.exists()
@@ -294,8 +278,7 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
 )
 def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, sign):
     changes = {
-        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v
-        for n, v in changes.items()
+        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for n, v in changes.items()
     }
     problem = next((p for start, p in OF.items() if min(changes).startswith(start)), None)
     assert problem is None or lavender.io.load(own(tmp_path, problem)) == problem
@@ -364,13 +347,7 @@ def test_box_rows_and_cones_become_blocks_in_their_order(tmp_path):
 def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
     rng = np.random.default_rng(1)
     a = sp.csr_array(np.where(rng.random((7, 7)) < 0.4, rng.random((7, 7)), 0.0))
-    parts = {
-        "A": None,
-        "A_data": a.data,
-        "A_indices": a.indices,
-        "A_indptr": a.indptr,
-        "A_shape": np.array(a.shape),
-    }
+    parts = {"A": None, "A_data": a.data, "A_indices": a.indices, "A_indptr": a.indptr, "A_shape": np.array(a.shape)}
     problem = lavender.io.load(box(tmp_path, **parts))
     assert np.array_equal(problem.dense(), a.toarray())
     whole = lavender.io.load(
@@ -429,9 +406,7 @@ def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
         assert missing == []
 
 
-@pytest.mark.parametrize(
-    ("indices", "indptr"), [([0, 9], [0, 1, 2]), ([0, -1], [0, 1, 2]), ([0, 1], [0, 2, 1])]
-)
+@pytest.mark.parametrize(("indices", "indptr"), [([0, 9], [0, 1, 2]), ([0, -1], [0, 1, 2]), ([0, 1], [0, 2, 1])])
 def test_a_broken_compressed_matrix_is_refused_in_memory_too(indices, indptr):
     broken = sp.csr_array((np.ones(2), np.array(indices), np.array(indptr)), shape=(2, 2))
     with pytest.raises(lv.InputError, match="not a valid compressed matrix"):

@@ -15,9 +15,7 @@ def robot(seed=0):
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.appendBodyToJoint(base, pin.Inertia.FromBox(1.0, 0.2, 0.3, 0.2), pin.SE3.Identity())
     arm = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])), "arm")
-    model.appendBodyToJoint(
-        arm, pin.Inertia.FromBox(0.5, 0.3, 0.05, 0.05), pin.SE3(np.eye(3), np.array([0.15, 0, 0]))
-    )
+    model.appendBodyToJoint(arm, pin.Inertia.FromBox(0.5, 0.3, 0.05, 0.05), pin.SE3(np.eye(3), np.array([0.15, 0, 0])))
     model.lowerPositionLimit[-1], model.upperPositionLimit[-1] = -0.01, 0.5
     model.upperDryFrictionLimit[-1], model.lowerDryFrictionLimit[-1] = 0.7, -0.7
     q = pin.neutral(model)
@@ -48,9 +46,7 @@ def test_the_rows_are_the_constraints_and_the_velocity_is_pinocchios():
     assert (problem.operator, problem.law, problem.m) == ("generalized", "coulomb", 3 + 3 + 2 + 1)
     assert problem.row_name(3) == "PointContact 1, normal"
     data = model.createData()
-    np.testing.assert_allclose(
-        problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12
-    )
+    np.testing.assert_allclose(problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12)
     # J by differences of the two points' places, which Pinocchio's forward kinematics moves.
     h, jac = 1e-6, problem.jacobian.toarray()
     base, arm = 1, 2
@@ -64,9 +60,7 @@ def test_the_rows_are_the_constraints_and_the_velocity_is_pinocchios():
         step[k] = h
         ahead, behind = places(pin.integrate(model, q, step)), places(pin.integrate(model, q, -step))
         corner, tip = ((x - y) / (2.0 * h) for x, y in zip(ahead, behind, strict=True))
-        np.testing.assert_allclose(
-            jac[3:6, k], corner[[2, 0, 1]], atol=1e-8
-        )  # 1e-6 squared, and rounding over it
+        np.testing.assert_allclose(jac[3:6, k], corner[[2, 0, 1]], atol=1e-8)  # 1e-6 squared, and rounding over it
         np.testing.assert_allclose(jac[0:3, k], tip, atol=1e-8)
     np.testing.assert_array_equal(jac[6:, :6], 0.0)
     np.testing.assert_array_equal(jac[6:, 6], [1.0, -1.0, 1.0])
@@ -143,9 +137,7 @@ def test_limits_and_friction_of_any_joint_hold_in_pinocchios_own_dynamics(seed):
     near = 1e-6 * (1.0 + np.abs(after).max())
     np.testing.assert_allclose(problem.velocity(own), after, atol=near)
     np.testing.assert_array_equal(problem.jacobian.toarray()[first:], np.eye(model.nv))
-    sticks = (own[first:] > -dt * -model.lowerDryFrictionLimit) & (
-        own[first:] < dt * model.upperDryFrictionLimit
-    )
+    sticks = (own[first:] > -dt * -model.lowerDryFrictionLimit) & (own[first:] < dt * model.upperDryFrictionLimit)
     assert np.abs(after[sticks]).max(initial=0.0) <= near
     assert (own[first:] * after <= near).all()  # what slides is braked
     rate = 1e6 * (pin.integrate(model, q, 1e-6 * after) - q)  # of the positions

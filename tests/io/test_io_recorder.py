@@ -55,9 +55,7 @@ def test_the_worst_answers_of_all_steps_are_kept(tmp_path):
 
 
 def test_every_and_when_select_beside_the_worst(tmp_path):
-    with lv.io.Recorder(
-        tmp_path / "a", every=3, keep_worst=1, when=lambda v: v.claimed and v.world == 1
-    ) as recorder:
+    with lv.io.Recorder(tmp_path / "a", every=3, keep_worst=1, when=lambda v: v.claimed and v.world == 1) as recorder:
         for _ in range(5):
             recorder.add(step_of([0.3, 0.01]))
     wanted = {(s, w) for s in (0, 3) for w in (0, 1)} | {(s, 1) for s in range(5)}
@@ -94,9 +92,7 @@ def test_single_problems_and_pairs(tmp_path):
 @pytest.mark.parametrize("name", ["file", "args", "allow_pickle", "a.b", "zipf"])
 def test_recorder_with_a_state_of_any_name_can_be_read(tmp_path, name):
     with lv.io.Recorder(tmp_path, every=1) as recorder:
-        recorder.add(
-            step_of([0.1, 0.2]), state={name: np.array([[1.0], [2.0]]), "label": np.array(["a", "b"])}
-        )
+        recorder.add(step_of([0.1, 0.2]), state={name: np.array([[1.0], [2.0]]), "label": np.array(["a", "b"])})
     state = lv.io.read_recorded_state(tmp_path, recorder.files[1])
     assert state[name].tolist() == [2.0] and state["label"] == "b"
 

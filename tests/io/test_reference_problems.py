@@ -54,9 +54,7 @@ def test_a_reference_problem_loads_and_its_solution_is_one(problem_dir, name, tm
 
 
 @pytest.mark.parametrize("solver", ["newton", "auto", "admm", "anderson", "nncg"])
-@pytest.mark.parametrize(
-    "name", [n for n in FILES if n.startswith("rfc3d_")] or [pytest.param("", id="no folder")]
-)
+@pytest.mark.parametrize("name", [n for n in FILES if n.startswith("rfc3d_")] or [pytest.param("", id="no folder")])
 def test_rolling_reference_problems_are_solved_as_their_reference(problem_dir, name, solver):
     stored = lavender.io.read(problem_dir / name)
     problem = stored.problem

@@ -32,9 +32,7 @@ NUMBER = re.compile(r"(?<![\w.])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?(
 NUMERAL = r"(?<![\w.])([-+\d.e]*\d)(?!\d)"
 HEADING = re.compile(r"^#+ .*\n", re.MULTILINE)
 CLAIMS_TEXT = Path(__file__).with_name("chapter_claims.txt").read_text(encoding="utf-8")
-SECTIONS = [
-    page + comments for page, comments in zip(HEADING.split(PAGE), HEADING.split(CLAIMS_TEXT), strict=True)
-]
+SECTIONS = [page + comments for page, comments in zip(HEADING.split(PAGE), HEADING.split(CLAIMS_TEXT), strict=True)]
 
 
 def value(text):
@@ -89,9 +87,7 @@ def check(numbers, tolerance, line, text):
         unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
         allowed = float(tolerance) / 100.0 * value(number) if tolerance else 0.5 * unit
         # what is printed is decimal, too
-        assert abs(value(shown) - value(number)) <= allowed * (1.0 + 1e-9), (
-            f"{number}, but {found[0]!r} is printed"
-        )
+        assert abs(value(shown) - value(number)) <= allowed * (1.0 + 1e-9), f"{number}, but {found[0]!r} is printed"
 
 
 def claimed(by):
@@ -123,9 +119,7 @@ def test_claims_have_the_headings_of_the_pages():
 def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
     """Its picture is there without a build, and none is there that the page does not show."""
     pictures = ROOT / "docs" / "static" / "chapter"
-    shown = re.findall(
-        r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE
-    )
+    shown = re.findall(r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE)
     assert sorted(f"{file}.png" for file, *_ in shown) == sorted(path.name for path in pictures.iterdir())
     assert len(shown) > 12 and PAGE.count("(static/chapter/") == len(shown)
     for file, name, panel in shown:
@@ -150,9 +144,7 @@ def test_a_panel_computes_only_what_it_draws(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(module, "LIMIT", 0.1)
     module.main(str(tmp_path / "stand.png"))
     assert capsys.readouterr().out == f"figure: {tmp_path / 'stand.png'}\n"
-    for name in {
-        re.match(r"python examples/(\w+)\.py", command)[1] for command in CLAIMS if "examples/" in command
-    }:
+    for name in {re.match(r"python examples/(\w+)\.py", command)[1] for command in CLAIMS if "examples/" in command}:
         assert len(example(name).numbers()) >= 1 and callable(example(name).print_numbers)
 
 
@@ -172,9 +164,7 @@ def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
 
 
 def test_every_failure_has_a_command_that_shows_it():
-    tables = re.findall(
-        r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE
-    )
+    tables = re.findall(r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert len(tables) == 5  # one for each experiment
     rows = [re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()]
     assert len(rows) > 14

@@ -36,16 +36,10 @@ def blocks(page, *kinds):
 
 
 def modules_with_doctests():
-    names = (
-        m.name for m in pkgutil.walk_packages(lv.__path__, "lavender.") if not m.name.endswith("__main__")
-    )
+    names = (m.name for m in pkgutil.walk_packages(lv.__path__, "lavender.") if not m.name.endswith("__main__"))
     for name in names:
         spec = importlib.util.find_spec(name)
-        if (
-            spec.origin
-            and spec.origin.endswith(".py")
-            and ">>> " in Path(spec.origin).read_text(encoding="utf-8")
-        ):
+        if spec.origin and spec.origin.endswith(".py") and ">>> " in Path(spec.origin).read_text(encoding="utf-8"):
             yield name
 
 
@@ -101,9 +95,7 @@ def test_python_of_a_page_runs(page, files, capsys):
 
 
 def test_the_test_of_the_quick_start_passes_as_a_file_of_its_own(tmp_path):
-    (text,) = (
-        text for *_, text in blocks(ROOT / "docs" / "quickstart.md", "python") if "import pytest" in text
-    )
+    (text,) = (text for *_, text in blocks(ROOT / "docs" / "quickstart.md", "python") if "import pytest" in text)
     path = tmp_path / "test_mine.py"
     path.write_text(text, encoding="utf-8")
     without = ("-p", "no:cacheprovider", "-p", "no:lavender-phenomena")  # the second as in pyproject.toml
@@ -125,10 +117,7 @@ def commands_of(page):
         if not set("[…") & set(found[1]) and not found[1].endswith("..."):
             lines.append((0, found[1]))
     for line, command in lines:
-        yield (
-            f"{page.name}, block at line {line}: {command}",
-            shlex.split(command.removeprefix("$ "), comments=True),
-        )
+        yield (f"{page.name}, block at line {line}: {command}", shlex.split(command.removeprefix("$ "), comments=True))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -193,9 +182,7 @@ def test_a_forge_shows_no_markup_of_sphinx(page):
 
 
 def test_the_page_on_plug_ins_shows_the_project_file_of_the_example():
-    (shown,) = re.findall(
-        r"^   ```toml\n(.*?)^   ```$", (ROOT / "docs/plugin.md").read_text("utf-8"), re.M | re.S
-    )
+    (shown,) = re.findall(r"^   ```toml\n(.*?)^   ```$", (ROOT / "docs/plugin.md").read_text("utf-8"), re.M | re.S)
     file = ROOT / "examples" / "plugin" / "pyproject.toml"
     assert textwrap.dedent(shown) == file.read_text(encoding="utf-8")
 
@@ -245,9 +232,7 @@ def test_the_largest_module_of_the_page_is_that_of_its_build():
 
 def test_every_test_that_a_page_names_exists():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
-    known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(
-        re.findall(r"def (test_\w+)", sources)
-    )
+    known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(re.findall(r"def (test_\w+)", sources))
     for page in PAGES:
         named = set(re.findall(r"\btest_\w+", page.read_text(encoding="utf-8")))
         assert named <= known, f"{page.name} names {sorted(named - known)}"

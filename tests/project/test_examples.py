@@ -184,9 +184,7 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     frames, speeds, residual = found["run"]
     assert residual < 1e-5 and found["drift"] < 1e-6
     assert found["depth"].max() < 0.1 * module.RADIUS and found["depth"][-1] < 0.005
-    assert (
-        np.abs(frames[-1, 1:, 0]).max() < 2.0 and np.abs(frames[-1] - frames[-2]).max() < 0.01
-    )  # in the box
+    assert np.abs(frames[-1, 1:, 0]).max() < 2.0 and np.abs(frames[-1] - frames[-2]).max() < 0.01  # in the box
     assert speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0  # more than the motor's torque
     source = module.__loader__.get_source(module.__name__)
     lines = source.split("# ---")[1].count("\n") - 1

@@ -29,9 +29,7 @@ def make_box_problem(mass, size, dt, v):
             rows += [np.concatenate([axis, np.cross(arm, axis)]) for axis in np.roll(np.eye(3), 1, axis=0)]
     inertia = mass * size**2 / 6.0
     cones = lv.Cones.contacts([0.5] * 4)
-    return lv.Problem.from_jacobian(
-        np.array(rows), np.diag([mass] * 3 + [inertia] * 3), v + dt * GRAVITY, cones=cones
-    )
+    return lv.Problem.from_jacobian(np.array(rows), np.diag([mass] * 3 + [inertia] * 3), v + dt * GRAVITY, cones=cones)
 
 
 def test_the_box_of_pinocchio_runs_on_a_stand_in(monkeypatch, capsys):
@@ -60,14 +58,7 @@ def test_the_box_of_pinocchio_runs_on_a_stand_in(monkeypatch, capsys):
 
 def test_the_box_of_drake_runs_on_a_stand_in(monkeypatch, capsys):
     module = example("drake_box")
-    packages = (
-        "geometry",
-        "math",
-        "multibody.plant",
-        "multibody.tree",
-        "systems.framework",
-        "systems.analysis",
-    )
+    packages = ("geometry", "math", "multibody.plant", "multibody.tree", "systems.framework", "systems.analysis")
     for name in ("pydrake", *(f"pydrake.{package}" for package in packages)):
         monkeypatch.setitem(sys.modules, name, MagicMock())
     plant = MagicMock()

@@ -6,9 +6,7 @@ from worked import ROOT, python
 
 
 def run(*arguments, seed="0", status=0):
-    return python(
-        ROOT / ".ci" / "fingerprint", *arguments, status=status, env={**os.environ, "PYTHONHASHSEED": seed}
-    )
+    return python(ROOT / ".ci" / "fingerprint", *arguments, status=status, env={**os.environ, "PYTHONHASHSEED": seed})
 
 
 def test_the_same_in_another_process_and_a_change_is_named(tmp_path):

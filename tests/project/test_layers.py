@@ -38,9 +38,7 @@ def kernel_breaches(package: Path) -> list[str]:
             continue  # what lies beside the rooms describes the package and its build
         room, where = inside[0], path.relative_to(package.parent).as_posix()
         if room not in KERNEL_HEIGHT:
-            found.append(
-                f"{where}: the room {room!r} has no place in KERNEL_LEVELS of tests/project/test_layers.py"
-            )
+            found.append(f"{where}: the room {room!r} has no place in KERNEL_LEVELS of tests/project/test_layers.py")
             continue
         for name in statement.findall(path.read_text(encoding="utf-8")):
             other = name.split(".")[1] if name else ""
@@ -69,8 +67,7 @@ def test_every_room_of_the_kernels_says_what_it_is():
     text = (ROOT / "lavender_ext" / "README.md").read_text(encoding="utf-8")
     listed = dict(re.findall(r"^\| `(\w+)/` \| (.+) \|$", text, re.MULTILINE))
     heads = {
-        room: ast.get_docstring(ast.parse((ROOT / "lavender_ext" / room / "__init__.py").read_text()))
-        for room in rooms
+        room: ast.get_docstring(ast.parse((ROOT / "lavender_ext" / room / "__init__.py").read_text())) for room in rooms
     }
     assert listed == heads
     heights = [KERNEL_HEIGHT[room] for room in listed]
@@ -111,9 +108,7 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
 
     def listed(head, end):
         table = page[page.index(head) : page.index(end)]
-        return [
-            re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in table.splitlines() if line[:3] == "| `"
-        ]
+        return [re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in table.splitlines() if line[:3] == "| `"]
 
     above = ("cli", "export", "audit", "report", "suite", "diagnostics", "sim", "io")
     floors = [name for (name,) in listed("## Layers", "## Data flow")]

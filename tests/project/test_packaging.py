@@ -70,11 +70,7 @@ def test_no_text_offers_the_package_of_someone_else():
     ]
     texts += [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "pyproject.toml", ROOT / ".ci" / "run"]
     assert len(texts) > 100
-    found = [
-        f"{path.relative_to(ROOT)}: {m[0]}"
-        for path in texts
-        for m in offers.finditer(path.read_text("utf-8"))
-    ]
+    found = [f"{path.relative_to(ROOT)}: {m[0]}" for path in texts for m in offers.finditer(path.read_text("utf-8"))]
     assert found == []
     assert offers.search("pip install lavender")
     assert offers.search("pip install 'lavender[wasm]'")
@@ -106,9 +102,7 @@ def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_
 def test_the_citation_names_this_version_and_licence():
     said = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE))
     assert said["version"] == lavender.__version__
-    assert (
-        said["license"] == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
-    )
+    assert said["license"] == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
     assert {"cff-version", "message", "title"} <= set(said)
 
 
@@ -123,9 +117,7 @@ def test_classifiers_claim_only_platforms_that_were_run():
 def test_the_lock_file_names_what_the_package_asks_for():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     asked = {re.split(r"[<>=]", line)[0] for line in project["dependencies"]}
-    lock = dict(
-        re.findall(r"^([\w-]+)==(\S+)$", (ROOT / "docs" / "versions.txt").read_text("utf-8"), re.MULTILINE)
-    )
+    lock = dict(re.findall(r"^([\w-]+)==(\S+)$", (ROOT / "docs" / "versions.txt").read_text("utf-8"), re.MULTILINE))
     extras = project["optional-dependencies"]
     needed = asked | {re.split(r"[<>=]", x)[0] for name in ("qp", "fclib", "mujoco") for x in extras[name]}
     assert needed <= set(lock)
@@ -165,19 +157,9 @@ def declared(table):
 def test_every_import_is_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
     known = declared("dependencies") | declared("fclib") | declared("qp")
-    known |= (
-        declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
-    )
+    known |= declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     # If installed:
-    known |= declared("newton") | {
-        "lavendersim",
-        "mujoco_warp",
-        "pinocchio",
-        "pydrake",
-        "qoco",
-        "siconos",
-        "warp",
-    }
+    known |= declared("newton") | {"lavendersim", "mujoco_warp", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
@@ -244,18 +226,14 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     code = "from pathlib import Path; from lavender.sim.web import compile; "
     code += "Path.write_bytes = lambda *what: print(*what); "
     done = python(
-        "-c",
-        code
-        + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.write_atomically(Path('a.wasm'), b'')",
+        "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.write_atomically(Path('a.wasm'), b'')"
     )
     names += [done.stdout.split()[0], "a.h", "a.wasm"]
     for folder in ("lavender/sim/web", "docs"):
         (tmp_path / folder).mkdir(parents=True)
         for name in names:
             (tmp_path / folder / name).write_text("")
-    rules = [
-        line for line in (ROOT / "MANIFEST.in").read_text("utf-8").splitlines() if line and line[0] != "#"
-    ]
+    rules = [line for line in (ROOT / "MANIFEST.in").read_text("utf-8").splitlines() if line and line[0] != "#"]
     code = "from setuptools.command.egg_info import FileList; files = FileList(); "
     code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
     done = python("-c", code, cwd=tmp_path)

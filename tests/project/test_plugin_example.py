@@ -95,9 +95,7 @@ def test_a_faulty_plug_in_costs_its_checks_alone_and_gets_sentences(environment,
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[lavender.solvers]\nfaulty = faulty:SPEC\n")
     path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
-    report = python(
-        "-m", "lavender", "contract", "faulty", env={**environment, "PYTHONPATH": path}, status=1
-    ).stdout
+    report = python("-m", "lavender", "contract", "faulty", env={**environment, "PYTHONPATH": path}, status=1).stdout
     assert "np." not in report and "Traceback" not in report and "assert" not in report
     assert "CONVERGED and lv.residual(problem, impulse).relative <= 1e-08" in report
     assert "the code of the solver ended its process" in report and "(exit status 7)" in report

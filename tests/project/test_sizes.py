@@ -19,9 +19,7 @@ BUDGETS = {
 
 def count_lines(package):
     """Count the lines of the sources of a package."""
-    files = (
-        path for path in (ROOT / package).rglob("*") if path.suffix in SUFFIXES and path not in GENERATED
-    )
+    files = (path for path in (ROOT / package).rglob("*") if path.suffix in SUFFIXES and path not in GENERATED)
     return sum(path.read_bytes().count(b"\n") for path in files)
 
 

@@ -42,9 +42,7 @@ def test_no_object_of_many_fields_is_made_by_place():
     names = classes_with_fields()
     assert {"Solution", "QP", "Cones", "Record"} <= names
     found = [
-        f"{path}:{line}: {name}"
-        for path, tree in syntax_of_package().items()
-        for line, name in long_calls(tree, names)
+        f"{path}:{line}: {name}" for path, tree in syntax_of_package().items() for line, name in long_calls(tree, names)
     ]
     assert found == [], f"name the fields in:\n{chr(10).join(found)}"
 
@@ -57,15 +55,7 @@ def test_a_long_call_is_seen():
 #: Documented in spite of their underscore: named tuples, ctypes, IPython, sys and os.
 DOCUMENTED = {"_asdict", "_replace", "_fields_", "_repr_html_", "_current_frames", "_exit"}
 #: Attributes of other engines that the importers read, which tests of the importers imitate.
-DOCUMENTED |= {
-    "_solver_kamino",
-    "_contacts_kamino",
-    "_jacobians",
-    "_model",
-    "_config",
-    "_options",
-    "_initialized",
-}
+DOCUMENTED |= {"_solver_kamino", "_contacts_kamino", "_jacobians", "_model", "_config", "_options", "_initialized"}
 PRIVATE = re.compile(r"_[a-zA-Z]\w*")
 TAKEN = re.compile(r"(\b(import|from)\b.*|[.'\"])\b_[a-zA-Z]")
 
@@ -92,9 +82,7 @@ def private_names(tree):
 def test_tests_take_public_names_only():
     """A layout that tests have taken hold of cannot change: what needs a test is its room's public name."""
     tests = Path(__file__).resolve().parent.parent
-    texts = {
-        path.relative_to(tests): path.read_text(encoding="utf-8") for path in sorted(tests.rglob("*.py"))
-    }
+    texts = {path.relative_to(tests): path.read_text(encoding="utf-8") for path in sorted(tests.rglob("*.py"))}
     found = [
         f"{path}:{line}: {name}"
         for path, text in texts.items()
@@ -108,9 +96,7 @@ def test_no_test_imports_a_conftest():
     """There are several, and which one Python finds first is a matter of the folders that pytest is given."""
     tests = Path(__file__).resolve().parent.parent
     texts = {path: path.read_text(encoding="utf-8") for path in tests.rglob("*.py")}
-    found = [
-        path.name for path, text in texts.items() if re.search(r"^\s*(from|import) conftest\b", text, re.M)
-    ]
+    found = [path.name for path, text in texts.items() if re.search(r"^\s*(from|import) conftest\b", text, re.M)]
     assert found == []
 
 

@@ -137,9 +137,7 @@ def test_numbers_out_of_range_are_rejected_by_name_and_limit(call, name):
 
 # -- scenes that are stepped --------------------------------------------------------------------------------------
 
-real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from(
-    [s * x for x in SPECIAL for s in (1.0, -1.0)]
-)
+real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from([s * x for x in SPECIAL for s in (1.0, -1.0)])
 positive = real.map(lambda x: abs(x) or 1.0)
 size = st.sampled_from((0.0, 1e-60, 1e-12, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e8, 1e30, 1e60))
 vector = st.lists(real, min_size=3, max_size=3) | st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3)
@@ -167,11 +165,7 @@ MOTION = {"quaternion": st.lists(real, min_size=4, max_size=4), "inertia": st.li
 JOINT_OPTIONS = {"collide": st.booleans(), "hertz": st.sampled_from((0.0, 1e-9, 1.0, 1e9, 1e60)),
                  "damping": st.sampled_from((0.0, 1.0, 1e60))}  # fmt: skip
 MOTOR = {"motor_speed": real, "motor_torque": st.sampled_from((0.0, 1.0, 1e9, 1e60))}
-SHAPES = {
-    "body": {},
-    "sphere": {"radius": positive},
-    "box": {"size": st.lists(positive, min_size=3, max_size=3)},
-}
+SHAPES = {"body": {}, "sphere": {"radius": positive}, "box": {"size": st.lists(positive, min_size=3, max_size=3)}}
 UNCHANGING = ("save", "problem", "residual")  # Actions that change nothing.
 ACTIONS = st.sampled_from((*UNCHANGING, "few sweeps", "many sweeps", "cold", "warm", "snapshot", "restore", "reset",
                            "seed"))  # fmt: skip
@@ -306,12 +300,7 @@ def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(
 
 
 def box(size, x=0.0, y=0.0, z=0.0, **more):
-    return {
-        "add": "box",
-        "size": [size] * 3 if np.isscalar(size) else size,
-        "mass": 1.0,
-        "position": [x, y, z],
-    } | more
+    return {"add": "box", "size": [size] * 3 if np.isscalar(size) else size, "mass": 1.0, "position": [x, y, z]} | more
 
 
 def sphere(radius, x=0.0, z=0.0):
@@ -348,15 +337,11 @@ ARRAYS = {"size": "<i4", "real": "<f8", "index": "<i4", "keys": "<u8"}
 NUMBERS = {
     "real": st.sampled_from((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9)),
     "keys": st.integers(0, 2**64 - 1),
-    **dict.fromkeys(
-        ("size", "index"), st.sampled_from((-(2**31), -1000, -1, 0, 1, 2, 7, 65536, 10**8, 2**31 - 1))
-    ),
+    **dict.fromkeys(("size", "index"), st.sampled_from((-(2**31), -1000, -1, 0, 1, 2, 7, 65536, 10**8, 2**31 - 1))),
 }
 HEADER = st.tuples(
     st.sampled_from(("version", "fingerprint", "steps", "failed", "lost", "lengths", "extra", None)),
-    st.sampled_from(
-        (None, -1, 0, 1, 10**30, 1.5, "x", [], [[]], [1, 2, 3, 4], {}, True, float("inf"), "\ud800")
-    ),
+    st.sampled_from((None, -1, 0, 1, 10**30, 1.5, "x", [], [[]], [1, 2, 3, 4], {}, True, float("inf"), "\ud800")),
 )
 DAMAGE = st.one_of(
     st.sampled_from(("deep", "long", "text", "checksum")),
@@ -435,9 +420,7 @@ def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
         assert sim.snapshot().real.tobytes() == before.real.tobytes()
 
 
-@pytest.mark.parametrize(
-    ("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})]
-)
+@pytest.mark.parametrize(("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})])
 def test_a_restored_snapshot_is_the_same_and_its_pairs_are_searched_again(name, solver):
     sim = after(30, name, **solver)
     shot = sim.snapshot()
@@ -450,9 +433,7 @@ def test_a_restored_snapshot_is_the_same_and_its_pairs_are_searched_again(name, 
     state = sim.state.copy()
     state.real[:], state.index[:], state.keys[:] = shot.real, shot.index, shot.keys
     state.head[HEAD["pairs"]] = 0
-    sim.restore(
-        lv.Snapshot(shot.fingerprint, shot.steps, 0, "", state.size, state.real, state.index, state.keys)
-    )
+    sim.restore(lv.Snapshot(shot.fingerprint, shot.steps, 0, "", state.size, state.real, state.index, state.keys))
     assert sim.constraint_problem().n_blocks > 0
     assert trajectory(sim, 5) == expected
     assert sim.constraint_problem().b.tobytes() == problem.b.tobytes()

@@ -24,11 +24,7 @@ def test_the_history_has_all_stages_and_changes_no_bit(name):
     recorded, plain = lv.solve(problem, history=True), lv.solve(problem)
     history = recorded.history
     assert recorded.impulse.tobytes() == plain.impulse.tobytes()
-    assert (recorded.status, recorded.iterations, recorded.message) == (
-        plain.status,
-        plain.iterations,
-        plain.message,
-    )
+    assert (recorded.status, recorded.iterations, recorded.message) == (plain.status, plain.iterations, plain.message)
     assert set(history.solvers) == CASES[name]
     assert len(history.solvers) == len(history.iterations) == len(history.time)
     assert history.iterations[0] == 0 and history.iterations[-1] == recorded.iterations
@@ -52,11 +48,7 @@ def test_a_start_that_is_a_solution_has_one_record():
 def test_a_prepared_auto_records_only_if_requested():
     problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
     prepared = lv.prepare(problem)
-    first, second, third = (
-        prepared.solve(history=True),
-        prepared.solve(max_iter=500),
-        prepared.solve(history=True),
-    )
+    first, second, third = (prepared.solve(history=True), prepared.solve(max_iter=500), prepared.solve(history=True))
     assert second.history is None
     assert first.history.iterations.tolist() == third.history.iterations.tolist()
     assert first.impulse.tobytes() == third.impulse.tobytes()

@@ -14,9 +14,7 @@ from lavender.solvers.costs import estimate_judge_setup_cost, estimate_result_co
 from lavender.solvers.sweeping import SweepSolver
 from lavender.solving.auto import DecisionTree, Newton, Step, estimate_cost
 
-OWN = [
-    name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"
-]
+OWN = [name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"]
 
 
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
@@ -116,11 +114,7 @@ def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
             assert solution.solver.name == name and not solution.work
             assert solution.residual.relative == least
     has_cost = spec.load().cost is not registry.Solver.cost
-    assert (
-        asked
-        or not has_cost
-        or name in ("sequential_impulses", "anderson", "nncg", "block_gauss_seidel", "admm")
-    )
+    assert asked or not has_cost or name in ("sequential_impulses", "anderson", "nncg", "block_gauss_seidel", "admm")
 
 
 @functools.cache

@@ -88,9 +88,7 @@ def test_redundant_boxes_cold_at_every_mass_ratio(name, form, ratio):
         assert solution.work["factorisations"] <= 30 and solution.solver.form == form
 
 
-@pytest.mark.parametrize(
-    ("name", "case"), [("newton", "pyramidF(k=4)"), ("auto", "pyramidF(k=4, mass_ratio=1e3)")]
-)
+@pytest.mark.parametrize(("name", "case"), [("newton", "pyramidF(k=4)"), ("auto", "pyramidF(k=4, mass_ratio=1e3)")])
 def test_ctrl_c_returns_the_best_iterate(name, case, interrupted_newton):
     """Interrupted after the fifth turn: what was found until then is kept, and `auto` begins nothing more."""
     looks = interrupted_newton

@@ -48,9 +48,7 @@ def held_rows(problem, lam, rounding):
 
 
 @pytest.mark.parametrize("scale", [0, 180, -180])
-@pytest.mark.parametrize(
-    "kind", ["four_bar(tilt=0.3)", "ring(n=8)", *(k for k in CONTACTS if k != "ellipses")]
-)
+@pytest.mark.parametrize("kind", ["four_bar(tilt=0.3)", "ring(n=8)", *(k for k in CONTACTS if k != "ellipses")])
 def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
     """F = 2^-53 (max(|J| |M^-1| |J|^T |lam| + c |lam|, d |lam|) + |b|), by dense matrices; squares beyond float64."""
     problem = arms_along_axes(CONTACTS[kind](3)) if kind in CONTACTS else suite.case(kind).problem
@@ -65,18 +63,14 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
     scaled = dataclasses.replace(problem, b=problem.b * 2.0**scale, rows=moved, cones=cones)
     for lam in np.diag(100.0 * np.abs(problem.b).max() / problem.d):  # each row once is the one that counts
         size = jac @ (np.abs(inv_mass) @ (jac.T @ lam))
-        size = np.maximum(
-            size + problem.compliance * lam, problem.d * lam
-        )  # a tangent alone is cut; else d is A_kk
+        size = np.maximum(size + problem.compliance * lam, problem.d * lam)  # a tangent alone is cut; else d is A_kk
         f = 2.0**-53 * (size + np.abs(problem.b))
         f[held_rows(problem, lam, f)] = 0.0
         start = lv.residual(problem, lam)
         energy = np.sqrt(np.sum(f**2 / problem.d)) / start.energy_at_zero
         velocity = np.max(f * problem.metric.weight / problem.d) / start.velocity_at_zero
         found = lv.residual(scaled, lam * 2.0**scale)
-        assert found.roundoff_floor == pytest.approx(
-            max(energy, velocity), rel=1e-12, abs=0.0
-        )  # sums in another order
+        assert found.roundoff_floor == pytest.approx(max(energy, velocity), rel=1e-12, abs=0.0)  # sums in another order
 
 
 def test_a_step_that_goes_wrong_is_undone():
@@ -108,8 +102,4 @@ def test_checks_end_a_run_soon_after_it_is_there(name, tol):
     solution = lv.solve(problem, name, tol=tol)
     # The last check before the end was at most an eighth, or one, or half of what was expected, too early; with
     # acceleration the fall is not steady, and the expectation may be out by as much again.
-    assert (
-        there
-        <= solution.iterations
-        <= there + max(1, there >> (3 if name in ("pgs", "sequential_impulses") else 2))
-    )
+    assert there <= solution.iterations <= there + max(1, there >> (3 if name in ("pgs", "sequential_impulses") else 2))

@@ -17,20 +17,8 @@ ROWS = 150  # at most: the set of all tests here takes seconds
 
 def recorded():
     """Steps of the engine with their warm start."""
-    scenes = [
-        ("stack", {}),
-        ("stack", {"n": 10}),
-        ("pyramid", {"base": 3}),
-        ("card_house", {}),
-        ("bridge", {}),
-    ]
-    scenes += [
-        ("chain", {"n": 8}),
-        ("heavy_on_light", {}),
-        ("table", {"legs": 4}),
-        ("four_bar", {}),
-        ("ramp", {}),
-    ]
+    scenes = [("stack", {}), ("stack", {"n": 10}), ("pyramid", {"base": 3}), ("card_house", {}), ("bridge", {})]
+    scenes += [("chain", {"n": 8}), ("heavy_on_light", {}), ("table", {"legs": 4}), ("four_bar", {}), ("ramp", {})]
     for name, parameters in scenes:
         simulation = lv.Simulation(lv.Scene(name, **parameters))
         for step in range(100):

@@ -201,9 +201,7 @@ def test_stored_solution_meets_every_condition_to_its_digits(name):
         assert friction <= (Fraction(float(c.mu[i])) * lam[first]) ** 2
         lower[first], upper[first] = 0.0, np.inf
         lower[first + 1 : end] = [-np.inf] * (end - first - 1)  # nothing slides: w is 0 on all rows
-    for low, high, impulse, slack in zip(
-        lower, upper, lam, np.array(speed, object) - np.array(b, object), strict=True
-    ):
+    for low, high, impulse, slack in zip(lower, upper, lam, np.array(speed, object) - np.array(b, object), strict=True):
         assert low - excess <= float(impulse) <= high + excess
         assert slack >= -tolerance or float(impulse) >= high
         assert slack <= tolerance or float(impulse) <= low

@@ -58,8 +58,7 @@ def test_painleve_meets_the_condition_of_the_paradox():
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"],
+    "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"]
 )
 def test_structures_stand(name):
     case = suite.case(name)

@@ -71,9 +71,7 @@ def test_each_line_is_reached_and_named(name):
     assert found.success
     compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= registry.SMALL_ROWS else set()
     searched = (
-        {"least"}
-        if set(expected) & {"newton", "newton over rows"} and problem.generalized is not None
-        else set()
+        {"least"} if set(expected) & {"newton", "newton over rows"} and problem.generalized is not None else set()
     )  # least violation
     assert {stage.solver.partition(" ")[0] for stage in found.stages} <= {
         name.partition(" ")[0] for name in (*expected, *compiled, *searched)
@@ -115,9 +113,7 @@ def test_a_small_problem_is_told_by_who_solves_it(make, names):
         partial(wild, 99750),  # newton stalls from what sweeps leave, and not from nothing
         partial(drawn, 99529, part="judged"),  # the second turn brings admm on the way
         partial(drawn, 99860, part="judged"),  # newton gains nothing in hundreds of factorisations
-        partial(
-            drawn, 102121, part="judged"
-        ),  # rows of A after velocities stall, for more than is left as counted
+        partial(drawn, 102121, part="judged"),  # rows of A after velocities stall, for more than is left as counted
     ],
     ids=lambda make: f"{make.func.__name__}{make.args}",
 )
@@ -128,11 +124,7 @@ def test_what_only_late_turns_solve_is_solved(make):
 
 def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
     rng = np.random.default_rng(8)
-    half, jac, moved = (
-        rng.standard_normal((150, 150)),
-        rng.standard_normal((400, 150)),
-        rng.standard_normal(150),
-    )
+    half, jac, moved = (rng.standard_normal((150, 150)), rng.standard_normal((400, 150)), rng.standard_normal(150))
     target = jac @ moved - rng.exponential(0.5, 400) * (rng.random(400) < 0.7)
     cones = lv.Cones.bounded(np.zeros(400), np.full(400, np.inf))
     problem = lv.Problem.from_jacobian(jac, half @ half.T, np.zeros(150), target=target, cones=cones)
@@ -147,10 +139,7 @@ def test_sweeps_alone_solve_contacts_whose_rows_have_unlike_units(contacts, fric
     rng = np.random.default_rng(contacts)
     m, unit = 3 * contacts, 10.0 ** rng.uniform(-2.0, 2.0, 3 * contacts)
     half, b = rng.standard_normal((m, 2 * m)), rng.standard_normal(m)
-    matrix, cones = (
-        unit[:, None] * (half @ half.T) * unit / m,
-        lv.Cones.contacts(rng.uniform(0.2, 1.0, contacts)),
-    )
+    matrix, cones = (unit[:, None] * (half @ half.T) * unit / m, lv.Cones.contacts(rng.uniform(0.2, 1.0, contacts)))
     solution = lv.solve(lv.Problem(unit * b, cones, matrix, friction=friction))
     assert solution.success and set(solution.work) <= {"sweeps", "restarts"}, solution.message
 
@@ -192,9 +181,7 @@ def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way(unit):
     target[::3] = 3.0 * np.abs(target[::3])
     cones = lv.Cones.contacts(0.3, count=3)
     mass = min(unit, 1e40) * np.eye(7)
-    found = lv.solve(
-        lv.Problem.from_jacobian(unit * jac, mass, np.zeros(7), target=unit * target, cones=cones)
-    )
+    found = lv.solve(lv.Problem.from_jacobian(unit * jac, mass, np.zeros(7), target=unit * target, cones=cones))
     assert not found.success and found.claim_check == "confirmed"
     assert found.status is lv.Status.INFEASIBLE or unit > 1.0
 

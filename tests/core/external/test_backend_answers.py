@@ -56,9 +56,7 @@ def test_program_form_near_unit_scale_has_the_users_own_numbers():
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_program_form_returns_the_solution_at_any_scale(scale):
     program = draw_program(10)
-    problem = lv.Problem.from_qp(
-        **{k: v * scale if k in ("P", "q", "A", "b") else v for k, v in program.items()}
-    )
+    problem = lv.Problem.from_qp(**{k: v * scale if k in ("P", "q", "A", "b") else v for k, v in program.items()})
     solution = lv.solve(problem, "clarabel")
     qp = build_program(problem, "program")
     x, zeta, xi = qp.make_start(solution.impulse)
@@ -82,9 +80,7 @@ def test_form_by_name_or_by_the_problem_is_used():
         lv.solve(lv.Problem.lcp(*spd(3)), "clarabel", form="program")
     jac = np.eye(2, 3)
     regular, repeated = (
-        lv.Problem.from_jacobian(
-            rows, np.eye(3), np.ones(3), cones=lv.Cones.bounded(np.zeros(len(rows)), np.inf)
-        )
+        lv.Problem.from_jacobian(rows, np.eye(3), np.ones(3), cones=lv.Cones.bounded(np.zeros(len(rows)), np.inf))
         for rows in (jac, np.vstack([jac, jac[:1]]))
     )
     assert choose_program_form(regular, "auto") == "impulse"
@@ -110,10 +106,7 @@ def test_solve_qp_of_an_ill_conditioned_program_is_solved_by_named_backends(name
 
 def test_matrix_p_of_all_forms_is_symmetric_in_every_bit():
     problem = lv.Problem.lcp(*spd(9, seed=1))
-    for qp in (
-        build_program(problem, "impulse"),
-        build_program(lv.Problem.from_qp(**draw_program(6)), "program"),
-    ):
+    for qp in (build_program(problem, "impulse"), build_program(lv.Problem.from_qp(**draw_program(6)), "program")):
         assert (qp.P != qp.P.T).nnz == 0
 
 

@@ -105,8 +105,6 @@ def test_description_of_a_backend_has_its_observations_and_what_its_adapter_does
 def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
     problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [0.0, -1e-7], lb=[0.0, 0.0], ub=[1.0, 1.0])
     solution = lv.solve(problem, "auto", max_iter=0)
-    contradicted = replace(
-        solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x"
-    )
+    contradicted = replace(solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x")
     row = compare_with_reference(problem, "daqp", contradicted, None)
     assert "observed with daqp" in row.note and "x2 = 0.03" in row.note

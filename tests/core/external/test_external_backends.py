@@ -370,12 +370,7 @@ def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(registe
     [
         (False, True, "confirmed", "auto found the certificate"),
         (True, True, "contradicted", "auto found a solution"),
-        (
-            True,
-            False,
-            "not proven",
-            "not proven: no certificate was given",
-        ),  # too many rows for our own search
+        (True, False, "not proven", "not proven: no certificate was given"),  # too many rows for our own search
     ],
 )
 def test_a_claim_of_infeasibility_without_a_certificate_is_checked_by_our_own(

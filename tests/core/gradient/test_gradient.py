@@ -40,9 +40,7 @@ def test_directions_agree_with_differences_of_solutions(kind, law, operator):
             wanted = (ends[1].slack - ends[0].slack) / (2.0 * H)
             assert np.abs(found.slack - wanted).max() <= CLOSE * size, (seed, name)
             if p.matrix is None:
-                ends = [
-                    moved(p, name, change, h).velocity(x.impulse) for h, x in zip((-H, H), ends, strict=True)
-                ]
+                ends = [moved(p, name, change, h).velocity(x.impulse) for h, x in zip((-H, H), ends, strict=True)]
                 wanted = (ends[1] - ends[0]) / (2.0 * H)
                 assert np.abs(found.velocity - wanted).max() <= CLOSE * size, (seed, name)
         return
@@ -108,10 +106,7 @@ def test_states_fit_impulse_and_slack(kind):
         if state.name == "slides" and len(rows) == 3 and "box" not in kind:
             reach = np.where(c.friction_coefficient[rows[1:]] > 0.0, c.friction_coefficient[rows[1:]], 1.0)
             share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
-            assert (
-                share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6)
-                or kind == "smooth"
-            )
+            assert share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6) or kind == "smooth"
 
 
 # -- where it does not exist ------------------------------------------------------------------------------------
@@ -177,18 +172,14 @@ def test_arrays_of_a_batch_are_those_of_its_gradients():
     # one after the other, of what the compiled call takes and of what goes alone: a matrix, a singular system
     rng = np.random.default_rng(0)
     problems = [drawn(seed, "disk", "cone", "generalized") for seed in range(3)]
-    twice = lv.Problem.from_jacobian(
-        np.ones((2, 1)), np.eye(1), [-1.0], cones=lv.Cones.bounded(np.zeros(2), np.inf)
-    )
+    twice = lv.Problem.from_jacobian(np.ones((2, 1)), np.eye(1), [-1.0], cones=lv.Cones.bounded(np.zeros(2), np.inf))
     for given in (problems, [*problems, twice, drawn(3, "ellipse", "cone", "generalized")]):
         solutions = lv.solve_many(given, tol=1e-12)
         weights = [rng.standard_normal(p.generalized.nv) for p in given]
         for answers in (solutions, [s.impulse for s in solutions], [s.impulse.tolist() for s in solutions]):
             d = lv.derivatives(given, answers)
             found = d.vjp(velocity=weights)
-            each = [
-                lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)
-            ]
+            each = [lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)]
             assert np.array_equal(found.v_free, np.concatenate([g.v_free for g in each]))
             assert np.array_equal(pickle.loads(pickle.dumps(found)).v_free, found.v_free)
             assert np.array_equal(found.mu, np.concatenate([g.mu for g in each]))
@@ -246,9 +237,7 @@ def test_contacts_given_twice_move_as_given_once(law, count):
     assert found[0].unique and not found[1].unique.impulse.all() and found[1].unique.slack.all()
     closed = [d.states.case[: each * count : each] != 0 for d in found]
     assert np.array_equal(*closed)
-    assert np.array_equal(
-        found[1].unique.impulse[: each * count : each], ~closed[1]
-    )  # what is open is unique
+    assert np.array_equal(found[1].unique.impulse[: each * count : each], ~closed[1])  # what is open is unique
     y, push = rng.standard_normal((2, jac.shape[1]))
     once, twice = (d.vjp(velocity=y).v_free for d in found)
     assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
@@ -270,9 +259,7 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
         monkeypatch.setattr("lavender.gradient.system.MAX_KERNEL_ROWS", small)
         monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "MAX_KERNEL_ROWS", small)
         monkeypatch.setattr("lavender.gradient.system.MAX_DENSE_ROWS", dense)
-        monkeypatch.setattr(
-            "lavender.gradient.system.is_dense_faster", lambda nnz, m, cones, few=few: few == 0.0
-        )
+        monkeypatch.setattr("lavender.gradient.system.is_dense_faster", lambda nnz, m, cones, few=few: few == 0.0)
         d = lv.derivative(p, solution)
         found.append(d.vjp(**weights))
     names = ["b", "lower", "mu"] + (["v_free", "J", "compliance"] if p.matrix is None else ["A"])

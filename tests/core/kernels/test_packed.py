@@ -43,9 +43,7 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
 
 @pytest.mark.parametrize("order", ["given", "reverse", "symmetric", "bottom_up", "colored", "array"])
 @pytest.mark.parametrize(("name", "options"), [("nncg", {}), ("nncg", {"convex": 20}), ("anderson", {})])
-@pytest.mark.parametrize(
-    ("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")]
-)
+@pytest.mark.parametrize(("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")])
 def test_pairs_within_single_sweeps_are_the_plain_ones(order, name, options, contacts, joints, kind):
     problem = tangled(contacts, contacts, joints, kind=kind)
     is_named, rng = order != "array", np.random.default_rng(contacts)

@@ -53,9 +53,7 @@ def test_a_full_factor_solves_and_counts_what_is_lost(n):
     a = half @ half.T + np.eye(n)
     wide, narrow = (LinearSystem(n, lanes) for lanes in (True, False))
     assert wide.factor(a, a.diagonal(), 0.0, 1e-13) == narrow.factor(a, a.diagonal(), 0.0, 1e-13) == 0
-    np.testing.assert_allclose(
-        wide.multiply(b), a @ b, rtol=0, atol=n * EPS * np.abs(a).sum() * np.abs(b).max()
-    )
+    np.testing.assert_allclose(wide.multiply(b), a @ b, rtol=0, atol=n * EPS * np.abs(a).sum() * np.abs(b).max())
     np.testing.assert_array_equal(wide.solve(b), narrow.solve(b))
     x = wide.solve(b)
     assert np.linalg.norm(a @ x - b) <= n * EPS * np.linalg.norm(a, 2) * np.linalg.norm(x)
@@ -122,10 +120,7 @@ def test_dissection_halves_the_work_of_minimum_degree_on_a_cube(piles):
     order = order_for_elimination(*raw(graph))
     assert np.array_equal(np.sort(order), np.arange(len(order)))
     pattern = sp.csr_array(graph + sp.eye_array(graph.shape[0]))
-    work = [
-        (np.diff(factor_of(pattern, x)[0]) ** 2.0).sum()
-        for x in (order, LinearSystem(raw(pattern), True).order)
-    ]
+    work = [(np.diff(factor_of(pattern, x)[0]) ** 2.0).sum() for x in (order, LinearSystem(raw(pattern), True).order)]
     # The order of LinearSystem is that of minimum degree. Other software for nested dissection reaches 0.4 as well.
     assert work[0] < 0.5 * work[1]
 
@@ -135,9 +130,7 @@ def test_wide_supernodes_give_the_bits_of_two_lanes(lu):
     """Products from 16,384 entries on copy their matrices in blocks; edges of 1 to 11 rows and columns remain."""
     rng = np.random.default_rng(4)
     corner = mirrored(rng, 301, 7, 0.02)
-    a = definite(
-        sp.block_array([[corner, None], [None, rng.normal(size=(613, 613))]]) + sp.eye_array(914, k=300)
-    )
+    a = definite(sp.block_array([[corner, None], [None, rng.normal(size=(613, 613))]]) + sp.eye_array(914, k=300))
     found = []
     for wide in (True, False):
         f = LinearSystem(raw(a), wide)
@@ -244,9 +237,7 @@ def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
     """The grid takes 7e8 multiply-adds, and signals are checked after every 2e8: the handler runs inside the call."""
     n = 24
     line, one = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), sp.eye_array(n)
-    grid = (
-        sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
-    )
+    grid = sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
     a = sp.csr_array(grid)
     a.sort_indices()
     system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))

@@ -83,10 +83,7 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
         expected = project(law, y[block], components)
         scale = np.abs(z[block]).max() + np.abs(s[block]).max()
         np.testing.assert_allclose(
-            (z[block] - linear.residual[block]).astype(float),
-            expected.astype(float),
-            rtol=0,
-            atol=1e-14 * scale,
+            (z[block] - linear.residual[block]).astype(float), expected.astype(float), rtol=0, atol=1e-14 * scale
         )
         if (linear.margin[block] * linear.root[block]).min() < 1e-3:
             continue  # near a kink, where differences do not converge
@@ -107,10 +104,7 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
                 root[block][0] / root[block][rows[0]]
             )
             np.testing.assert_allclose(
-                edge.astype(float),
-                difference(by_coefficient, np.array([a], L), 0).astype(float),
-                rtol=0,
-                atol=1e-9,
+                edge.astype(float), difference(by_coefficient, np.array([a], L), 0).astype(float), rtol=0, atol=1e-9
             )
     cases = np.array(
         [(*case, -1, -1, -1, -1, -1)[:6] for case in states]

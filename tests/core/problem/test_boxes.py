@@ -7,13 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import (
-    as_matrix,
-    dragged,
-    random_box_friction_contacts,
-    random_ellipse_friction_contacts,
-    seeds,
-)
+from random_problems import as_matrix, dragged, random_box_friction_contacts, random_ellipse_friction_contacts, seeds
 
 import lavender as lv
 from lavender import registry
@@ -105,9 +99,7 @@ def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
     assert "takes no boxes" in spec.refuses(free(1))
     assert spec.refuses(replace(free(1), cones=lv.Cones.contacts(0.5, count=4))) is None
     with pytest.raises(lv.InputError, match="box_friction_laws"):
-        registry.SolverSpec(
-            "theirs", lambda: None, frozenset({"coulomb"}), "", box_friction_laws=frozenset({"lcp"})
-        )
+        registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "", box_friction_laws=frozenset({"lcp"}))
 
 
 # -- ellipses --------------------------------------------------------------------------------------------------------
@@ -133,11 +125,7 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
 def test_a_compliance_that_a_thin_ellipse_makes_less_than_one_may_be_is_none():
     """1e-40 in rows that are 1e-12 as long, beside a d of 1e-24."""
     problem = lv.Problem.from_jacobian(
-        np.eye(3),
-        np.eye(3),
-        [0.3, 0.2, -1.0],
-        cones=lv.Cones.contacts([(0.5, 5e-13)]),
-        compliance=[0.0, 0.0, 1e-40],
+        np.eye(3), np.eye(3), [0.3, 0.2, -1.0], cones=lv.Cones.contacts([(0.5, 5e-13)]), compliance=[0.0, 0.0, 1e-40]
     )
     assert problem.disk.compliance.tolist() == [0.0, 0.0, 0.0]
     assert lv.solve(problem, tol=1e-9).success
@@ -166,9 +154,7 @@ def test_disks_share_the_factor_of_the_mass_matrix(mass):
     assert disk.generalized.change(x).tobytes() == anew.change(x).tobytes()
     assert (
         disk.metric.whitened()[2].tobytes()
-        == lv.Problem(disk.b, disk.cones, generalized=anew, compliance=disk.compliance)
-        .metric.whitened()[2]
-        .tobytes()
+        == lv.Problem(disk.b, disk.cones, generalized=anew, compliance=disk.compliance).metric.whitened()[2].tobytes()
     )
 
 
@@ -188,13 +174,9 @@ ELLIPSES = {
 def test_what_comes_back_is_in_the_rows_of_the_problem(form):
     problem = ELLIPSES[form](3, friction="cone")
     s, calls = problem.cones.stretch, []
-    found = lv.solve(
-        problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None
-    )
+    found = lv.solve(problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None)
     r = lv.residual(problem, found.impulse)
-    np.testing.assert_allclose(
-        found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.residual.error, r.error, rtol=1e-9, atol=1e-12)
     assert found.residual.relative == pytest.approx(r.relative, rel=1e-9)
     for x, at in calls:

@@ -45,9 +45,7 @@ def test_what_is_proved_is_said(name):
         solution = lv.solve(opposed(eps), name)
         assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
         assert (solution.impulse_bound == np.inf) is (eps == 0.0)
-        assert (
-            eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0
-        )  # the sum of (2 / eps + 1, 2 / eps)
+        assert eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0  # the sum of (2 / eps + 1, 2 / eps)
         assert words in solution.message
     assert lv.solve(opposed(1.0), name).impulse_bound is None
 
@@ -110,9 +108,7 @@ def test_rigid_rows_that_contradict_each_other_are_found_among_those_that_yield(
     j[np.arange(m), pair[:, 0]], j[np.arange(m), pair[:, 1]] = 1.0, -1.0
     free, rigid = lower < 0.0, soft == 0.0
     one, below = rigid & free, rigid & ~free
-    met = linprog(
-        np.zeros(n), A_ub=-j[below], b_ub=-target[below], A_eq=j[one], b_eq=target[one], bounds=(None, None)
-    )
+    met = linprog(np.zeros(n), A_ub=-j[below], b_ub=-target[below], A_eq=j[one], b_eq=target[one], bounds=(None, None))
     assert solution.status is (lv.Status.CONVERGED if met.success else lv.Status.INFEASIBLE), str(solution)
 
 
@@ -130,9 +126,7 @@ def test_no_solution_has_less_impulse_than_a_direction_says(law, form):
             continue
         for _ in range(10):
             y, c = np.zeros(problem.m), problem.cones
-            y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (
-                rng.random(len(c.normal_rows)) < 0.5
-            )
+            y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (rng.random(len(c.normal_rows)) < 0.5)
             free = np.isneginf(c.lower) & np.isposinf(c.upper) & ~c.contact_rows
             y[free] = rng.normal(size=free.sum())
             found = prove_infeasibility(problem, y)
@@ -168,9 +162,7 @@ def test_dust_beside_the_numbers_that_made_it_asks_nothing(form, name):
         problem = as_matrix(dusty) if form == "matrix" else dusty
         assert len(problem.metric.empty) and problem.b[0] > 0.0
         solution = lv.solve(problem, name, tol=1e-6)
-        clean = lv.solve(
-            problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6
-        )
+        clean = lv.solve(problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6)
         assert solution.success == clean.success, str(solution)
         assert solution.claim_check == "confirmed"
         if form == "J and M" and name in OURS:  # nor to any tolerance

@@ -59,11 +59,7 @@ def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
         solution = lv.solve(problem, name)
         if solution.status is lv.Status.STALLED:
             again = lv.solve(problem, name, impulse=solution.impulse)
-            assert again.residual.relative >= 0.5 * solution.residual.relative, (
-                seed,
-                str(solution),
-                str(again),
-            )
+            assert again.residual.relative >= 0.5 * solution.residual.relative, (seed, str(solution), str(again))
 
 
 @pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
@@ -223,9 +219,7 @@ def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
                 impulse[:] = told
                 return says(status)
 
-            liar = plug_in(
-                run, operators={"matrix"}, supports_rolling=True, box_friction_laws={"coulomb", "cone"}
-            )
+            liar = plug_in(run, operators={"matrix"}, supports_rolling=True, box_friction_laws={"coulomb", "cone"})
             solution = lv.solve(problem, liar)
             assert solution.claim_check == "contradicted", (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}
@@ -338,9 +332,7 @@ def along(ray, b, mu):
 
 RUNAWAYS = {
     "b is not in the range of A": HIDDEN,
-    "sweeps run away until A lambda - b rounds to 0": along(
-        [-0.1, 2.6, 0.7, 1.4], [1.5, 0.0, -1.6, -0.1], [0.8, 0.5]
-    ),
+    "sweeps run away until A lambda - b rounds to 0": along([-0.1, 2.6, 0.7, 1.4], [1.5, 0.0, -1.6, -0.1], [0.8, 0.5]),
     "every row pulls": along([-0.2, -0.7, 0.6, 2.0], [0.2, -1.1, 1.4, -1.9], [0.3, 0.6]),
 }
 
@@ -350,11 +342,7 @@ RUNAWAYS = {
 def test_nobody_solves_what_has_no_solution_by_running_away(name, problem):
     if registry.get(name).refuses(problem) is not None:
         return
-    for budget in (
-        {},
-        {"tol": 1e-9},
-        {"max_iter": 20_000},
-    ):  # one that was used up in vain asks for a proof, too
+    for budget in ({}, {"tol": 1e-9}, {"max_iter": 20_000}):  # one that was used up in vain asks for a proof, too
         solution = lv.solve(problem, name, **budget)
         assert not solution.success and solution.claim_check == "confirmed" and not solution.residual.at_floor
         assert solution.status not in (lv.Status.ROUNDOFF_LIMIT, lv.Status.CONVERGED)

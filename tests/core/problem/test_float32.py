@@ -26,13 +26,7 @@ def dense_parts(p):
 @pytest.mark.parametrize("form", ["rows", "matrix", "generalized"])
 @given(seed=seeds)
 def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
-    p = (
-        random_contact_problem(seed)
-        if form == "rows"
-        else robot(seed)
-        if form == "generalized"
-        else random_lcp(seed)
-    )
+    p = random_contact_problem(seed) if form == "rows" else robot(seed) if form == "generalized" else random_lcp(seed)
     lam = lv.solve(p, max_iter=50).impulse
     if form == "matrix":
         a = p.dense()

@@ -9,14 +9,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import (
-    ancestors,
-    as_matrix,
-    random_generalized_problem,
-    random_tree_parents,
-    seeds,
-    tree_mass,
-)
+from random_problems import ancestors, as_matrix, random_generalized_problem, random_tree_parents, seeds, tree_mass
 
 import lavender as lv
 from lavender.solvers.sweeping import is_sweep_over_jacobian_cheaper
@@ -89,9 +82,7 @@ def test_no_velocities_no_rows_and_rows_on_nothing():
     empty = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=bounds)
     solution = lv.solve(empty, "newton", tol=1e-12)
     np.testing.assert_allclose(solution.impulse, [1.0, 4.0])  # the row on nothing: decided on the spot
-    hopeless = lv.Problem.from_jacobian(
-        jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2)
-    )
+    hopeless = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2))
     assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
 
 
@@ -143,9 +134,7 @@ def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compli
     want = lv.solve(as_matrix(problem), "newton", tol=1e-12)
     assert found.success, str(found)
     assert np.count_nonzero(found.impulse) > 0
-    np.testing.assert_allclose(
-        problem.velocity(found.impulse), problem.velocity(want.impulse), rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(problem.velocity(found.impulse), problem.velocity(want.impulse), rtol=1e-9, atol=1e-9)
     many = lv.solve_many([problem, problem], "newton", tol=1e-11)
     assert many.impulse.tobytes() == found.impulse.tobytes() * 2
 
@@ -163,9 +152,7 @@ def test_updated_is_the_same_structure_with_new_numbers():
     assert problem.updated(b=problem.b) == problem
 
 
-@pytest.mark.parametrize(
-    "jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
-)
+@pytest.mark.parametrize("jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]])
 def test_entries_of_a_that_vanish_are_left_out(jac):
     """Colours and islands are told by entries: of rows that all meet in the same columns, and of others."""
     n = len(jac)
@@ -178,17 +165,13 @@ def test_entries_of_a_that_vanish_are_left_out(jac):
 def test_branches_are_factored_in_their_own_pattern(friction, seed):
     """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
-    problem = random_generalized_problem(
-        seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts
-    )
+    problem = random_generalized_problem(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-11)
     assert solution.residual.relative <= 1e-11 or solution.residual.at_floor
     other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
     # Every row is soft by 0.01 / kg or more, so residuals of 1e-11 are impulses of 1e-8 of their size.
     if friction != "coulomb":
-        np.testing.assert_allclose(
-            solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max())
-        )
+        np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max()))
 
 
 @pytest.mark.parametrize(
@@ -247,9 +230,7 @@ def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
     np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7)
     v = problem.velocity(solution.impulse)
     given = problem.generalized
-    np.testing.assert_allclose(
-        given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11
-    )
+    np.testing.assert_allclose(given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11)
 
 
 def test_room_for_a_pattern_grows():
@@ -266,9 +247,7 @@ def test_room_for_a_pattern_grows():
 @given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), spin=st.booleans(), few=st.booleans())
 def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
-    problem = random_generalized_problem(
-        seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin
-    )
+    problem = random_generalized_problem(seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin)
     if lv.known(problem)[name]:
         assert name == "pgs" and problem.law == "cone"
         return

@@ -45,9 +45,7 @@ def rows_side_by_side(first, second):
     )  # fmt: skip
     j, k, c, d = p.n_joints, q.n_joints, p.n_contacts, q.n_contacts
     cones = first.cones + second.cones
-    order = np.concatenate(
-        [np.arange(j), j + c + np.arange(k), j + np.arange(c), j + c + k + np.arange(d)]
-    ).astype(int)
+    order = np.concatenate([np.arange(j), j + c + np.arange(k), j + np.arange(c), j + c + k + np.arange(d)]).astype(int)
     size = np.diff(cones.ptr)
     row_order = np.concatenate([np.arange(cones.ptr[i], cones.ptr[i] + size[i]) for i in order]).astype(int)
     b = np.concatenate([first.b, second.b])[row_order]
@@ -87,9 +85,7 @@ def scaled(problem, factor):
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds, power=st.integers(-6, 6))
 def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind, friction, seed, power):
-    first, second = (
-        FORMS[form](CONTACTS[kind](seed + i, friction, bodies=3, joints=2, contacts=3)) for i in range(2)
-    )
+    first, second = (FORMS[form](CONTACTS[kind](seed + i, friction, bodies=3, joints=2, contacts=3)) for i in range(2))
     second = scaled(second, 10.0**power)
     both, rows = together(first, second)
     rng = np.random.default_rng(seed)
@@ -241,17 +237,13 @@ def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(see
         assert found[0] == count
         np.testing.assert_array_equal(found[1], label)
     np.testing.assert_array_equal(compute_block_colors(given), compute_block_colors(both))
-    np.testing.assert_array_equal(
-        compute_block_levels_from_ground(given), compute_block_levels_from_ground(both)
-    )
+    np.testing.assert_array_equal(compute_block_levels_from_ground(given), compute_block_levels_from_ground(both))
     lam = np.random.default_rng(seed).normal(size=both.m)
     assert lv.residual(given, lam).relative == lv.residual(both, lam).relative
     for name in ("pgs", "sequential_impulses", "block_gauss_seidel", "newton", "auto"):
         one, other = (lv.solve(p, name, tol=1e-8) for p in (both, given))
         assert one.status is other.status, name
-        np.testing.assert_allclose(
-            lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative
-        )
+        np.testing.assert_allclose(lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative)
 
 
 def test_solve_fast_ball_beside_stack_on_immovable_body_is_judged_separately():
@@ -263,12 +255,7 @@ def test_solve_fast_ball_beside_stack_on_immovable_body_is_judged_separately():
     pairs = [(-1, 0), *((i, i + 1) for i in range(n - 1)), (-1, n)]
     rows = touching(pairs, inv_mass=inverse, inv_inertia=inverse[:, None, None] * np.eye(3), v_free=v_free)
     alone = lv.Problem.from_rows(
-        touching(
-            pairs[:n],
-            inv_mass=inverse[:n],
-            inv_inertia=inverse[:n, None, None] * np.eye(3),
-            v_free=v_free[:n],
-        ),
+        touching(pairs[:n], inv_mass=inverse[:n], inv_inertia=inverse[:n, None, None] * np.eye(3), v_free=v_free[:n]),
         tangents=0,
     )
     given = with_ground_as_body(lv.Problem.from_rows(rows, tangents=0))
@@ -281,9 +268,7 @@ def test_solve_fast_ball_beside_stack_on_immovable_body_is_judged_separately():
 
 
 def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
-    rows = touching(
-        [(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)]
-    )
+    rows = touching([(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)])
     problem = lv.Problem.from_rows(rows, target=[0.0, 0.0, 0.0, 1.0, 0.5, 0.0], mu=0.5)
     assert find_islands(problem) == (2, pytest.approx([0, 1]))
     for name in ("newton", "auto", "admm", "block_gauss_seidel"):
@@ -293,8 +278,6 @@ def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
 
 
 def test_find_islands_stored_zero_of_matrix_connects_nothing():
-    a = sp.csr_array(
-        (np.array([2.0, 0.0, 0.0, 2.0]), np.array([0, 1, 0, 1]), np.array([0, 2, 4])), shape=(2, 2)
-    )
+    a = sp.csr_array((np.array([2.0, 0.0, 0.0, 2.0]), np.array([0, 1, 0, 1]), np.array([0, 2, 4])), shape=(2, 2))
     assert a.nnz == 4
     assert find_islands(lv.Problem.lcp(a, [1.0, 1000.0]))[0] == 2

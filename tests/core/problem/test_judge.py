@@ -47,11 +47,7 @@ def equals_the_twin(problem, lam):
         first = min(said.unrefined, 0.1 * said.relative)  # of a pass that need not be refined
         assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed + first
         # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
-        assert (
-            0.1 * found.roundoff_floor
-            <= said.floors[max(found.worst_island, 0)]
-            <= 100.0 * found.roundoff_floor
-        )
+        assert 0.1 * found.roundoff_floor <= said.floors[max(found.worst_island, 0)] <= 100.0 * found.roundoff_floor
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -111,9 +107,7 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
     # 1e-13 of the size of what is added: a few roundings on a few dozen terms, of J and M those of M and its inverse.
     for form, given_by in FORMS.items():
         p, atol = given_by(problem), 1e-11 if form == "J and M" else 1e-13
-        np.testing.assert_allclose(
-            p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max()
-        )
+        np.testing.assert_allclose(p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max())
         np.testing.assert_allclose(p.dense(), a, atol=atol * np.abs(a).max())
         assert p.csr.has_canonical_format
         np.testing.assert_array_equal(p.dense(), p.dense().T)

@@ -63,9 +63,7 @@ def test_levels_count_from_the_ground():
     problem = lv.Problem.from_rows(rows)
     np.testing.assert_array_equal(compute_block_levels_from_ground(problem), shuffled)
     np.testing.assert_array_equal(shuffled[compute_block_order(problem, "bottom_up").blocks], np.arange(n))
-    np.testing.assert_array_equal(
-        shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1]
-    )
+    np.testing.assert_array_equal(shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1])
     matrix = as_matrix(problem)
     ground = np.flatnonzero(shuffled == 0)
     np.testing.assert_array_equal(compute_block_levels_from_ground(matrix, ground), shuffled)

@@ -71,10 +71,7 @@ def test_rows_have_names():
     cone = lv.Problem(np.ones(6), lv.Cones.contacts(0.5, 5), np.eye(6), friction="cone")
     assert [cone.row_name(i) for i in (3, 4)] == ["contact 0, spin", "contact 0, roll 1"]
     named = lv.Problem(
-        problem.b,
-        problem.cones,
-        rows=problem.rows,
-        names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8,
+        problem.b, problem.cones, rows=problem.rows, names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8
     )
     wide = int(np.argmax(np.diff(problem.cones.ptr[: kj + 1]) > 1))
     assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
@@ -98,9 +95,7 @@ def test_mu_alone_means_two_tangents_and_a_mu_without_friction_rows_is_refused()
     mixed = lv.Problem.from_rows(made, mu=[0.0, 0.5])
     assert mixed.cones.n_tangents.tolist() == [0, 2]
     assert lv.Problem.from_rows(made).m == 2
-    assert (
-        lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4
-    )  # a spin row is a friction row
+    assert lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4  # a spin row is a friction row
     with pytest.raises(lv.InputError, match=r"contact 0 has mu 0\.5 but no friction row"):
         lv.Problem.from_rows(made, mu=0.5, tangents=0)
 
@@ -109,9 +104,7 @@ def test_one_mu_for_each_contact_and_a_scalar_for_all():
     with pytest.raises(lv.InputError, match=r"mu has 3 values for 3 rows.*one mu for each contact"):
         lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5, 0.5, 0.5])
     assert lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.0, 0.0, 0.0]).law == "lcp"
-    assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(
-        np.eye(9), np.ones(9), mu=[0.5] * 3
-    )
+    assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(np.eye(9), np.ones(9), mu=[0.5] * 3)
     assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2
     assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
 
@@ -234,18 +227,14 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
 
 
 def test_contact_with_rows_of_two_kinds_of_contacts_needs_tangents():
-    with pytest.raises(
-        lv.InputError, match=r"3 contacts with one tangent each, or 2 contacts with two: .*tangents=1"
-    ):
+    with pytest.raises(lv.InputError, match=r"3 contacts with one tangent each, or 2 contacts with two: .*tangents=1"):
         lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5])
     planar = lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5], tangents=1)
     assert planar.cones.n_tangents.tolist() == [1, 1, 1]
     assert lv.Problem.contact(np.eye(6), np.ones(6), 0.5, tangents=1) == planar
     assert lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [1, 1]
     assert lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [2, 2]
-    with pytest.raises(
-        lv.InputError, match="6 rows for 2 contacts; each contact needs a normal row, 1 tangent rows"
-    ):
+    with pytest.raises(lv.InputError, match="6 rows for 2 contacts; each contact needs a normal row, 1 tangent rows"):
         lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5], tangents=1)
     with pytest.raises(lv.InputError, match="tangents is 3"):
         lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5], tangents=3)

@@ -200,9 +200,7 @@ def test_residual_loose_tolerance_and_ill_conditioned_m_reports_the_error_in_lon
         (many.relative[0], many.roundoff_floor[0]),
     ):
         assert abs(relative - truth.relative) <= 1e-8 + truth.allowed + 1e-2 * truth.relative
-        assert (
-            floor == 0.0 or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
-        )
+        assert floor == 0.0 or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
 
 
 def test_a_well_conditioned_m_is_not_refined():

@@ -275,9 +275,7 @@ def largest_velocity_of_a_stack(slop, n=4, dt=1 / 120, steps=360, **options):
     position = np.array([(0.0, 0.5 + k) for k in range(n)])
     angle, velocity, solution, largest = np.zeros(n), np.zeros((n, 3)), None, []
     for _ in range(steps):
-        builder = lv.RowBuilder(
-            np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop
-        )
+        builder = lv.RowBuilder(np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop)
         turn = [np.array([(np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a))]) for a in angle]
         for k in range(n):
             below, frame = (position[k - 1], turn[k - 1]) if k else (np.array((0.0, -0.5)), np.eye(2))
@@ -358,13 +356,7 @@ def draw_arguments(rng, block_type, n, dimensions):
 def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
     rng, n = np.random.default_rng(seed), 4
     inertia = np.full(3, 2.0) if dimensions == 2 else np.tile(2.0 * np.eye(3), (3, 1, 1))
-    bodies = (
-        np.ones(3),
-        inertia,
-        rng.normal(size=(3, 3 * dimensions - 3)),
-        DT,
-        rng.normal(size=(3, dimensions)),
-    )
+    bodies = (np.ones(3), inertia, rng.normal(size=(3, 3 * dimensions - 3)), DT, rng.normal(size=(3, dimensions)))
     single, arrays = lv.RowBuilder(*bodies), lv.RowBuilder(*bodies)
     single_keys, array_keys = [], []
     for block_type in rng.permutation(list(ARRAYS)):
@@ -421,9 +413,7 @@ def test_invalid_arrays_are_rejected_and_add_nothing(change, message):
 
 def test_joints_reject_arguments_that_their_method_does_not_have():
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
-    with pytest.raises(
-        lv.InputError, match=r"RowBuilder.ball has no argument axis=; it takes a=, b=, anchor="
-    ):
+    with pytest.raises(lv.InputError, match=r"RowBuilder.ball has no argument axis=; it takes a=, b=, anchor="):
         builder.joints("ball", [(-1, 0)], anchor=np.zeros(3), axis=np.zeros(3))
     with pytest.raises(lv.InputError, match=r"RowBuilder.hinge lacks anchor="):
         builder.joints("hinge", [(-1, 0)], axis=np.ones(3))

@@ -93,11 +93,7 @@ def test_float32_is_taken_and_made_whole():
     n /= np.linalg.norm(n, axis=1)[:, None]
     t = np.cross(n, turn)
     t /= np.linalg.norm(t, axis=1)[:, None]
-    flat = np.linalg.qr(rng.normal(size=(10, 3, 3)))[0] * [
-        1.0,
-        2.0,
-        0.0,
-    ]  # a plane body: one direction does not turn
+    flat = np.linalg.qr(rng.normal(size=(10, 3, 3)))[0] * [1.0, 2.0, 0.0]  # a plane body: one direction does not turn
     tensor = flat @ flat.transpose(0, 2, 1)
     single = {"normal": n, "tangent": t, "inv_inertia": tensor, "inv_mass": np.ones(10)}
     more = {

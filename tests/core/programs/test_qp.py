@@ -123,9 +123,7 @@ def test_a_budget_is_that_of_one_solve_where_p_is_definite():
     assert done.count(0) == 1  # solves that began
 
 
-@pytest.mark.filterwarnings(
-    "ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access"
-)
+@pytest.mark.filterwarnings("ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access")
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @given(seed=seeds)
 def test_x_and_multipliers_equal_qpsolvers(backend, seed):
@@ -142,15 +140,8 @@ def test_x_and_multipliers_equal_qpsolvers(backend, seed):
     other, answer = qpsolvers.solve_problem(qp, solver=backend, **tight), lv.solve_qp(lv.Problem.from_qp(qp))
     assert other.is_optimal(1e-5)
     size = 1.0 + max(np.abs(part).max() for part in (answer.x, answer.y, answer.z, answer.z_box))
-    for name in (
-        "x",
-        "y",
-        "z",
-        "z_box",
-    ):  # wrong by the backend's tolerance over curvatures and angles of rows
-        np.testing.assert_allclose(
-            getattr(answer, name), getattr(other, name), atol=1e-3 * size, err_msg=name
-        )
+    for name in ("x", "y", "z", "z_box"):  # wrong by the backend's tolerance over curvatures and angles of rows
+        np.testing.assert_allclose(getattr(answer, name), getattr(other, name), atol=1e-3 * size, err_msg=name)
 
 
 @given(seed=seeds)
@@ -287,8 +278,7 @@ def contradicting(seed, kind):
 PROVES = [
     name
     for name in lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2)))
-    if name
-    in {"auto", "newton", "direct", "lemke", "osqp", "piqp", "qpalm", "daqp", "scs", "clarabel", "highs"}
+    if name in {"auto", "newton", "direct", "lemke", "osqp", "piqp", "qpalm", "daqp", "scs", "clarabel", "highs"}
 ]
 
 
@@ -306,9 +296,7 @@ def test_the_residual_of_an_infeasible_program_is_that_of_its_impulse():
     rng, n = np.random.default_rng(0), 40
     root, G = rng.normal(size=(n, n)), rng.normal(size=(120, n))
     h = G @ rng.normal(size=n)
-    problem = lv.Problem.from_qp(
-        root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0]
-    )
+    problem = lv.Problem.from_qp(root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0])
     solution = lv.solve_qp(problem).solution
     assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
     assert (solution.impulse >= 0.0).all()
@@ -354,8 +342,7 @@ def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, 
     rows = np.array([[0.0, 1.0, 1.0], [0.0, -1.0, -1.0], [-1.0, 0.0, 1.0]])
     program = {"P": np.diag([0.0, 1.0, 0.0]), "q": [-1.0, 0.5, 0.0], "G": rows}
     none, some = (
-        lv.solve_qp(lv.Problem.from_qp(**program, h=[-1.0, side, 1.0]), solver, tol=tol)
-        for side in (-1.0, 1.0)
+        lv.solve_qp(lv.Problem.from_qp(**program, h=[-1.0, side, 1.0]), solver, tol=tol) for side in (-1.0, 1.0)
     )
     assert none.ray is None and not none.found
     assert some.ray is not None and not some.found
@@ -417,18 +404,14 @@ def test_every_backend_solves_programs_with_a_singular_hessian(name, seed):
 
 def test_a_singular_hessian_is_kept_and_auto_names_the_backend_that_ran():
     P = np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
-    problem = lv.Problem.from_qp(
-        P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat"
-    )
+    problem = lv.Problem.from_qp(P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat")
     assert problem.generalized is None and problem.has_singular_program
     np.testing.assert_array_equal(problem.dense()[:3, :3], P)
     np.testing.assert_array_equal(problem.qp.hessian.toarray(), P)
     first = next(name for name in ("piqp", "clarabel", "osqp") if name in BACKENDS)
     for solution in (lv.solve(problem, tol=1e-9), lv.solve_qp(problem).solution, lv.prepare(problem).solve()):
         assert solution.stages[0].solver == first and first in solution.message
-        assert (
-            solution.success and solution.residual.relative == lv.residual(problem, solution.impulse).relative
-        )
+        assert solution.success and solution.residual.relative == lv.residual(problem, solution.impulse).relative
     plan = lv.explain(problem)
     assert plan.stages[0].solver == first and first in str(plan)
     assert problem.row_name(2) == "variable 2" and problem.row_name(3) == "constraint 0"
@@ -491,19 +474,10 @@ def test_a_time_limit_holds_for_a_singular_program(limit):
 def chained(seed, n=150):
     """A trajectory of n places with limits on them, on its steps and on some sums; P has two null directions."""
     rng = np.random.default_rng(seed)
-    bend = sp.diags_array(
-        [np.ones(n - 2), -2.0 * np.ones(n - 2), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n)
-    )
+    bend = sp.diags_array([np.ones(n - 2), -2.0 * np.ones(n - 2), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n))
     step = sp.diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
     x, some = np.cumsum(rng.uniform(-0.05, 0.05, n)), rng.normal(size=(3, n)) * (rng.random((3, n)) < 0.1)
-    parts = (
-        bend.T @ bend,
-        rng.normal(size=n),
-        sp.vstack([step, -step]),
-        np.full(2 * (n - 1), 0.1),
-        some,
-        some @ x,
-    )
+    parts = (bend.T @ bend, rng.normal(size=n), sp.vstack([step, -step]), np.full(2 * (n - 1), 0.1), some, some @ x)
     return dict(zip(NAMES, (*parts, x - rng.random(n), x + rng.random(n)), strict=True))
 
 
@@ -523,9 +497,7 @@ def test_a_trajectory_with_many_limits_is_solved_at_any_scale(seed):
 @pytest.mark.parametrize(("seed", "n"), [(0, 300), (1, 800)])
 def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
     rng = np.random.default_rng(seed)
-    A = sp.random_array(
-        (n // 2, n), density=5.0 / n, rng=rng, data_sampler=lambda size: rng.normal(size=size)
-    )
+    A = sp.random_array((n // 2, n), density=5.0 / n, rng=rng, data_sampler=lambda size: rng.normal(size=size))
     x = rng.random(n) * (rng.random(n) < 0.5)
     q = A.T @ rng.normal(size=n // 2) + rng.random(n) * (x == 0.0)
     problem = lv.Problem.from_qp(sp.csr_array((n, n)), q, A=A.tocsr(), b=A @ x, lb=np.zeros(n))
@@ -570,15 +542,9 @@ EYE, TWO = np.eye(2), np.zeros(2)
 INVALID_PROBLEM = [
     ({"P": np.array([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at \(1, 0\) .*0\.5"),
     ({"P": sp.csc_matrix([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at .*0\.5"),
-    (
-        {"P": np.array([[1.0, 2.0], [2.0, 1.0]])},
-        r"P is not positive semidefinite: its smallest eigenvalue is -1,",
-    ),
+    ({"P": np.array([[1.0, 2.0], [2.0, 1.0]])}, r"P is not positive semidefinite: its smallest eigenvalue is -1,"),
     ({"P": np.diag([1.0, -0.25])}, r"P is not positive semidefinite: its smallest eigenvalue is -0\.25"),
-    (
-        {"P": np.array([[0.0, 1.0], [1.0, 5.0]])},
-        r"P is not positive semidefinite: its smallest eigenvalue is -0\.19",
-    ),
+    ({"P": np.array([[0.0, 1.0], [1.0, 5.0]])}, r"P is not positive semidefinite: its smallest eigenvalue is -0\.19"),
     ({"P": 1e-70 * EYE}, r"the diagonal of P must be 0 or at least 1e-60; entry \[0\]"),
     ({"P": np.array([[1.0, 0.5], [0.5 + 1e-9, 1.0]])}, r"not symmetric: at \(1, 0\) .*0\.500000001"),
     ({"P": np.eye(3)}, r"P has shape \(3, 3\); \(2, 2\) is needed"),
@@ -637,12 +603,7 @@ def test_a_hessian_of_rank_one_is_solved_though_its_free_minimum_is_far(seed):
     root, x, rows = rng.normal(size=(n, 1)), rng.normal(size=n), rng.normal(size=(2 * n, n))
     answer = lv.solve_qp(
         lv.Problem.from_qp(
-            root @ root.T,
-            rng.normal(size=n),
-            G=rows,
-            h=rows @ x + rng.uniform(0, 1, 2 * n),
-            lb=x - 2.0,
-            ub=x + 2.0,
+            root @ root.T, rng.normal(size=n), G=rows, h=rows @ x + rng.uniform(0, 1, 2 * n), lb=x - 2.0, ub=x + 2.0
         ),
         tol=1e-6,
     )
@@ -654,9 +615,7 @@ def test_found_means_to_the_error_that_was_asked_for():
     for n in (3, 10, 30):
         root, rows = rng.normal(size=(n, n)), rng.normal(size=(n, n))
         for p in (root @ root.T, root[:, :2] @ root[:, :2].T):
-            problem = lv.Problem.from_qp(
-                p, rng.normal(size=n), G=rows, h=np.ones(n), lb=-np.ones(n), ub=np.ones(n)
-            )
+            problem = lv.Problem.from_qp(p, rng.normal(size=n), G=rows, h=np.ones(n), lb=-np.ones(n), ub=np.ones(n))
             for tol in (1e-2, 1e-5, 1e-9):
                 answer = lv.solve_qp(problem, tol=tol)
                 assert answer.found and answer.error <= tol

@@ -86,16 +86,7 @@ ARGUMENTS = {
     "solve": ("problem.npz", "--solver", "projected_gradients"),
     "check": ("problem.npz", "--solvers", "projected_gradients", "pgs", "--reference", "newton"),
     "explain": ("problem.npz",),
-    "report": (
-        "problem.npz",
-        "--solvers",
-        "projected_gradients",
-        "pgs",
-        "--tolerances",
-        "1e-3",
-        "--budgets",
-        "4",
-    ),
+    "report": ("problem.npz", "--solvers", "projected_gradients", "pgs", "--tolerances", "1e-3", "--budgets", "4"),
     "solvers": (),
     "contract": ("projected_gradients",),
     "doctor": (),
@@ -112,9 +103,7 @@ def run_with_solver(tmp_path_factory):
 
     def run(code, *arguments):
         command = [sys.executable, "-c", ADD_SOLVER, str(folder), code, *arguments]
-        process = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=600, check=False
-        )
+        process = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
         assert process.returncode == 0, process.stdout + process.stderr
         return process.stdout
 
@@ -136,12 +125,8 @@ def test_broken_plug_in_is_reported_once_by_a_report_with_workers(tmp_path):
     pytest.importorskip("joblib")
     metadata = tmp_path / "broken-1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n", encoding="utf-8"
-    )
-    (metadata / "entry_points.txt").write_text(
-        "[lavender.solvers]\nbroken = no_such_module:SPEC\n", encoding="utf-8"
-    )
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text("[lavender.solvers]\nbroken = no_such_module:SPEC\n", encoding="utf-8")
     lv.io.save(lv.Problem.lcp([[2.0]], [1.0]), tmp_path / "problem.npz")
     command = [sys.executable, "-m", "lavender", "report", "problem.npz", "--solvers", "pgs", "jacobi"]
     command += ["--workers", "2", "--tolerances", "1e-3", "--budgets", "4"]

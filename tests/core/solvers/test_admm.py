@@ -17,9 +17,7 @@ def test_every_factorisation_gives_the_same(law):
     if law == "linear":
         cones = lv.Cones.free(base.m)
     elif law == "lcp":
-        cones = lv.Cones.bounded(
-            np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf)
-        )
+        cones = lv.Cones.bounded(np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf))
     a = base.dense() + 0.3 * np.eye(base.m)
     problem = lv.Problem(base.b, cones, a, friction=base.friction)
     assert problem.law == law
@@ -27,9 +25,7 @@ def test_every_factorisation_gives_the_same(law):
     assert dense.solver.form == "Cholesky"
     results = [dense]
     slightly = a + 1e-13 * np.abs(a).max() * np.triu(np.ones_like(a), 1)
-    lu = lv.solve(
-        lv.Problem(base.b, cones, slightly, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
-    )
+    lu = lv.solve(lv.Problem(base.b, cones, slightly, friction=base.friction), "admm", tol=1e-10, max_iter=20_000)
     assert lu.solver.form == "LU"
     results.append(lu)
     # Eight of them side by side make a matrix of few entries.
@@ -40,9 +36,7 @@ def test_every_factorisation_gives_the_same(law):
         # Eigenvalues of A from 0.3 to about 30.
         np.testing.assert_allclose(solution.impulse, dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
     assert eight.success
-    np.testing.assert_allclose(
-        eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max()
-    )
+    np.testing.assert_allclose(eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
 
 
 @pytest.mark.parametrize("m", [60, 1200])
@@ -95,9 +89,7 @@ def test_without_memory_it_is_plain_admm_by_hand():
         y = rho * (u - z)
         x = inverse @ (c + rho * z - y)
         got = lv.solve(problem, "admm", memory=0, tol=0.0, max_iter=n)
-        np.testing.assert_allclose(
-            got.impulse, z / root, rtol=1e-10, atol=1e-12
-        )  # the inverse loses some digits
+        np.testing.assert_allclose(got.impulse, z / root, rtol=1e-10, atol=1e-12)  # the inverse loses some digits
         u = u + 1.6 * (x - z)
 
 

@@ -15,9 +15,7 @@ from lavender.solvers.newton import Newton
 @given(seed=seeds)
 def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
     rolls = bool(seed % 2)
-    problem = FORMS[form](
-        random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6)
-    )
+    problem = FORMS[form](random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6))
     count, label = find_islands(problem)
     # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.
     count_of_matrix, label_of_matrix = find_islands(as_matrix(problem))
@@ -43,9 +41,7 @@ def test_an_island_may_ask_for_dust():
     """1e-300 m/s beside 1 m/s: no problem alone may ask for so little, beside which nothing is."""
     problem = lv.Problem(np.array([1.0, 1e-300]), lv.Cones.free(2), np.eye(2))
     _, label = find_islands(problem)
-    parts = [
-        restrict_to_blocks(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)
-    ]
+    parts = [restrict_to_blocks(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)]
     assert [part.b.tolist() for part in parts] == [[1.0], [0.0]]
 
 
@@ -71,9 +67,7 @@ def test_auto_solves_a_resting_pile_by_its_relaxation():
 
 
 def test_auto_stops_interior_points_on_the_relaxation_when_contacts_slip():
-    problem = lv.suite.case(
-        "pyramidF(k=10)"
-    ).problem  # The relaxation has the residual 6e-2 under Coulomb's law.
+    problem = lv.suite.case("pyramidF(k=10)").problem  # The relaxation has the residual 6e-2 under Coulomb's law.
     solution = lv.solve(problem, "auto", tol=1e-6)
     work = {stage.solver: stage.work for stage in solution.stages}
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
@@ -87,9 +81,7 @@ def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
     sweeps = [s.work["sweeps"] for s in solution.stages if s.solver == "anderson" and s.before > 0.1]
-    assert (
-        sum(sweeps) <= 128
-    )  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
+    assert sum(sweeps) <= 128  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
 
 
 # -- time limits ---------------------------------------------------------------------------------------

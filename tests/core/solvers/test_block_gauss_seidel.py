@@ -37,9 +37,7 @@ def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows, matr
     reach, zero = rng.uniform(0.0, 0.5, (2, n * rows)), np.zeros(n)
     low, high = np.where(rng.random((2, n * rows)) < 0.3, np.inf, reach) * [[-1.0], [1.0]]
     cones = lv.Cones(rows * np.arange(n + 1), np.zeros(n, int), low, high, zero, zero)
-    problem = lv.Problem(
-        rng.standard_normal(n * rows), cones, sp.block_diag(list(map(sp.coo_array, w)), format="csr")
-    )
+    problem = lv.Problem(rng.standard_normal(n * rows), cones, sp.block_diag(list(map(sp.coo_array, w)), format="csr"))
     found = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1)
     assert found.work["fallbacks"] == 0
     assert found.residual.relative <= 1e-12 + 10.0 * found.residual.roundoff_floor  # a few roundings
@@ -48,9 +46,7 @@ def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows, matr
 def test_dependent_rows_of_a_joint_are_solved():
     # A redundant row twice in one block, and a block that contradicts itself: the best of it, finite.
     a = np.array([[2.0, 2.0, 0.3], [2.0, 2.0, 0.3], [0.3, 0.3, 1.0]])
-    cones = lv.Cones(
-        np.array([0, 3]), np.zeros(1, int), np.full(3, -np.inf), np.full(3, np.inf), [0.0], [0.0]
-    )
+    cones = lv.Cones(np.array([0, 3]), np.zeros(1, int), np.full(3, -np.inf), np.full(3, np.inf), [0.0], [0.0])
     solution = lv.solve(lv.Problem(np.array([1.0, 1.0, 0.5]), cones, a), "block_gauss_seidel", tol=1e-12)
     assert solution.success
     contradiction = lv.solve(lv.Problem(np.array([1.0, 2.0, 0.5]), cones, a), "block_gauss_seidel")

@@ -56,9 +56,7 @@ def test_solver_solves_every_kind_of_problem_in_every_form(name):
                 assert solution.success or solution.status_conflict or solution.status != "CONVERGED"
                 continue
             assert solution.success and solution.claim_check == "confirmed", (law, kind, solution)
-            if (
-                law != "coulomb"
-            ):  # The slack is unique; an impulse error of tol moves it by at most 1e3 times as much.
+            if law != "coulomb":  # The slack is unique; an impulse error of tol moves it by at most 1e3 times as much.
                 size = np.abs(problem.slack(problem.start())).max()
                 np.testing.assert_allclose(
                     solution.slack, slack, rtol=0, atol=1e3 * tol * size + 1e-7 * np.abs(slack).max()
@@ -77,9 +75,7 @@ def test_every_form_of_a_solver_has_the_same_slack(name):
             assert solution.success or (spec.external and name not in REQUIRED_BACKENDS)
             if solution.success and law != "coulomb":
                 size = np.abs(forms[0].slack(forms[0].start())).max()
-                np.testing.assert_allclose(
-                    solution.slack, slack, rtol=0, atol=1e-3 * size + 1e-7 * np.abs(slack).max()
-                )
+                np.testing.assert_allclose(solution.slack, slack, rtol=0, atol=1e-3 * size + 1e-7 * np.abs(slack).max())
         with pytest.raises(lv.LavenderError, match="velocity"):
             lv.solve(forms[0], name, form="velocities")
 
@@ -97,9 +93,7 @@ def test_impulses_scale_with_the_units_of_mass_and_velocity(name):
             np.testing.assert_allclose(second.impulse / unit, first.impulse, rtol=0, atol=1e-4)
 
 
-SOFT = touching(
-    [[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3))
-)  # a body that cannot move
+SOFT = touching([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))  # a body that cannot move
 UNUSUAL = {
     "no rows, linear": lv.Problem.linear(np.zeros((0, 0)), []),
     "one free row": lv.Problem.linear([[2.0]], [1.0]),

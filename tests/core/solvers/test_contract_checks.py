@@ -58,9 +58,7 @@ class Sweeps:
 
     def claim(self, state, impulse, n, tol):
         good = lv.residual(state.problem, impulse).relative <= tol
-        return lv.Claim(
-            lv.Status.CONVERGED if good else lv.Status.DIVERGED, n, {"sweeps": n}, "" if good else "grew"
-        )
+        return lv.Claim(lv.Status.CONVERGED if good else lv.Status.DIVERGED, n, {"sweeps": n}, "" if good else "grew")
 
     def run(self, state, impulse, n, tol, time_limit=None):
         for i in range(n):

@@ -94,9 +94,7 @@ def test_no_form_of_a_problem_is_made_after_the_deadline(form, kind, slow_disks,
         prepared = lv.prepare(problem, name)
         for limit, again in product((1e-9, 2e-4), (False, True)):
             given, clock.now = grown(0, form, kind), 0.0
-            late = (
-                prepared.solve(given, time_limit=limit) if again else lv.solve(given, name, time_limit=limit)
-            )
+            late = prepared.solve(given, time_limit=limit) if again else lv.solve(given, name, time_limit=limit)
             assert clock.now <= limit, (name, limit)
             if limit == 1e-9:
                 assert made_once(given) == before and late.status is lv.Status.TIME_LIMIT, name
@@ -179,9 +177,7 @@ def test_late_worlds_of_a_batch_are_not_made(clock, monkeypatch):
         made.clear()
         clock.now = 0.0
         found = lv.solve_many(batch, time_limit=20.0 * each, **more)
-        assert (
-            clock.now <= 22.0 * each and len(made) <= 22
-        )  # one that the limit overtakes, one that says if it refuses
+        assert clock.now <= 22.0 * each and len(made) <= 22  # one that the limit overtakes, one that says if it refuses
         late = np.array([status is lv.Status.TIME_LIMIT for status in found.status])
         assert np.sum(~late) >= 15 and found.success[~late].all() and late[-1]
         wanted = starts[-1] if more else make(batch, 0).start()
@@ -246,9 +242,7 @@ def test_code_of_others_is_imported_before_the_clock_of_its_first_limit(name, tm
     (tmp_path / "slow-1.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1\n")
     points = "[lavender.solvers]\nslow_plug_in = slow_plug_in:SPEC\n"
     (tmp_path / "slow-1.dist-info/entry_points.txt").write_text(points)
-    solve = (
-        f"lv.solve(lv.Problem.lcp([[2.0]], [1.0]), {name!r}, time_limit=0.5)"  # [s], 20 times what it takes
-    )
+    solve = f"lv.solve(lv.Problem.lcp([[2.0]], [1.0]), {name!r}, time_limit=0.5)"  # [s], 20 times what it takes
     paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     done = python("-c", f"import lavender as lv; print({solve})", env={**os.environ, "PYTHONPATH": paths})
     assert f"{name}: CONVERGED" in done.stdout
@@ -271,9 +265,7 @@ print(lv.solve(problem, tol=1e-13, time_limit=0.2))
 
 
 def test_set_up_of_sequential_impulses_is_estimated_without_forming_a():
-    builder = lv.RowBuilder(
-        np.ones(50), np.tile(np.eye(3), (50, 1, 1)), np.zeros((50, 6)), 0.01, np.zeros((50, 3))
-    )
+    builder = lv.RowBuilder(np.ones(50), np.tile(np.eye(3), (50, 1, 1)), np.zeros((50, 6)), 0.01, np.zeros((50, 3)))
     pairs = np.column_stack([np.arange(50) - 1, np.arange(50)])
     builder.contacts(pairs, np.arange(150.0).reshape(50, 3), (0.0, 0.0, 1.0), mu=0.5)
     problem = builder.problem()

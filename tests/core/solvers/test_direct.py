@@ -28,9 +28,7 @@ def laplacian(n, diagonal=2.5):
 
 
 def tridiagonal(m, diagonal=2.01):
-    return sp.csr_array(
-        sp.diags_array([-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
-    )
+    return sp.csr_array(sp.diags_array([-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]))
 
 
 def shuffled(rng, a):
@@ -152,9 +150,7 @@ def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
     assert solver != "lemke" or "ray" in solution.message or "row of A is zero" in solution.message
 
 
-@pytest.mark.parametrize(
-    ("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)]
-)
+@pytest.mark.parametrize(("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)])
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-0.3, 0.3), (-np.inf, np.inf)])
 def test_asymmetric_bounded_rows(m, density, bounds):
     """Positive definite and not symmetric, as recorded problems are and more: compiled and LAPACK's LU, SuperLU."""
@@ -205,18 +201,13 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
     a = sp.csr_array(([1.0, 1.0, 1.0], ([0, 1, 2], [0, 0, 0])), (3, 3))
     with pytest.raises(RuntimeError, match="singular"):
         factor_sparse_lu(a)
-    assert factor_sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [
-        1.0,
-        1.0,
-    ]
+    assert factor_sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [1.0, 1.0]
     for seed in range(6):
         a, b = skew(seed)
         solution = lv.solve(lv.Problem.lcp(a, b, -1.0, 1.0), "direct")
         assert solution.claim_check == "confirmed"
         assert solution.residual.relative <= 1.0
-        full = sp.csr_array(
-            a + sp.coo_array((np.ones(120), (np.arange(120), np.zeros(120, int))), (120, 120))
-        )
+        full = sp.csr_array(a + sp.coo_array((np.ones(120), (np.arange(120), np.zeros(120, int))), (120, 120)))
         for solver in ("direct", "auto"):
             assert lv.solve(lv.Problem.linear(full, b), solver).claim_check == "confirmed"
 

@@ -25,8 +25,6 @@ def test_contacts_are_solved_as_newton_solves_them(friction, seed, rolling):
         assert relative == pytest.approx(truth, rel=1e-9, abs=1e-300)
         if how == REACHED:
             assert truth <= 1e-9
-        if (
-            problem.rows is None
-        ):  # one method: over bodies other columns may be left out, over rows nothing differs
+        if problem.rows is None:  # one method: over bodies other columns may be left out, over rows nothing differs
             assert (how == REACHED) == expected.success
             assert done == pytest.approx(expected.work["factorisations"], abs=2)

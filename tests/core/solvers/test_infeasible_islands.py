@@ -22,12 +22,7 @@ def skip_if_refused(name, problem):
 
 def jam(kind):
     """Rows over the one velocity of a body, their cones and targets [m/s]: no impulse gives what they ask for."""
-    rows = {
-        "motors": [1.0, 1.0],
-        "limits": [1.0, -1.0],
-        "nearly equal": [1.0, 1.0 + 1e-9],
-        "an empty row": [1.0, 0.0],
-    }
+    rows = {"motors": [1.0, 1.0], "limits": [1.0, -1.0], "nearly equal": [1.0, 1.0 + 1e-9], "an empty row": [1.0, 0.0]}
     target = [1.0, 1.0] if kind in ("limits", "an empty row") else [1.0, -1.0]
     cones = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]) if kind == "limits" else lv.Cones.free(2)
     return np.array(rows[kind])[:, None], cones, target
@@ -44,9 +39,7 @@ def balls_beside_jams(kind, friction, jams=1):
         every = every + cones
     v_free = np.r_[np.tile([-0.1635, 0.3, 0.0], BALLS), np.zeros(jams)]
     target = [0.0] * m + target * jams
-    return lv.Problem.from_jacobian(
-        jac, np.eye(n + jams), v_free, target=target, cones=every, friction=friction
-    )
+    return lv.Problem.from_jacobian(jac, np.eye(n + jams), v_free, target=target, cones=every, friction=friction)
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -74,11 +67,7 @@ def test_balls_are_held_beside_many_jams(friction):
 def test_an_infeasible_solve_counts_the_work_for_the_other_islands():
     problem = balls_beside_jams("motors", "cone")
     alone = lv.Problem.from_jacobian(
-        problem.generalized.jac[-2:].toarray()[:, -1:],
-        np.eye(1),
-        [0.0],
-        target=[1.0, -1.0],
-        cones=lv.Cones.free(2),
+        problem.generalized.jac[-2:].toarray()[:, -1:], np.eye(1), [0.0], target=[1.0, -1.0], cones=lv.Cones.free(2)
     )
     solution, jammed = (lv.solve(p, "newton", tol=TOL) for p in (problem, alone))
     assert solution.status is jammed.status is lv.Status.INFEASIBLE

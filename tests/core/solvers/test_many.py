@@ -37,15 +37,7 @@ def assert_same(many, i, single):
     """The arrays and the Solution of world i have the bits of a single solve."""
     own, found = many[i], single.residual
     assert own.impulse.tobytes() == single.impulse.tobytes()
-    for name in (
-        "relative",
-        "energy",
-        "velocity",
-        "roundoff_floor",
-        "worst_row",
-        "energy_at_zero",
-        "velocity_at_zero",
-    ):
+    for name in ("relative", "energy", "velocity", "roundoff_floor", "worst_row", "energy_at_zero", "velocity_at_zero"):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
     assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)
@@ -306,11 +298,7 @@ def test_a_bad_world_is_named_and_harms_no_other(threads):
     for i in range(10):
         if i in words:
             assert words[i] in str(many.faults[i]) and f"world {i}:" in str(many.faults[i])
-            assert (
-                many.status[i] is lv.Status.INVALID_PROBLEM
-                and np.isnan(many.relative[i])
-                and not many.success[i]
-            )
+            assert many.status[i] is lv.Status.INVALID_PROBLEM and np.isnan(many.relative[i]) and not many.success[i]
             assert found.verdict[i] == "" and np.isnan(found.relative[i]) and i in found.faults
             with pytest.raises(lv.InputError, match=f"world {i}:"):
                 many[i]
@@ -408,17 +396,13 @@ def test_lists_start_from_their_impulses_and_refuse_what_is_none():
 
 def test_balls_in_arrays_have_the_impulse_and_velocity_of_the_formula():
     v = np.array([[[0.5, 0.0, -v, 0.0, 0.0, 0.0]] for v in (1.0, 2.0, 3.0)])
-    many = lv.solve_many(
-        lv.Batch.of_bodies(balls(np.array([[0.5], [1.0], [2.0]]), v_free=v), mu=0.5, target=0.1)
-    )
+    many = lv.solve_many(lv.Batch.of_bodies(balls(np.array([[0.5], [1.0], [2.0]]), v_free=v), mu=0.5, target=0.1))
     assert many.impulse.shape == (3, 3) and many.success.all()
     assert many.impulse[:, 0] == pytest.approx([2.2, 2.1, 1.55], rel=1e-5)  # m (v + 0.1), s
     assert many.velocity.reshape(3, 6)[:, 2] == pytest.approx(0.1, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    "mu", [0.0, 0.5, np.linspace(0.1, 1.0, 48).reshape(6, 8)], ids=["none", "one", "each"]
-)
+@pytest.mark.parametrize("mu", [0.0, 0.5, np.linspace(0.1, 1.0, 48).reshape(6, 8)], ids=["none", "one", "each"])
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 def test_bodies_in_arrays_have_the_bits_of_single_solves(mu, friction, monkeypatch):
     """Boxes of two on each other; what is wrong with one, or a little off, does not matter to the others."""
@@ -456,9 +440,7 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     mu = np.array([[0.5], [0.0]])
     with pytest.raises(lv.InputError, match="friction is 'wet'"):
         lv.Batch.of_bodies(ball, friction="wet")
-    with pytest.raises(
-        lv.InputError, match=r"world 1: this world has 1 rows, the first world 3; .* give tangents="
-    ):
+    with pytest.raises(lv.InputError, match=r"world 1: this world has 1 rows, the first world 3; .* give tangents="):
         lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
 

@@ -40,9 +40,7 @@ def test_rows_that_outnumber_velocities_take_an_interior_point_no_longer(seed, f
 @pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
-    problem = random_contact_problem(
-        seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10
-    )
+    problem = random_contact_problem(seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10)
     system = system_in(problem, "velocity" if form == "augmented" else form)
     solve = system.solve
     m, g, eps = solve.m, solve.g, 1e-3
@@ -184,9 +182,7 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     assert system.solve.factor("natural", eps)
     assert not system.sparse.uses_fallback
     expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
-    np.testing.assert_allclose(
-        system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
-    )
+    np.testing.assert_allclose(system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("form", FORMS)

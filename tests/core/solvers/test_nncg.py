@@ -122,9 +122,7 @@ def test_anderson_slipping_pyramid_leaves_the_cone_law():
     problem = make_suite_problem("pyramidF", k=10)
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=2000)
     assert found.success
-    assert (
-        found.iterations < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
-    )
+    assert found.iterations < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
 
 
 def make_suite_problem(name, **parameters):

@@ -42,9 +42,7 @@ def test_a_missing_package_is_named_with_what_installs_it():
 def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
-        with pytest.raises(
-            lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"
-        ):
+        with pytest.raises(lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"):
             lv.solve(TINY, "absent")
     broken = tmp_path / "broken_module_1.py"
     broken.write_text("raise RuntimeError('needs a licence')\n")

@@ -35,9 +35,7 @@ def draw(kind, seed):
         return lv.Problem.linear(0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9))
     if kind == "one-sided":  # unsymmetric
         return lv.Problem.lcp(
-            rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
-            rng.normal(size=6),
-            friction=["coulomb", "cone"][seed % 2],
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6), rng.normal(size=6), friction=["coulomb", "cone"][seed % 2]
         )
     if kind.startswith("rows"):
         return random_contact_problem(

@@ -41,10 +41,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
     for order, impulse in plain.items():
         # v = M^-1 J^T lam of the warm start is summed in another order: rounding, carried through 20 sweeps.
         np.testing.assert_allclose(
-            sweeps(problem, NAME, 20, order=order, impulse=start),
-            impulse,
-            rtol=0,
-            atol=1e-11 * np.abs(impulse).max(),
+            sweeps(problem, NAME, 20, order=order, impulse=start), impulse, rtol=0, atol=1e-11 * np.abs(impulse).max()
         )
 
 

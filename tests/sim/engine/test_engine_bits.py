@@ -66,9 +66,7 @@ def moved(sim, folder):
     size = sim.state.size.copy()
     size[8:] += 100
     twin.state = State(size)
-    memory.move_engine_state(
-        *((s.size, s.real, s.index, s.keys)[i] for s in (sim.state, twin.state) for i in range(4))
-    )
+    memory.move_engine_state(*((s.size, s.real, s.index, s.keys)[i] for s in (sim.state, twin.state) for i in range(4)))
     return twin
 
 

@@ -26,9 +26,7 @@ def rebuild(sim, state, recorded, h):
     """Build the same joints and contacts by a builder; no correction of errors, as in LavenderSim's rigid rows."""
     rows = recorded.rows
     moving = state["body_of"].tolist()
-    builder = lv.RowBuilder(
-        rows.inv_mass, rows.inv_inertia, rows.v_free, h, state["x"][moving], baumgarte=0.0
-    )
+    builder = lv.RowBuilder(rows.inv_mass, rows.inv_inertia, rows.v_free, h, state["x"][moving], baumgarte=0.0)
 
     def world(body, local, offset=True):
         if body < 0:
@@ -55,9 +53,7 @@ def rebuild(sim, state, recorded, h):
                            damping=2 * joint.damping * omega / inverse_mass)  # fmt: skip
     for i, pair in enumerate(rows.contact_body):
         mu = recorded.cones.mu[rows.n_joints + i]
-        builder.contact(
-            *pair, state["point"][i], rows.normal[i], gap=state["gap"][i], mu=mu, tangent=rows.tangent[i]
-        )
+        builder.contact(*pair, state["point"][i], rows.normal[i], gap=state["gap"][i], mu=mu, tangent=rows.tangent[i])
     return builder.problem()
 
 

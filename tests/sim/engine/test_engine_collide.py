@@ -62,8 +62,7 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
         (half[1], place, convert_to_rotation_matrix(q[1])),
     )
     found = manifold(
-        ("box", 2 * half[0], {"quaternion": q[0]}),
-        ("box", 2 * half[1], {"quaternion": q[1], "position": place}),
+        ("box", 2 * half[0], {"quaternion": q[0]}), ("box", 2 * half[1], {"quaternion": q[1], "position": place})
     )
     exact = separation(a, b)
     tol = 1e-3 * min(half[0].min(), half[1].min())
@@ -95,10 +94,7 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
 
 
 def test_a_box_on_a_box_has_its_four_corners_in_the_order_of_a_plane():
-    for below in (
-        ("plane", (0, 0, 1), {}),
-        ("box", (2, 2, 2), {"position": (0, 0, -1), "mass": 0, "static": True}),
-    ):
+    for below in (("plane", (0, 0, 1), {}), ("box", (2, 2, 2), {"position": (0, 0, -1), "mass": 0, "static": True})):
         found = manifold(below, ("box", (1, 0.6, 0.4), {"position": (0, 0, 0.2 - 1e-3)}))
         np.testing.assert_allclose(found["gap"], -1e-3, atol=1e-15)
         np.testing.assert_allclose(found["normal"], [[0, 0, 1]] * 4, atol=1e-15)
@@ -111,8 +107,7 @@ def test_crossed_edges_meet_in_one_point():
     other = [np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]
     z = np.sqrt(2) - 0.01
     found = manifold(
-        ("box", (2, 1, 1), {"quaternion": turn}),
-        ("box", (1, 2, 1), {"quaternion": other, "position": (0.1, 0.2, z)}),
+        ("box", (2, 1, 1), {"quaternion": turn}), ("box", (1, 2, 1), {"quaternion": other, "position": (0.1, 0.2, z)})
     )
     assert len(found["gap"]) == 1
     assert found["gap"][0] == pytest.approx(-0.01, abs=1e-12)

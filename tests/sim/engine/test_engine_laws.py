@@ -104,10 +104,7 @@ def test_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
                 scene.add_plane()
             else:
                 scene.add_box((2, 2, wall), position=(0, 0, -wall / 2), static=True)
-            place = {
-                "position": (0.01, 0.02, 0.5 * size + margin + phase * far),
-                "velocity": (0, 0, -far / h),
-            }
+            place = {"position": (0.01, 0.02, 0.5 * size + margin + phase * far), "velocity": (0, 0, -far / h)}
             if shape == "sphere":
                 scene.add_sphere(size / 2, **place)
             else:

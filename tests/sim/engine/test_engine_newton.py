@@ -112,9 +112,7 @@ def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
 
 def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():
     problem = problem_in("table", 1, friction=1.0)
-    budgets = [
-        lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)
-    ]
+    budgets = [lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)]
     assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))
 
 

@@ -95,10 +95,7 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
         with pytest.raises(lv.InputError, match="another scene"):
             lv.Simulation(lv.Scene("stack", **{"n": 3, **other})).load(path)
     data = path.read_bytes()
-    cut, *flipped = (
-        data[:-40],
-        *(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :] for k in (5, len(data) // 2, -33)),
-    )
+    cut, *flipped = (data[:-40], *(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :] for k in (5, len(data) // 2, -33)))
     for bad in (cut, *flipped):
         path.write_bytes(bad)
         with pytest.raises(lv.InputError, match=r"does not begin as a snapshot|damaged"):
@@ -272,7 +269,5 @@ def test_the_eight_values_print_with_their_names_and_units():
     np.testing.assert_allclose([float(line.split()[1]) for line in lines], values, rtol=1e-3)
     assert lines[0] == "iterations         9" and values.dtype == np.float64
     # everything else is as of any array
-    assert (
-        str(values[:2]) == "[9. 1.]" and repr(values).startswith("array([9.") and len(str(values == 9.0)) < 60
-    )
+    assert str(values[:2]) == "[9. 1.]" and repr(values).startswith("array([9.") and len(str(values == 9.0)) < 60
     assert isinstance(values[4], float) and not (values - values).any()

@@ -11,9 +11,7 @@ G = 9.81
 def ball(rolling=0.02, speed=2.0, radius=0.5, **more):
     scene = lv.Scene(rolling_radius=rolling, **more)
     scene.add_plane()
-    scene.add_sphere(
-        radius, position=(0, 0, radius), velocity=(speed, 0, 0), angular_velocity=(0, speed / radius, 0)
-    )
+    scene.add_sphere(radius, position=(0, 0, radius), velocity=(speed, 0, 0), angular_velocity=(0, speed / radius, 0))
     return lv.Simulation(scene)
 
 

@@ -109,9 +109,7 @@ def test_spinning_ball_slows_linearly_by_torsional_friction(mu, spin):
     scene.add_sphere(0.5, position=(0.0, 0.0, 0.5), angular_velocity=(0.0, 0.0, spin))
     seconds = spin * 0.4 * 0.25 / (mu * patch * G)  # Inertia 2/5 m R^2, torque mu r m g.
     time, _, _, v = record(scene, seconds + 0.5)
-    np.testing.assert_allclose(
-        v[:, 1, 5], spin * np.maximum(0.0, 1.0 - time / seconds), rtol=0, atol=1e-9 * spin
-    )
+    np.testing.assert_allclose(v[:, 1, 5], spin * np.maximum(0.0, 1.0 - time / seconds), rtol=0, atol=1e-9 * spin)
 
 
 # -- joints and free bodies ------------------------------------------------------------------------
@@ -298,15 +296,7 @@ def test_limits_of_overhang_and_arch_equal_those_of_a_linear_program(make, limit
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=1e4, gravity=G, dt=DT, friction=0.5, **NEWTON), True),
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=100.0, gravity=G, dt=DT, friction=0.5), True),
     ],
-    ids=[
-        "overhang 10",
-        "too far 10",
-        "overhang 5, sweeps",
-        "arch",
-        "too thin",
-        "heavy newton",
-        "heavy sweeps",
-    ],
+    ids=["overhang 10", "too far 10", "overhang 5, sweeps", "arch", "too thin", "heavy newton", "heavy sweeps"],
 )
 def test_structure_stands_exactly_if_statics_allows(scene, stands):
     _, x, _, _ = record(scene(), 8.0)

@@ -102,9 +102,7 @@ def test_the_page_gets_the_frames_as_they_come():
         rest = np.frombuffer(rest, "<f4").reshape(7, width)
         assert more["X-First"] == "1"
         for row, observation in zip(rest, expected, strict=True):
-            np.testing.assert_array_equal(
-                row[9:].reshape(-1, 7)[:, :3], observation["positions"].astype("f4")
-            )
+            np.testing.assert_array_equal(row[9:].reshape(-1, 7)[:, :3], observation["positions"].astype("f4"))
         beside = ("../film.py", "none", "%00", "a%00b/", "%ff", "x" * 5000)
         for path in ("frames?from=-1", "frames?from=x", *beside):
             with pytest.raises(urllib.error.HTTPError):

@@ -17,14 +17,7 @@ def test_the_readme_of_a_scene_by_hand():
     observation, reward, terminated, truncated, info = lv.Simulation(scene).step()
     assert (reward, terminated, truncated) == (0.0, False, False)
     assert info == {"time": 0.01, "step": 1, "failed_solves": 0, "order": "alternating"}
-    assert set(observation) == {
-        "positions",
-        "quaternions",
-        "velocities",
-        "contacts",
-        "joint_impulses",
-        "solver",
-    }
+    assert set(observation) == {"positions", "quaternions", "velocities", "contacts", "joint_impulses", "solver"}
     assert set(observation["contacts"]) == {"pair", "point", "normal", "tangent", "depth", "impulses"}
     # 2 kg held over the last of the three substeps of 10 ms
     assert observation["contacts"]["impulses"][:, 0].sum() == pytest.approx(2.0 * 9.81 * 0.01 / 3, rel=1e-3)

@@ -98,9 +98,7 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     )
 
 
-@pytest.mark.parametrize(
-    "x", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3)), np.diag([np.nan, 1, 1])]
-)
+@pytest.mark.parametrize("x", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3)), np.diag([np.nan, 1, 1])])
 def test_what_has_no_inverse_says_so(x):
     assert arithmetic.invert_definite_3x3(x) is None
 

@@ -21,9 +21,7 @@ def boxes(velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), **paramete
 
 @pytest.mark.parametrize("body", [2, "box 1"])
 @pytest.mark.parametrize(
-    "parameters",
-    [{}, {"solver": "newton"}, {"restitution": 0.5}],
-    ids=lambda parameters: str(*parameters.values()),
+    "parameters", [{}, {"solver": "newton"}, {"restitution": 0.5}], ids=lambda parameters: str(*parameters.values())
 )
 def test_a_run_has_the_bits_of_a_scene_that_begins_with_this_velocity(parameters, body):
     sim = lv.Simulation(boxes(**parameters))

@@ -117,9 +117,7 @@ def test_a_bearing_contact_is_in_place_within_the_slop():
         head[HEAD["warm_start"]] = warm
         problem = sim.constraint_problem()
         a["x"][:], head[HEAD["warm_start"]] = kept
-        return (problem.b + problem.rows.jacobian(problem.cones) @ problem.rows.v_free.ravel())[
-            problem.cones.ptr[:-1]
-        ]
+        return (problem.b + problem.rows.jacobian(problem.cones) @ problem.rows.v_free.ravel())[problem.cones.ptr[:-1]]
 
     h, slop = p.dt, p.slop
     np.testing.assert_allclose(targets(0.5 * slop, True), 0.0, atol=1e-13)

@@ -93,6 +93,4 @@ def visit(new_page, address):
     yield start
     for v in visits:
         assert v.complaints == []
-        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {
-            v.address.rsplit("/", 1)[0]
-        }
+        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {v.address.rsplit("/", 1)[0]}

@@ -23,9 +23,7 @@ CHECK = HERE / "check_wasm_exports.mjs"
 # Left out where the kernels run with every check on: the module is compiled without them either way.
 pytestmark = pytest.mark.slow
 
-needs_compiler = pytest.mark.skipif(
-    bool(wasm.explain_missing_requirement()), reason=wasm.explain_missing_requirement()
-)
+needs_compiler = pytest.mark.skipif(bool(wasm.explain_missing_requirement()), reason=wasm.explain_missing_requirement())
 
 
 @pytest.fixture(scope="session")
@@ -89,10 +87,7 @@ def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind):
     assert not (tmp_path / "bad.wasm").exists()
 
 
-GOOD = (
-    HEAD
-    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
-)
+GOOD = HEAD + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
 
 
 @needs_compiler
@@ -141,17 +136,13 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(wasm, "explain_missing_requirement", lambda: "no compiler")
     monkeypatch.setattr(pages, "SHIPPED", tmp_path)
-    with pytest.raises(
-        LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
-    ):
+    with pytest.raises(LavenderError, match="lavender is not in this installation and cannot be built: no compiler"):
         pages.get_or_build_module()
     other = b"\0asm\1\0\0\0" + wasm.make_custom_section(wasm.SOURCES_SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
     with pytest.raises(LavenderError, match="is of other kernels"):
         pages.get_or_build_module()
-    fresh = b"\0asm\1\0\0\0" + wasm.make_custom_section(
-        wasm.SOURCES_SECTION, wasm.hash_sources(ROOT).encode()
-    )
+    fresh = b"\0asm\1\0\0\0" + wasm.make_custom_section(wasm.SOURCES_SECTION, wasm.hash_sources(ROOT).encode())
     (tmp_path / "lavender.wasm").write_bytes(fresh)
     assert pages.get_or_build_module() == fresh
 

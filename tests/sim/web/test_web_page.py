@@ -141,10 +141,7 @@ def address(v):
     for to, done in (
         ("#scene=table&a=5,warm,given&b=6,warm,given&play=0", "lavender.scene.name === 'table'"),
         ("#no such scene", "lavender.scene.name === 'stack'"),
-        (
-            "#half%",
-            "document.querySelector('#failure').textContent.includes('half%')",
-        ),  # that encodes nothing
+        ("#half%", "document.querySelector('#failure').textContent.includes('half%')"),  # that encodes nothing
         ("#scene=pyramid&play=0", "lavender.scene.name === 'pyramid'"),
         ("#scene=stack&a=1000,x,y&b=&play=0", "lavender.scene.name === 'stack'"),  # leaves what was set
     ):
@@ -226,10 +223,7 @@ def test_a_tour_shows_the_native_numbers_and_says_what_it_said(visit, start):
 
 @pytest.mark.parametrize(
     ("preset", "phone"),
-    [
-        *((preset, {}) for preset in EXPERIMENTS),
-        (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}}),
-    ],
+    [*((preset, {}) for preset in EXPERIMENTS), (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}})],
 )
 def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
     v = visit("#" + preset.name, **phone)
@@ -452,9 +446,7 @@ def _open_files(v, film):
     }  # fmt: skip
     for name, data in wrong.items():
         v.page.set_input_files("#file", {"name": name, "mimeType": "", "buffer": data})
-        v.page.wait_for_function(
-            f"document.querySelector('#failure').textContent.startsWith('{name} is not a film')"
-        )
+        v.page.wait_for_function(f"document.querySelector('#failure').textContent.startsWith('{name} is not a film')")
         assert v.js("lavender.frames.length") == 61
     v.page.set_input_files("#file", {"name": "film", "mimeType": "", "buffer": film[: -len(of[2]) // 61]})
     v.page.wait_for_function("document.querySelector('#failure').hidden && lavender.frames.length === 60")
