@@ -22,8 +22,8 @@ SMALL_SIZES = [10.0**-k for k in range(1, 10)]
 DENSE_ONLY = ("daqp", "ecos", "quadprog", "jaxopt_osqp", "qpax", "pyqpmad")
 
 
-def run_alone(name, P, q, sparse=None, **arrays):
-    """Solve a program by qpsolvers with the backend's default settings; return the solution or the exception."""
+def run_alone(name, P, q, sparse=None, settings=(), **arrays):
+    """Solve a program by qpsolvers, by default with default settings; return the solution or the exception."""
     import qpsolvers
 
     if "qpax" in name or "jax" in name:
@@ -36,7 +36,7 @@ def run_alone(name, P, q, sparse=None, **arrays):
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         try:
-            return qpsolvers.solve_problem(qpsolvers.Problem(**arrays), name)
+            return qpsolvers.solve_problem(qpsolvers.Problem(**arrays), name, **dict(settings))
         except Exception as error:  # Backends raise their own exceptions.
             return error
 
@@ -214,10 +214,10 @@ def piqp_fails_with_unsorted_indices():
 
 
 def proxqp_finds_a_program_infeasible():
-    found = run_alone(  # The solution is (0, 1).
-        "proxqp", np.diag([1, 0]), [2, -1], G=[[0, 1]], h=[1], A=[[1, 0]], b=[0], lb=[-5, -5], ub=[5, 5]
-    )
-    return "PRIMAL_INFEASIBLE" in str(found.extras["info"].status)
+    program = {"P": np.diag([1, 0]), "q": [2, -1], "G": [[0, 1]], "h": [1], "A": [[1, 0]], "b": [0]}
+    program |= {"lb": [-5, -5], "ub": [5, 5]}
+    found, weighted = run_alone("proxqp", **program), run_alone("proxqp", **program, settings={"rho": 1e-2})
+    return "PRIMAL_INFEASIBLE" in str(found.extras["info"].status) and is_near(weighted.x, np.array([0, 1]))
 
 
 def highs_returns_zeros():
