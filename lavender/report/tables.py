@@ -206,15 +206,17 @@ def tabulate_runs(report: Report) -> Frame:
     """Tabulate the time to each tolerance, smallest residual, status and claim of each solver on each case."""
     runs = report.frame[(report.frame["order"] == "given") & (report.frame["step"] < 0)]
     keys = ["case", "solver", "start"]
+    # pandas 3.1 cannot align two indices of categories with codes of different sizes (above 127 cases).
+    runs = runs.astype(dict.fromkeys(keys, str))
     to_tolerance = runs[runs["mode"] == "tol"] if (runs["mode"] == "tol").any() else runs
-    table = runs.groupby(keys, observed=True, sort=False)[["relative"]].min()
+    table = runs.groupby(keys, sort=False)[["relative"]].min()
     for tolerance in report.tolerances:
         reached = to_tolerance[to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance]
-        reached = reached.groupby(keys, observed=True)["time"]
+        reached = reached.groupby(keys)["time"]
         table[f"to {format_tolerance(tolerance)} [s]"] = reached.min().reindex(table.index)
-    last = to_tolerance.groupby(keys, observed=True)[["status", "form"]].last()
+    last = to_tolerance.groupby(keys)[["status", "form"]].last()
     checks = runs["claim_check"].map({CONFIRMED: 0, NOT_PROVEN: 1, CONTRADICTED: 2}).astype(int)
-    worst = checks.groupby([runs[k] for k in keys], observed=True).max()
+    worst = checks.groupby([runs[k] for k in keys]).max()
     table = table.join(last)
     table["claim"] = worst.map({0: "", 1: NOT_PROVEN, 2: f"✗ {CONTRADICTED}"})
     table = table.reset_index().rename(columns={"relative": "smallest residual [-]"})

@@ -276,3 +276,16 @@ def test_table_times_have_one_unit_and_sizes_one_format():
     assert [table.is_numeric_column(h) for h in table.heads] == [False, True, True, True, True]
     assert Table(["n", "t"], [["x", Cell.time(2e-6)], ["y", Cell.time(3e-6)]]).heads == ["n", "t [µs]"]
     assert Table(["a"], [["<b>|*x*"]]).format_markdown() == ["| a |", "|---|", r"| &lt;b&gt;\|\*x\* |"]
+
+
+def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
+    """pandas has codes of one byte for up to 127 categories, and did not align them with codes of two bytes."""
+    made = [
+        record(f"c{i}", s, 1e-3, 1e-8 if i < 3 else 0.5, tol=1e-3)
+        for i in range(200)
+        for s in ("auto", "pgs")
+    ]
+    report = Report(records_of(*made))
+    assert len(report.sections["runs"].frame) == 400
+    assert report.sections["runs"].frame["to 1e-3 [s]"].notna().sum() == 6
+    assert len(report.sections["failures"].frame) == 394
