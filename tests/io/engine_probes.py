@@ -180,6 +180,46 @@ def delay_is_limited_by_samples():
     return steps == 4
 
 
+def make_sheet(elastic, solver, iterations):
+    """Return data of a moving sheet after a forward pass of the integrator "discrete"."""
+    import mujoco
+
+    model, data = make_mujoco(
+        f"""<mujoco><option timestep="0.002" integrator="discrete" tolerance="1e-12" solver="{solver}"
+        iterations="{iterations}"/><worldbody><flexcomp name="sheet" type="grid" count="4 4 1" spacing=".06 .06 .06"
+        pos="0 0 .23" radius=".005" dim="2" mass=".2" dof="full"><contact selfcollide="none"/>
+        <elasticity young="3e4" poisson="0.2" damping="0.01" thickness="4e-3" elastic2d="{elastic}"/></flexcomp>
+        </worldbody></mujoco>"""
+    )
+    data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
+    mujoco.set_mju_user_warning(lambda text: None)  # Otherwise MuJoCo writes warnings to a file.
+    mujoco.mj_forward(model, data)
+    mujoco.set_mju_user_warning(None)
+    return data
+
+
+@fact(
+    *MUJOCO,
+    '`integrator="discrete"`: `efm_K`',
+    'The stiffness of a flex that only bends is in `efm_K` with `solver="Newton"`, and is not stored with "CG".',
+    "`from_mujoco` rejects such a step and names the flex and the solver.",
+)
+def bending_stiffness_is_stored_with_newton_only():
+    return [make_sheet("bend", s, 300).efm_K_val.size > 0 for s in ("Newton", "CG")] == [True, False]
+
+
+@fact(
+    *MUJOCO,
+    '`integrator="discrete"`: `iterations`',
+    "The limit of the solver also limits the iteration that computes `qacc_smooth` with a flex. After one iteration, "
+    "it is wrong by 1e-4 of its size.",
+    "The exact `qacc_smooth` is computed; the problem does not depend on `iterations`.",
+)
+def iterations_limit_the_smooth_acceleration():
+    early, exact = (make_sheet("bend", "Newton", n).qacc_smooth for n in (1, 300))
+    return np.abs(early - exact).max() > 1e-5 * np.abs(exact).max()
+
+
 # -- one URDF in several engines -----------------------------------------------------------------------
 
 INERTIAL = (
