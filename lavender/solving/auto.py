@@ -21,9 +21,8 @@
                      constraints, for other problems under Coulomb's law by a linear program
     alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued where it stopped, with doubled
                      work in each round, until no solver improves the residual in two rounds or the total cost exceeds
-                     `total_ratio` times the cost of the cheapest. On large problems with friction, the factorising
-                     solvers, which have just run, come last in a round, and `admm` continues while one more turn is
-                     predicted to solve the problem
+                     `total_ratio` times the cost of the cheapest. On large problems with friction, a round begins with
+                     a tenth of a turn of `admm`, which continues while one more is predicted to solve the problem
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
@@ -94,6 +93,9 @@ RELAXED_BUDGET_RATIO = 2.0
 # number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
 ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
 MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
+# On large problems with friction, `admm` runs before the factorising solvers of a round, for this fraction of the cost
+# of a turn. It ends many solves from the best impulse of a path; 1 delays what a second turn of `newton` solves.
+EARLY_ADMM_FRACTION = 0.1
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
@@ -674,17 +676,15 @@ class DecisionTree:
         times *= DECISIONS.budget_ratio
         p, cost, setup = self.problem, times * self.unit, 0.0
         why = f"in turn, {times:g} times the cheapest factorising solver's cost"
-        factorisations = [self.factorisation(name, cost, why) for name in self.solver_costs]
-        # On large problems with friction, the factorising solvers have just had a turn, and `admm` ends many solves
-        # from their best impulse.
-        is_large = starts_relaxed(p)
-        if not is_large:
-            yield from factorisations
-        n = 0.5 * cost / self.sweep  # An iteration of the next two solvers costs as much as two sweeps.
+        n = 0.5 * cost / self.sweep  # An iteration of `admm` and `nncg` costs as much as two sweeps.
         if p.generalized is not None:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
+        if setup <= cost and starts_relaxed(p):
+            fraction = EARLY_ADMM_FRACTION
+            yield from self.repeat_while_converging(Stage("admm", fraction * n, fraction * cost, why))
+        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         if setup <= cost:
             yield from self.repeat_while_converging(Stage("admm", n, cost, why))
         yield Stage("nncg", n, cost, why)
@@ -692,8 +692,6 @@ class DecisionTree:
             before = self.best
             yield self.sweeps(cost, why)
             self.sweeps_failed = self.best >= before
-        if is_large:
-            yield from factorisations
 
     def repeat_while_converging(self, stage: Stage) -> Iterator[Stage]:
         """Yield a stage. On large problems with friction, repeat it while one more turn is predicted to reach tol."""

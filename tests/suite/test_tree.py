@@ -199,11 +199,12 @@ def test_direct_gets_its_budget_on_a_narrow_band_once():
     assert [stage.solver for stage in stages] == ["direct", "newton"]
 
 
-def test_auto_sliding_pyramid_admm_follows_first_turn_of_newton():
+def test_round_of_large_problem_with_friction_begins_with_part_of_a_turn_of_admm():
     problem = suite.case("pyramidF(k=12, sliding=0.5, mass_ratio=3)").problem
     assert starts_relaxed(problem)
-    names = [stage.solver for stage in DecisionTree(problem).iterate_one_round(1.0)]
-    assert names == ["admm", "nncg", "anderson", "newton"]
+    stages = list(DecisionTree(problem).iterate_one_round(1.0))
+    assert [stage.solver for stage in stages] == ["admm", "newton", "admm", "nncg", "anderson"]
+    assert stages[0].cost < 0.5 * stages[2].cost and stages[2].cost == stages[1].cost
     small = suite.case("pyramidF(k=6, sliding=0.5)").problem
     names = [stage.solver for stage in DecisionTree(small).iterate_one_round(1.0)]
     assert names[0] == "newton" and names[-1] == "anderson"
