@@ -73,6 +73,8 @@ DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about
 MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated only after results have arrived for this long.
 # If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
 MAX_DEFAULT_WORLDS = 4096
+# World 0 is first judged in this process for these numbers of steps, so that Ctrl-C soon after the start has a result.
+FIRST_STEPS = (1, 20)
 N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
 SAVED_KINDS = ("worst", "contact")
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
@@ -255,6 +257,20 @@ class Audit:
     notes: str = ""
     n_quiet: tuple[int, int] = (0, 0)
     contact_states: list[StepState] = field(default_factory=list)
+
+    def add_piece(self, piece: Piece, keep: int | None) -> None:
+        """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
+        self.numbers[:, piece.world, piece.step] = piece.numbers
+        self.verdict[piece.world, piece.step] = piece.verdict
+        self.rows[piece.world, piece.step] = piece.rows
+        self.contacts[piece.world, piece.step] = piece.contacts
+        for i, name in piece.where:
+            count, largest = self.where.get(name, (0, 0.0))
+            self.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
+        self.worst[:] = _select_worst([*self.worst, *piece.worst], keep)
+        self.contact_states.extend(piece.contact_states)
+        self.engine_warnings.update(piece.engine_warnings)
+        self.divergences[:] = sorted([*self.divergences, *piece.divergences])
 
     @property
     def is_judged(self) -> Any:
@@ -632,7 +648,8 @@ def audit(
     Returns
     -------
     Audit
-        After Ctrl-C, the result of the steps so far, with `stopped`.
+        After Ctrl-C, the result of the steps so far, with `stopped`: before the first results of the workers, some
+        steps of world 0.
 
     Raises
     ------
@@ -657,52 +674,45 @@ def audit(
         check_float("threshold", threshold, low=0.0),
         None if keep is None else check_int("keep", keep, 1),
     )
-    expected_time = None
-    if worlds is None:
-        if watch is not None:
-            watch(Event(0, 0, "timing one world", ""))
-        expected_time = DEFAULT_DURATION
-        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed).with_start_states(states)
-        worlds = choose_world_count(one, judging, count_processes(workers) if engine == "mujoco" else 1)
-    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed).with_start_states(states)
-    runs, spread_note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
-    if keep_contact_states:
-        judging = judging._replace(contact_share=min(1.0, MAX_CONTACT_STATES / (worlds * steps)))
-    numbers, verdict = (
-        np.full((len(WORST_ROW_ERRORS), worlds, steps), np.nan),
-        np.full((worlds, steps), -1, np.int8),
-    )
-    rows, contacts = np.zeros((2, worlds, steps), int)
-    result = Audit(
-        runs, engine, numbers, verdict, rows=rows, contacts=contacts,
-        can_touch=can_any_geoms_collide(*runs.load_model()), where={},
-        worst=[], divergences=[], error_limit=max_velocity_error,
-        notes=" ".join(filter(None, (runs.sleep_note, spread_note))),
-    )  # fmt: skip
-    loads, processes = [], 1
-    if engine == "mujoco":
-        pieces = _audit_mujoco(runs, judging, workers, backend)
-        processes += count_processes(workers)  # This process waits for the workers.
-    else:
-        pieces = _audit_jointly_stepped_worlds(engine, runs, judging)
-    if watch is not None:
-        text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
-        watch(Event(0, worlds * steps, text, "", remaining=expected_time))
-    begin = perf_counter()
-    first: tuple[int, float] | None = None  # Number of steps and time [s] of the first results.
+    expected_time = DEFAULT_DURATION if worlds is None else None
+    one = Runs(
+        os.fspath(model), 1 if worlds is None else worlds, steps, control=control, seed=seed
+    ).with_start_states(states)
+    early = result = _make_empty_audit(one, engine, max_velocity_error)
+    loads: list[float | None] = []
+    processes = count_processes(workers) if engine == "mujoco" else 1
+    n_quiet = (0, 0)
     try:
+        if worlds is None or engine == "mujoco":
+            _reject_unsupported_model(one)
+            for n_steps in (*FIRST_STEPS, steps) if worlds is None else FIRST_STEPS:
+                begin = perf_counter()
+                judged = _judge_first_steps(result, judging, n_steps, watch)
+                duration = perf_counter() - begin
+                early = judged if engine == "mujoco" else early
+        if worlds is None:
+            worlds = choose_world_count(duration, processes)
+        runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed).with_start_states(states)
+        if watch is not None and spread is None:
+            watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
+        runs, spread_note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+        if keep_contact_states:
+            judging = judging._replace(contact_share=min(1.0, MAX_CONTACT_STATES / (worlds * steps)))
+        result = _make_empty_audit(runs, engine, max_velocity_error, spread_note)
+        if engine == "mujoco":
+            pieces = _audit_mujoco(runs, judging, workers, backend)
+        else:
+            pieces = _audit_jointly_stepped_worlds(engine, runs, judging)
+        if watch is not None:
+            text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
+            if engine == "mujoco":
+                watch(Event(0, worlds * steps, text, "", remaining=expected_time))
+            else:
+                watch(Event(0, worlds * steps, f"compiling {engine}, then {text}", ""))
+        begin = perf_counter()
+        first: tuple[int, float] | None = None  # Number of steps and time [s] of the first results.
         for piece in pieces:
-            numbers[:, piece.world, piece.step] = piece.numbers
-            verdict[piece.world, piece.step] = piece.verdict
-            rows[piece.world, piece.step] = piece.rows
-            contacts[piece.world, piece.step] = piece.contacts
-            for i, name in piece.where:
-                count, largest = result.where.get(name, (0, 0.0))
-                result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
-            result.worst[:] = _select_worst([*result.worst, *piece.worst], judging.keep)
-            result.contact_states.extend(piece.contact_states)
-            result.engine_warnings.update(piece.engine_warnings)
-            result.divergences[:] = sorted([*result.divergences, *piece.divergences])
+            result.add_piece(piece, judging.keep)
             loads.append(machine.count_runnable_processes())
             if watch is not None:
                 # The time before the first results contains the start of the workers.
@@ -715,17 +725,49 @@ def audit(
                     remaining = elapsed * (worlds * steps - result.n_processed) / since
                 text = f"steps, {int(result.is_unconverged.sum())} unconverged"
                 watch(Event(result.n_processed, worlds * steps, text, "", remaining=remaining))
+        if engine == "mujoco":
+            n_quiet = _repeat_without_noise(runs, result.divergences)
     except KeyboardInterrupt:
         if not result.n_processed:
-            raise
+            if not early.n_processed:
+                raise
+            return early
     if not result.n_processed:
         raise InputError(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
         )
-    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
+    own = processes + (engine == "mujoco")  # This process waits for the workers.
+    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=own)
     result.contact_states.sort(key=lambda entry: entry[:2])
-    n_quiet = _repeat_without_noise(runs, result.divergences) if engine == "mujoco" else (0, 0)
-    return replace(result, stopped=result.n_processed < worlds * steps, busy=busy, n_quiet=n_quiet)
+    return replace(result, stopped=result.n_processed < result.verdict.size, busy=busy, n_quiet=n_quiet)
+
+
+def _make_empty_audit(runs: Runs, engine: str, error_limit: float | None, note: str = "") -> Audit:
+    """Make the result of an audit before its first step; `note` is a sentence about the spread."""
+    shape = runs.worlds, runs.steps
+    rows, contacts = np.zeros((2, *shape), int)
+    return Audit(
+        runs, engine, np.full((len(WORST_ROW_ERRORS), *shape), np.nan), np.full(shape, -1, np.int8),
+        rows=rows, contacts=contacts, can_touch=can_any_geoms_collide(*runs.load_model()), where={},
+        worst=[], divergences=[], error_limit=error_limit,
+        notes=" ".join(filter(None, (runs.sleep_note, note))),
+    )  # fmt: skip
+
+
+def _judge_first_steps(
+    empty: Audit, judging: Judging, n_steps: int, watch: Callable[[Event], None] | None
+) -> Audit:
+    """Judge up to the first `n_steps` steps of world 0 in this process, as the result of an audit that was stopped.
+
+    World 0 starts without noise, so that its steps do not depend on the spread.
+    """
+    runs = replace(empty.runs, steps=min(n_steps, empty.runs.steps))
+    if watch is not None:
+        watch(Event(0, 0, f"judging one world: {format_count(runs.steps, 'step')}", ""))
+    judged = _make_empty_audit(empty.runs, empty.engine, empty.error_limit)
+    for piece in audit_worlds(runs, judging, range(1)):
+        judged.add_piece(piece, judging.keep)
+    return replace(judged, stopped=True)
 
 
 def _repeat_without_noise(runs: Runs, divergences: list[Divergence]) -> tuple[int, int]:
@@ -753,18 +795,12 @@ def count_processes(workers: int) -> int:
     return workers if workers > 0 else max(1, (os.cpu_count() or 1) + 1 + workers)
 
 
-def choose_world_count(runs: Runs, judging: Judging, processes: int) -> int:
+def choose_world_count(duration: float, processes: int) -> int:
     """Return the number of worlds that take about `DEFAULT_DURATION` in `processes` processes.
 
-    `runs` describes one world. It is simulated and judged twice with MuJoCo, and the second run is timed, because the
-    first one also imports modules.
+    `duration` [s] is the time in which one world was simulated and judged.
     """
-    _reject_unsupported_model(runs)
-    audit_worlds(replace(runs, steps=1), judging, range(1))
-    begin = perf_counter()
-    audit_worlds(runs, judging, range(1))
-    duration = max(perf_counter() - begin, 1e-6)
-    return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / duration)))
+    return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / max(duration, 1e-6))))
 
 
 def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:
@@ -780,7 +816,6 @@ def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:
 
 def _audit_mujoco(runs: Runs, judging: Judging, workers: int, backend: str) -> Iterator[Piece]:
     """Simulate and judge MuJoCo's steps in worker processes."""
-    _reject_unsupported_model(runs)
     share = -(-runs.worlds // (MIN_TASKS_PER_WORKER * count_processes(workers)))
     worlds_per_task = max(1, min(STEPS_PER_TASK // runs.steps, share))
     parts = (

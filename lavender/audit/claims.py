@@ -262,6 +262,8 @@ def compare_claims(
             solver=engine,
             replace=True,
         )
+    if watch is not None:
+        watch(Event(0, total, f"compiling {engine}", ""))
     try:
         for step in steps:
             if outcomes and len(step.batch) != len(outcomes[0]):

@@ -10,7 +10,7 @@ import click
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_choice
-from lavender.cli.measuring import show_page, show_progress
+from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
 from lavender.cli.options import (
     FILE,
     FOLDER,
@@ -99,7 +99,7 @@ def audit(
         return
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
-    with show_progress() as watch:
+    with explain_early_interrupt("the first step"), show_progress() as watch:
         result = run(
             model, watch=watch, max_velocity_error=max_velocity_error, keep=keep,
             keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
@@ -127,7 +127,7 @@ def _audit_claims(
     stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps, **starts)
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
-    with show_progress() as watch:
+    with explain_early_interrupt("the first step of all worlds"), show_progress() as watch:
         result = compare_claims(
             stepped,
             engine=options["engine"],

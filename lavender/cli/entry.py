@@ -183,8 +183,10 @@ def _run_command(args: Sequence[str] | None) -> int:
     except click.exceptions.ClickException as error:
         error.show()
         code = error.exit_code
-    except (click.exceptions.Abort, KeyboardInterrupt):
-        click.echo("lavender: stopped", err=True)
+    except (click.exceptions.Abort, KeyboardInterrupt) as error:
+        # click raises Abort from KeyboardInterrupt, whose message may describe the completed part.
+        reason = str(error) or str(error.__cause__ or "")
+        click.echo(": ".join(filter(None, ("lavender: stopped", reason))), err=True)
         code = EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit):
         # The reader has closed the pipe (`lavender solvers | head`), for which click and rich raise SystemExit.

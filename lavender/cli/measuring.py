@@ -183,6 +183,19 @@ def show_page(page: SummaryPage, folder: Path) -> None:
 
 
 @contextlib.contextmanager
+def explain_early_interrupt(first_result: str) -> Iterator[None]:
+    """Give the exception of Ctrl-C a message with the time so far and with `first_result`, which is not complete."""
+    began = time.monotonic()
+    try:
+        yield
+    except KeyboardInterrupt:
+        elapsed = time.monotonic() - began
+        raise KeyboardInterrupt(
+            f"nothing was complete yet after {elapsed:.1f} s; the first result is {first_result}"
+        ) from None
+
+
+@contextlib.contextmanager
 def show_progress() -> Iterator[Callable[[Event], None]]:
     """Yield a callback that shows progress: a bar on a terminal, otherwise a line on stderr every few seconds."""
     to = make_console(stderr=True)
@@ -217,7 +230,7 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
         transient=True,
         refresh_per_second=4,  # Drawing more often would take processor time from the measurement.
     ) as bar:
-        task = bar.add_task("", total=None, what="", remaining="")
+        task = bar.add_task("", total=None, what="starting", remaining="")
         pace = Pace()
 
         def show_event(event: Event) -> None:

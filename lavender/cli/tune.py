@@ -9,7 +9,7 @@ import click
 
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_choice
-from lavender.cli.measuring import show_page, show_progress
+from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output
 
@@ -51,7 +51,7 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
 
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
-    with show_progress() as watch:
+    with explain_early_interrupt("the present setting on the first steps"), show_progress() as watch:
         tuning = run(model, watch=watch, **options)
     show_page(tuning.summary_page, out)
     if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):

@@ -51,8 +51,15 @@ def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes
     events = []
     found = audit(boxes(EARLY), steps=20, workers=1, watch=events.append)
     assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.n_judged == 20 * found.runs.worlds
-    assert (events[0].case, events[1].remaining) == ("timing one world", 0.5)
-    assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[1:])
+    first = next(i for i, event in enumerate(events) if event.total)
+    assert [event.case for event in events[:first]] == [
+        "judging one world: 1 step",
+        "judging one world: 20 steps",
+        "judging one world: 20 steps",
+        "simulating trial worlds to choose the spread",
+    ]
+    assert events[first].remaining == 0.5
+    assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[first:])
     assert events[-1].done == events[-1].total == 20 * found.runs.worlds
     same = audit(boxes(EARLY), worlds=found.runs.worlds, steps=20, workers=1)
     assert same.numbers.tobytes() == found.numbers.tobytes()
@@ -146,6 +153,52 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
     assert np.isnan(found.numbers[:, 1:]).all()
     found.write(tmp_path / "out")
     assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
+
+
+@pytest.mark.parametrize(
+    ("worlds", "phase", "shape", "judged"),
+    [
+        (3, "judging one world: 20 steps", (3, 25), 1),
+        (3, "simulating trial worlds", (3, 25), 20),
+        (3, "3 worlds of 25 steps", (3, 25), 20),
+        (None, "judging one world: 25 steps", (1, 25), 20),
+        (None, "simulating trial worlds", (1, 25), 25),
+    ],
+)
+def test_ctrl_c_before_the_first_results_of_workers_returns_steps_of_world_0(
+    boxes, tmp_path, worlds, phase, shape, judged
+):
+    def watch(event):
+        if event.case.startswith(phase):
+            raise KeyboardInterrupt
+
+    path = boxes(EARLY)
+    found = audit(path, worlds=worlds, steps=25, workers=1, watch=watch)
+    assert found.stopped and found.verdict.shape == shape and found.n_processed == judged
+    want = [r.velocity for r in own_errors(path, 0, judged)]
+    np.testing.assert_allclose(found.numbers[0, 0, :judged], want, rtol=1e-6, atol=1e-12)
+    found.write(tmp_path / "out")
+    assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
+
+
+def test_ctrl_c_before_the_first_step_is_raised(boxes):
+    def watch(event):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        audit(boxes(EARLY), worlds=3, steps=25, workers=1, watch=watch)
+
+
+def test_an_engine_of_joint_worlds_is_shown_as_compiling_until_its_first_step(boxes, monkeypatch):
+    events = []
+
+    def compile_without_end(engine, runs):
+        assert events[-1].case == "compiling mjx, then 2 worlds of 10 steps"
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "iterate_frames", compile_without_end)
+    with pytest.raises(KeyboardInterrupt):  # The steps of MuJoCo that were timed are no result of MJX.
+        audit(boxes(EARLY), worlds=2, steps=10, engine="mjx", watch=events.append)
 
 
 def test_what_is_close_enough_may_still_not_be_accepted(boxes):

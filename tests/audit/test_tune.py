@@ -218,6 +218,39 @@ def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
 
 
+def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkeypatch):
+    fewer(monkeypatch)
+    simulate = sweep.MujocoStage.from_stretches_of_runs.__func__
+
+    def stop_after_first_stage(cls, mj, model, runs, worlds, horizon):
+        if runs.steps > horizon:
+            raise KeyboardInterrupt
+        return simulate(cls, mj, model, runs, worlds, horizon)
+
+    def stop_at_timing(event):
+        if event.case.startswith("timing"):
+            raise KeyboardInterrupt
+
+    whole = tune(boxes(EARLY), worlds=4, steps=20, repeats=1, watch=stop_at_timing)
+    monkeypatch.setattr(sweep.MujocoStage, "from_stretches_of_runs", classmethod(stop_after_first_stage))
+    brief = tune(boxes(EARLY), worlds=4, steps=20, repeats=1)
+    for found, n_steps in ((whole, 2 * 20), (brief, 10)):  # two of the four worlds; one stretch
+        assert found.stopped and [m.setting.options for m in found.measured] == [()]
+        assert len(found.measured[0].error) == n_steps and not found.held
+        assert "Stopped before the end" in found.summary_page.render_html()
+
+
+def test_worlds_are_simulated_with_a_label_and_without_a_count(boxes, monkeypatch):
+    fewer(monkeypatch)
+
+    def stop(event):
+        assert (event.done, event.total, event.case) == (0, 0, "simulating the worlds")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune(boxes(EARLY), worlds=2, steps=10, watch=stop)
+
+
 @pytest.mark.parametrize(
     ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "horizon"), ({"repeats": 0}, "repeats")]
 )

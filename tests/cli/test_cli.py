@@ -1,5 +1,6 @@
 """The command line: what it leaves, and what it says when it cannot."""
 
+import importlib
 import json
 import os
 import re
@@ -290,6 +291,23 @@ def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path
     done = python("-m", "lavender", "solvers", env=environment, status=130)
     assert "lavender: stopped" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", ["audit", "tune"])
+def test_ctrl_c_before_the_first_result_ends_with_130_and_a_reason(tmp_path, monkeypatch, capsys, command):
+    pytest.importorskip("mujoco")
+    from lavender.cli import main
+
+    def stop(*arguments, **options):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(importlib.import_module(f"lavender.audit.{command}"), command, stop)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    with pytest.raises(SystemExit) as end:
+        main([command, "model.xml"])
+    assert end.value.code == 130
+    assert "lavender: stopped: nothing was complete yet" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")

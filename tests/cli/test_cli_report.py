@@ -69,6 +69,17 @@ def test_progress_on_a_terminal_keeps_counts_and_times(monkeypatch, width):
     assert "199/770 0:00:00 about 61 s remain: timing: round 1 of 5, x" in last and last.endswith("x…")
 
 
+def test_progress_on_a_terminal_has_a_label_before_the_first_event(monkeypatch):
+    from rich.console import Console
+
+    console = Console(force_terminal=True, width=80, file=StringIO(), _environ={}, color_system=None)
+    monkeypatch.setattr(measuring, "make_console", lambda stderr: console)
+    with measuring.show_progress():
+        pass
+    assert all("starting" in line for line in console.file.getvalue().split("\r") if "0/?" in line)
+    assert "0/?" in console.file.getvalue()
+
+
 def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
     monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
     with measuring.show_progress() as watch:

@@ -90,7 +90,8 @@ def tune(
     Returns
     -------
     Tuning
-        After Ctrl-C, it holds the results so far, and its `stopped` is true.
+        After Ctrl-C, it holds the results so far, and its `stopped` is true. Before the first round of timing, these
+        are the present setting on one stretch of one world, and then on all worlds.
 
     Raises
     ------
@@ -122,16 +123,18 @@ def tune(
         return run_tuning(
             lambda: make_kamino_stages(name, worlds, steps, horizon, **start),
             name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2,
-            error_limit=max_velocity_error, watch=watch,
+            error_limit=max_velocity_error, watch=watch, first_phase="compiling kamino, then simulating the worlds",
         )  # fmt: skip
     runs = Runs(name, worlds, steps, control=control, seed=seed).with_start_states(states)
-    runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+    note = ""
     mj, configured = runs.load_model()
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
 
     def make_stages() -> Sequence[Stage]:
         """Simulate all worlds; return the stages of the worlds with even numbers and of those with odd numbers."""
+        nonlocal runs, note
+        runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
         if engine == "mujoco_warp":
             return make_warp_stages(mj, configured, runs, horizon)
         return [
@@ -139,10 +142,17 @@ def tune(
             for i in (0, 1)
         ]
 
+    def make_first_stage() -> Stage:
+        """Simulate the first stretch of world 0, which starts without noise."""
+        first = replace(runs, steps=horizon)
+        return MujocoStage.from_stretches_of_runs(mj, configured, first, range(1), horizon)
+
     with count_engine_warnings(mj):  # Settings with which worlds diverge are left out.
         tuning = run_tuning(
             make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
             n_held_worlds=worlds // 2, error_limit=max_velocity_error, watch=watch,
+            make_first_stage=make_first_stage if engine == "mujoco" else None,
+            first_phase=f"{'simulating' if engine == 'mujoco' else f'compiling {engine}, then simulating'} the worlds",
         )  # fmt: skip
     return replace(tuning, notes=" ".join(filter(None, (runs.sleep_note, note))))
 
@@ -158,6 +168,8 @@ def run_tuning(
     n_held_worlds: int,
     error_limit: float | None = None,
     watch: Callable[[Event], None] | None = None,
+    make_first_stage: Callable[[], Stage] | None = None,
+    first_phase: str = "simulating the worlds",
 ) -> Tuning:
     """Measure settings on one stage, and measure the chosen settings on a second stage.
 
@@ -175,16 +187,22 @@ def run_tuning(
         Number of worlds held back.
     error_limit : float, m/s, optional
         Also choose the fastest setting whose error does not exceed this number on both stages.
+    make_first_stage : callable, optional
+        Returns a small stage, on which the present setting is measured first: the result of a measurement that Ctrl-C
+        stops before this setting is measured on the other stages.
+    first_phase : str
+        Shown until the first measurement.
     """
     schedule = Schedule(watch)
     held_errors: dict[Setting, float] = {}
     measured: list[Measured] = []
     held: list[Measured] = []
+    early: list[Measured] = []  # The present setting, timed once; the result until the first round of timing.
     sizes: StepSizes | None = None
 
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
-        timed = [m for m in measured if np.isfinite(m.mean_step_time)]
+        timed = [m for m in measured if np.isfinite(m.mean_step_time)] or early
         busy = machine.make_busy_warning(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
@@ -200,7 +218,21 @@ def run_tuning(
                 results.append(stage.judge_setting(setting))
         return results
 
+    def measure_early(stage: Stage, judged: Measured) -> None:
+        """Time the present setting once, if no world diverges, as the result so far."""
+        nonlocal sizes
+        timed = replace(judged)
+        stage.time_settings([timed], 1, Schedule(None))
+        if np.isfinite(timed.mean_step_time):
+            early[:] = [timed]
+            sizes = StepSizes(timed.rows, timed.contacts, can_touch)
+
+    if watch is not None:
+        watch(Event(0, 0, first_phase, ""))
     try:
+        if make_first_stage is not None:
+            first_stage = make_first_stage()
+            measure_early(first_stage, first_stage.judge_setting(first_stage.own_setting))
         stage, held_back = make_stages()
         own, first_settings = stage.own_setting, stage.list_first_settings()
         n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
@@ -216,6 +248,7 @@ def run_tuning(
                 f"{model}: worlds diverge with the model's own setting, so other settings cannot be "
                 "compared with it: give other controls, states or fewer steps"
             )
+        measure_early(stage, measured[0])
         last = judge(held_back, [own])
         both = [*measured, *last]
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
@@ -254,7 +287,7 @@ def run_tuning(
         held_back.time_settings(last, 2 * repeats, schedule)
         held += last if np.isfinite(last[0].mean_step_time) else []
     except KeyboardInterrupt:
-        if not measured or not np.isfinite(measured[0].mean_step_time):
+        if not early:
             raise
         return make_result(True)
     return make_result(False)
