@@ -114,7 +114,7 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
     )
     number = {case: i for i, case in enumerate(cases)}
     solvers = [str(s) for s in runs["solver"].unique()] if law else select_drawn_solvers(report, frame)
-    curves = []
+    curves: list[Curve] = []
     for solver in sorted(solvers) if law else solvers:
         own = runs[runs["solver"] == solver]
         if not len(own):
@@ -135,7 +135,7 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
         across, low, middle, high = (tuple(x[first:].tolist()) for x in (grid, *bands))
         n = own["case"].nunique()
         label = solver if n == len(cases) else f"{solver} ({n} of {len(cases)} cases)"
-        band = {"low": low, "high": high} if not curves and not law and len(cases) > 1 else {}
+        band: dict[str, Any] = {"low": low, "high": high} if not curves and not law and len(cases) > 1 else {}
         curves.append(Curve(solver, label, across, middle, steps=len(cases) == 1, unmarked=True, **band))
     over = (
         f", median over {format_count(len(cases), 'case' if single.any() else 'step')}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, UnknownName
@@ -93,7 +94,7 @@ class Plan:
                     "integer: random:3"
                 )
         # Remove duplicates: a value given twice would be run twice and change the middle value.
-        unique = {
+        unique: dict[str, Iterable[Any]] = {
             "tolerances": sorted({float(x) for x in self.tolerances}, reverse=True),
             "budgets": sorted({check_int("budget", n, 1) for n in self.budgets}),
             "orders": dict.fromkeys(self.orders),

@@ -66,7 +66,9 @@ class Table:
     @classmethod
     def from_frame(cls, frame: Any) -> Table:
         """Create a table from a DataFrame: columns of floats with the unit [s] are times, with another unit sizes."""
-        heads, columns, words = [], [], set()
+        heads: list[str] = []
+        columns: list[list[str | Cell]] = []
+        words: set[str] = set()
         for head, values in frame.items():
             name, kind = str(head), values.dtype.kind
             is_time = kind == "f" and name.endswith(" [s]")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ from lavender.report.text import format_count, format_residual
 if TYPE_CHECKING:
     from lavender.report.findings import Report
 
-Frame = pd.DataFrame
+Frame: TypeAlias = pd.DataFrame
 MEAN_TIME_SHIFT = (
     1e-5  # [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
 )

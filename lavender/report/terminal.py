@@ -116,7 +116,7 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
     notes = [Text(text, style=style) for text, style in _list_notes(report, MAX_NOTES if complete else 1)]
     if complete:
         for section in report.sections.values():
-            note = f" {section.note}" if section.note else ""
+            note = f": {section.note}" if section.note else ""
             console.print(Text.assemble("\n", (section.title, "bold"), note))
             print_table(console, section.table, grouped=section.file in ("runs", "sequences", "times"))
     else:
