@@ -362,26 +362,24 @@ def tabulate_changes(report: Report) -> Frame:
 
     Earlier times are multiplied by the change of the time of the loop of fixed work on the same case.
     """
-    old, new = report.earlier_frame, report.frame[report.frame["step"] < 0]
-    rows, keys = [], ["case", "sha", "solver"]
-    both = pd.merge(
-        *(f[f["mode"] == "tol"].astype(dict.fromkeys(keys, str)) for f in (old, new)), on=[*keys, "start"]
-    )
-    both = both[
-        (both["order_x"] == "given") & (both["order_y"] == "given") & (both["tol_x"] == both["tol_y"])
+    rows, keys = [], ["case", "sha", "solver", "start", "tol"]
+    frames = (report.earlier_frame, report.frame[report.frame["step"] < 0])
+    some = [
+        f[(f["mode"] == "tol") & (f["order"] == "given")].astype(dict.fromkeys(keys[:4], str)) for f in frames
     ]
+    both = pd.merge(*some, on=keys)
     drift = both.groupby("case")[["calibration_time_x", "calibration_time_y"]].median()
     drift = (drift["calibration_time_y"] / drift["calibration_time_x"]).fillna(1.0)
     for r in both.itertuples():
         before, after = (
-            t if x <= r.tol_x else math.inf
+            t if x <= r.tol else math.inf
             for t, x in ((r.time_x * drift[r.case], r.relative_x), (r.time_y, r.relative_y))
         )
         spread = 2.0 * (max(r.time_median_x / r.time_x, r.time_median_y / r.time_y) - 1.0)
         noise = 1.0 + max(MAX_NOISE, spread if math.isfinite(spread) else 0.0)
         if before != after and not before / noise <= after <= before * noise:
             kinds = ("lost", "reached") if math.inf in (before, after) else ("slower", "faster")
-            rows.append({"case": r.case, "solver": r.solver, "target": f"to {format_tolerance(r.tol_x)}",
+            rows.append({"case": r.case, "solver": r.solver, "target": f"to {format_tolerance(r.tol)}",
                          "before [s]": before, "now [s]": after, "change": kinds[int(after < before)]})  # fmt: skip
     return pd.DataFrame(rows).assign(compared=len(both)) if rows else pd.DataFrame({"compared": [len(both)]})
 
