@@ -15,6 +15,7 @@ from lavender.cli.options import (
     MultiValueCommand,
     is_option_set,
     limit_to_one_thread,
+    make_console,
     precision_option,
     print_escaped,
     threshold_option,
@@ -23,6 +24,12 @@ from lavender.cli.options import (
 if TYPE_CHECKING:
     from lavender.report.cases import Item
     from lavender.report.check import CrossCheck
+
+
+# Columns that a narrow terminal leaves out, in this order.
+NARROW_CHECK_OMITS = (
+    "objective [J]", "allowed [√J]", "floor", "distance [√J]", "what ran", "time [ms]", "relative",
+)  # fmt: skip
 
 
 @click.command(cls=MultiValueCommand)
@@ -71,6 +78,7 @@ def check(
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.report.check import cross_check
+    from lavender.report.terminal import print_table
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
@@ -93,7 +101,8 @@ def check(
             )
             stored = item.judge_stored_answer(precision, threshold)
             print_escaped(item.name, style="bold")
-            print_escaped(str(comparison))
+            print_escaped(comparison.description)
+            print_table(make_console(), comparison.table, optional=NARROW_CHECK_OMITS)
             if (exact := _describe_distances(item, comparison)) is not None:
                 print_escaped(exact)
             if stored is not None:

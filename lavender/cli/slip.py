@@ -10,6 +10,9 @@ from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_escaped
 from lavender.io.stored import check_figure_path, check_writable, write_figure
 
+# Columns that a narrow terminal leaves out, in this order.
+NARROW_SLIP_OMITS = ("steps x points", "coulomb [m/s]", "hard [m/s]", "disk [m/s]")
+
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
@@ -60,7 +63,7 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
         raise click.exceptions.Exit(EXIT_UNMET)
     if out is not None:
         write_figure(draw_slip(explanations), out)
-    print_table(make_console(), summarize_slip(explanations))
+    print_table(make_console(), summarize_slip(explanations), optional=NARROW_SLIP_OMITS)
     worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
     print_escaped(worst.sentence)
     if worst.remedies:

@@ -30,6 +30,7 @@ from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
+from lavender.report.table import Table
 from lavender.report.worker import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
@@ -173,16 +174,25 @@ class CrossCheck:
             for r in self.rows
         ]  # fmt: skip
 
+    @property
+    def table(self) -> Table:
+        """Table of the compared solvers."""
+        heads, *rows = self._cells
+        return Table(heads, rows, words=frozenset({"solver", "verdict", "status", "what ran"}))
+
+    @property
+    def description(self) -> str:
+        """Name and law of the problem, tolerance and reference."""
+        name = self.problem.name or f"{self.problem.m} rows"
+        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
+        return f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}"
+
     def __str__(self) -> str:
         widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
         lines = [
             "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in self._cells
         ]
-        name = self.problem.name or f"{self.problem.m} rows"
-        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
-        return "\n".join(
-            [f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}", *lines]
-        )
+        return "\n".join([self.description, *lines])
 
 
 def _format_number(x: float | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from lavender.report.table import Table
@@ -23,25 +23,33 @@ MIN_WORD_WIDTH = 9  # [columns] A column of words does not become narrower: "CON
 MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
 
 
-def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
+def print_table(
+    console: Console, table: Table, grouped: bool = False, cut: bool = False, optional: Sequence[str] = ()
+) -> None:
     """Print a table within the width of the terminal. Its texts are not read as markup.
 
     In a table that is too wide, heads and words fold and numbers stay whole. If that is not enough, each cell becomes
-    a line below the first cell of its row; with `cut`, the last columns are left out instead. `grouped` shows the
-    first cell only if it differs from the row above, and separates such groups. Columns without any text are left out.
+    a line below the first cell of its row; with `cut`, the last columns are left out instead. Before that, the columns
+    with the heads `optional` are left out one by one; then the words of the first column stay whole, too. `grouped`
+    shows the first cell only if it differs from the row above, and separates such groups. Columns without any text are
+    left out.
     """
     texts = table.cell_texts
     empty = [head for i, head in enumerate(table.heads) if texts and not any(row[i] for row in texts)]
     table = table.without_columns(*empty)
-    grid = _make_grid(table, grouped)
-    is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
-    while is_wide and _fold_words(grid, table) > console.width:
-        if not cut or len(table.heads) <= 2:
+    left_out = [head for head in optional if head in table.heads]
+    while True:
+        grid = _make_grid(table, grouped)
+        width = console.measure(grid, options=console.options.update(width=100_000)).maximum
+        if width <= console.width or _fold_words(grid, table, bool(optional)) <= console.width:
+            break
+        if left_out:
+            table = table.without_columns(left_out.pop(0))
+        elif cut and len(table.heads) > 2:
+            table = table.without_columns(table.heads[-1])
+        else:
             _print_rows_as_lines(console, table)
             return
-        table = table.without_columns(table.heads[-1])
-        grid = _make_grid(table, grouped)
-        is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
     console.print(grid, highlight=False)
 
 
@@ -67,8 +75,11 @@ def _make_grid(table: Table, grouped: bool) -> RichTable:
     return grid
 
 
-def _fold_words(grid: RichTable, table: Table) -> int:
-    """Let heads and columns of words fold, and return the smallest width at which numbers stay whole."""
+def _fold_words(grid: RichTable, table: Table, whole_first: bool = False) -> int:
+    """Let heads and columns of words fold, and return the smallest width at which numbers stay whole.
+
+    With `whole_first` the words of the first column stay whole, too.
+    """
     from rich.text import Text
 
     width = 2 * (len(table.heads) - 1)
@@ -80,7 +91,10 @@ def _fold_words(grid: RichTable, table: Table) -> int:
             column.header = Text("\n".join(lines))
         else:
             words = [word for text in (head, *texts) for word in text.split()]
-            smallest = min(MIN_WORD_WIDTH, max(map(len, words), default=1))
+            smallest = max(map(len, words), default=1)
+            if whole_first and not i:
+                column.width = smallest  # Rich narrows other columns only, so that none exceeds the terminal.
+            smallest = column.width or min(MIN_WORD_WIDTH, smallest)
             column.min_width, column.no_wrap, column.overflow = smallest, False, "fold"
         width += smallest
     return width

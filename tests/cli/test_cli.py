@@ -293,6 +293,22 @@ def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path
     assert "Traceback" not in done.stderr
 
 
+def test_check_in_a_narrow_terminal_keeps_solver_verdict_status_and_error(lavender, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, output, _ = lavender("check", "stack(n=4)", "--solvers", "newton", "block_gauss_seidel")
+    table = output.splitlines()[2:]
+    assert code == 0
+    assert (
+        "block_gauss_seidel" in output
+        and "velocities" in output
+        and "error" in output
+        and "objective [J]" not in output
+    )
+    assert max(len(line) for line in table if "distance of the impulses" not in line) <= 80
+    monkeypatch.setenv("COLUMNS", "300")
+    assert "objective [J]" in lavender("check", "stack(n=4)", "--solvers", "newton")[1]
+
+
 @pytest.mark.parametrize("command", ["audit", "tune"])
 def test_ctrl_c_before_the_first_result_ends_with_130_and_a_reason(tmp_path, monkeypatch, capsys, command):
     pytest.importorskip("mujoco")

@@ -48,3 +48,15 @@ def test_settings_are_shown_with_the_slip_that_they_leave(lavender, tmp_path):
     code, output, _ = lavender("slip", tmp_path / "slope.xml", "--steps", 100)
     assert code == 0 and '<option noslip_iterations="20"/> leaves the least slip' in " ".join(output.split())
     assert output.count("<option") == 4 and '<geom solref="0.004 1"/>' in output
+
+
+def test_a_narrow_terminal_keeps_names_and_causes_whole(lavender, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    long_name = "left_finger_of_the_long_gripper"
+    (tmp_path / "slope.xml").write_text(SLOPE.replace('"box" type', f'"{long_name}" type'))
+    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15)
+    assert code == 0, error
+    table = output.partition(" slides fastest")[0]
+    assert long_name in table and "engine" in table and "dominant" in table and "coulomb" not in table
+    assert {"load", "above", "friction", "limit"} <= set(table.split())  # The cause is wrapped and not cut.
+    assert max(map(len, table.splitlines()[:-1])) <= 80
