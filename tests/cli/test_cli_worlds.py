@@ -46,7 +46,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     assert "On other states they can be larger" in " ".join(out.split())
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
-    assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()
+    assert (tmp_path / "out" / "figures" / "time-and-error.svg").is_file()
 
 
 def test_tuning_to_a_limit_of_the_error(lavender, boxes, tmp_path, monkeypatch):

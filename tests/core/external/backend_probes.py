@@ -57,16 +57,11 @@ def is_near(x, solution):
 
 
 def find_triangle(name, sparse=None):
-    found = [
-        run_alone(name, P, [-1, -1], sparse, lb=[-9, -9], ub=[9, 9])
-        for P in ([[2, 1], [0, 2]], [[2, 0], [1, 2]])
-    ]
+    found = [run_alone(name, P, [-1, -1], sparse, lb=[-9, -9], ub=[9, 9]) for P in ([[2, 1], [0, 2]], [[2, 0], [1, 2]])]
     if any(isinstance(f, Exception) for f in found):
         return "none"
     sizes = {"both": [1 / 3] * 2, "one": [0.5] * 2, "mean": [0.4] * 2}
-    seen = [
-        next((k for k, v in sizes.items() if is_near(np.ravel(f.x), np.array(v))), "other") for f in found
-    ]
+    seen = [next((k for k, v in sizes.items() if is_near(np.ravel(f.x), np.array(v))), "other") for f in found]
     words = {("both", "one"): "upper", ("one", "both"): "lower", ("mean", "mean"): "mean"}
     return words.get(tuple(seen), "all")
 
@@ -105,9 +100,7 @@ def find_smallest(name):
 
 def find_far_bound(name):
     for far in FAR_BOUNDS:
-        found = run_alone(
-            name, [[2, 0.5], [0.5, 1]], [-1, -1], G=[[1, 1]], h=[1], lb=[-far, -far], ub=[far, far]
-        )
+        found = run_alone(name, [[2, 0.5], [0.5, 1]], [-1, -1], G=[[1, 1]], h=[1], lb=[-far, -far], ub=[far, far])
         if give_verdict(found, [0.25, 0.75]) != "right":
             return far
     return math.inf
@@ -131,9 +124,7 @@ BEHAVIOUR_PROBES = {
         run_alone(n, SADDLE, [0, 0], A=[[0, 1]], b=[0.5], lb=[-9, -9], ub=[9, 9]), [0, 0.5]
     ),
     "saddle": lambda n: give_verdict(run_alone(n, SADDLE, [0, 0], lb=[-1, -1], ub=[1, 2]), [0, 2]),
-    "unbounded": lambda n: give_verdict(
-        run_alone(n, np.diag([1, 0]), [0, -1], lb=[0, 0], ub=[np.inf, np.inf])
-    ),
+    "unbounded": lambda n: give_verdict(run_alone(n, np.diag([1, 0]), [0, -1], lb=[0, 0], ub=[np.inf, np.inf])),
     "infeasible_x": find_infeasible_x,
     "linear_term": find_linear_term,
     "small_part": find_small_part,
@@ -191,9 +182,7 @@ def solve_with_scs(solver=None, **start):
 
 def scs_needs_x_y_and_s():
     solution = solve_with_scs()[1]
-    count = {
-        k: solve_with_scs(**{n: solution[n] for n in k})[1]["info"]["iter"] for k in ("x", "xy", "xs", "xys")
-    }
+    count = {k: solve_with_scs(**{n: solution[n] for n in k})[1]["info"]["iter"] for k in ("x", "xy", "xs", "xys")}
     return count.pop("xys") == 0 and min(count.values()) > 0
 
 
@@ -207,9 +196,7 @@ def piqp_fails_with_unsorted_indices():
 
     P = sp.csc_matrix((np.array([1.0, 2.0, 2.0, 1.0]), np.array([1, 0, 1, 0]), np.array([0, 2, 4])))
     arrays = {"lb": np.full(2, -9.0), "ub": np.full(2, 9.0)}
-    found = [
-        qpsolvers.solve_problem(qpsolvers.Problem(M, -np.ones(2), **arrays), "piqp") for M in (P, P.toarray())
-    ]
+    found = [qpsolvers.solve_problem(qpsolvers.Problem(M, -np.ones(2), **arrays), "piqp") for M in (P, P.toarray())]
     return not found[0].found and give_verdict(found[1], [1 / 3, 1 / 3]) == "right"
 
 
