@@ -16,7 +16,8 @@
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
                      the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed
     factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
-                     cheapest first, each up to `budget_ratio` times its estimated cost
+                     cheapest first, each up to `budget_ratio` times its estimated cost, on large problems with friction
+                     a quarter more
     certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
                      constraints, for other problems under Coulomb's law by a linear program
     alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued where it stopped, with doubled
@@ -93,6 +94,9 @@ RELAXED_BUDGET_RATIO = 2.0
 # number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
 ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
 MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
+# On large problems with friction, the first turn of the factorising solvers is longer by this factor: the paths of
+# many heaps end between 1 and 1.25 times the budget of other problems.
+LARGE_BUDGET_FACTOR = 1.25
 # On large problems with friction, `admm` runs before the factorising solvers of a round, for this fraction of the cost
 # of a turn. It ends many solves from the best impulse of a path; 1 delays what a second turn of `newton` solves.
 EARLY_ADMM_FRACTION = 0.1
@@ -615,7 +619,7 @@ class DecisionTree:
             state = self.states.get("newton")
             cost = self.newton if state is None else state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        for stage in self.iterate_factorising_stages(ratio):
+        for stage in self.iterate_factorising_stages(LARGE_BUDGET_FACTOR * ratio if relaxed else ratio):
             if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
                 yield stage
         self.analyse_row_form_if_cheaper(ratio * self.newton)
