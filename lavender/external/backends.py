@@ -138,8 +138,9 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
             settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True, jax=True,
             finite=True,
-            behaviour=Behaviour("0.1.4", "mean", contradictory="wrong", convex_on_rows="not found", saddle="right",
-                infeasible_x="0", linear_term=0.5, far_bound=1e3, small_part=None)),
+            behaviour=Behaviour("0.1.4", "mean", repeated="wrong", contradictory="wrong", convex_on_rows="not found",
+                saddle="right", infeasible_x="0", linear_term=0.5, far_bound=1e3, small_part=None, notes={
+                "nan": "With two equal equality rows, NaN is reported as solved."})),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
             settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
