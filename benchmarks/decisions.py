@@ -49,8 +49,8 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     from lavender.base.deadline import Deadline
     from lavender.judge.residuals import get_zero_impulse_reference
     from lavender.problem import Problem
-    from lavender.solvers.small import get_call_time_fraction
     from lavender.solving.auto import DecisionTree
+    from lavender.solving.compiled_call import get_call_time_fraction
 
     def pile(n: int) -> Problem:
         return lv.suite.granular(n=n, friction="coulomb").problem

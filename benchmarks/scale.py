@@ -141,9 +141,9 @@ def measure(
         path = Path(temporary) / "problem.npz"
         problem.save(path)
         for name, python, folder, stages in tasks:
-            auto = measured.get("auto")
-            enough = name in CONTESTANTS and auto is not None and auto["solved"]
-            allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"])) if enough else limit
+            auto, allowed = measured.get("auto"), limit
+            if name in CONTESTANTS and auto is not None and auto["solved"]:
+                allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"]))
             load_per_core = os.getloadavg()[0] / (os.cpu_count() or 1)
             found = run_worker(python, folder, path, stages, allowed * max(1.0, load_per_core))
             if found:

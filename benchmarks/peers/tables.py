@@ -149,7 +149,9 @@ def means(results: Sequence[Result]) -> list[Mean]:
                 some = [c.ratios for c in of_size if c.target == target]
                 if some:
                     columns = [[x for x in column if math.isfinite(x)] for column in zip(*some, strict=True)]
-                    ours, scratch, auto = map(geometric_mean, columns)
+                    ours, scratch, auto = (
+                        geometric_mean(column) if column else math.nan for column in columns
+                    )
                     which = f"{group}, {size}"
                     out.append(
                         Mean(

@@ -233,7 +233,7 @@ class Audit:
     engine_warnings : Counter
         MuJoCo's own warnings, and how often each occurred.
     notes : str
-        Sentences about what differs from a simulation of the model as it is: no sleep, a smaller spread.
+        Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     n_quiet : (int, int)
         Number of worlds that diverged and were simulated again without noise, and how many of these then survived.
     contact_states : list of StepState

@@ -12,16 +12,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG
+from lavender.report.ranking import compute_mean
 from lavender.report.records import Records, escape_unprintable
-
-if TYPE_CHECKING:
-    from lavender.report.findings import Report
 
 _NUMERIC_KEYS = ("rows", "seconds", "relative")
 INSIDE = "inside the engine, warm-started, without copy and judge"
@@ -55,16 +53,16 @@ class EngineAnswers:
         """Return whether the source of a case is a file of the engine's folder."""
         return str(Path(source).parent) == self.source
 
-    def rank(self, report: Report, cases: Sequence[str]) -> dict[str, Any] | None:
+    def rank(
+        self, records: Records, cases: Sequence[str], tolerance: float, limit: float
+    ) -> dict[str, Any] | None:
         """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
-        from lavender.report.tables import compute_mean
-
-        sources = [report.records.cases[name].source for name in cases]
+        sources = [records.cases[name].source for name in cases]
         answers = [self.answers.get(Path(s).name) for s in sources if self.contains(s)]
         if not cases or None in answers or len(answers) < len(cases):
             return None
-        times = [t if x <= report.tolerance else math.inf for t, x in filter(None, answers)]
-        mean = float(compute_mean([t if math.isfinite(t) else report.limit for t in times]))
+        times = [t if x <= tolerance else math.inf for t, x in filter(None, answers)]
+        mean = float(compute_mean([t if math.isfinite(t) else limit for t in times]))
         solved = sum(map(math.isfinite, times))
         return {"solver": self.solver, "solved": solved, "cases": len(cases), "mean": mean}
 

@@ -85,8 +85,8 @@ def build_figures(report: Report) -> list[Figure]:
 
 def select_drawn_solvers(report: Report, frame: pd.DataFrame) -> list[str]:
     """Select the solvers that figures show: the best of the ranking, at most `MAX_CURVES`, and all plug-ins."""
+    from lavender.report.ranking import rank_solvers
     from lavender.report.recommendation import is_plug_in
-    from lavender.report.tables import rank_solvers
 
     ranking = [str(name) for name in rank_solvers(frame, report.tolerance, report.limit).index]
     plug_ins = [name for name in ranking if is_plug_in(name)]
@@ -99,7 +99,7 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
     A case without a result by that time counts with residual 1, as the zero impulse. Cases are single problems from a
     cold start; if there are only sequences, each step is a case. With `law`, its cases and all solvers are drawn.
     """
-    from lavender.report.tables import select_starts
+    from lavender.report.ranking import select_starts
 
     frame = report.frame[report.frame["law"] == law] if law else report.frame
     single = frame["step"] < 0
@@ -151,7 +151,8 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
 
 def build_cost_figure(report: Report) -> Figure:
     """Plot the time to the middle tolerance against the number of rows, with the fitted power of each solver."""
-    from lavender.report.tables import get_times, tabulate_costs
+    from lavender.report.ranking import get_times
+    from lavender.report.tables import tabulate_costs
 
     fits, target = tabulate_costs(report), format_tolerance(report.tolerance)
     times, curves = get_times(report.frame, report.tolerance), []
@@ -175,7 +176,7 @@ def build_profile_figure(report: Report) -> Figure:
 
     A case that a solver misses or does not accept counts with an infinite multiple.
     """
-    from lavender.report.tables import get_times
+    from lavender.report.ranking import get_times
 
     times = get_times(report.frame, report.tolerance)
     n, target = len(times.columns), format_tolerance(report.tolerance)

@@ -11,10 +11,10 @@ import pandas as pd
 
 from lavender.base.deadline import format_seconds
 from lavender.io.stored import SUFFIXES
+from lavender.report.contents import Contents
 from lavender.report.engine import INSIDE
-from lavender.report.findings import Report
+from lavender.report.ranking import STRUCTURE_ORDER, rank_solvers, select_ranked_runs
 from lavender.report.records import format_tolerance
-from lavender.report.tables import STRUCTURE_ORDER, rank_solvers, select_ranked_runs
 from lavender.report.text import format_count, format_left_out_count, format_residual
 from lavender.report.timing import format_call
 from lavender.solvers import registry
@@ -43,7 +43,7 @@ def is_plug_in(solver: str) -> bool:
     return spec is None or not spec.builtin
 
 
-def recommend(report: Report) -> tuple[Statement, ...]:
+def recommend(report: Contents) -> tuple[Statement, ...]:
     """Recommend a solver for all single cases together, then for the steps of all sequences.
 
     A campaign, which has no times, has no recommendation.
@@ -59,13 +59,20 @@ def recommend(report: Report) -> tuple[Statement, ...]:
     )
 
 
-def _recommend_for(report: Report, frame: pd.DataFrame) -> Statement:
+def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     """Recommend the first solver of the ranking on some cases, and name ties, misses, engine and plug-ins."""
     ranking = rank_solvers(frame, report.tolerance, report.limit)
     cases = list(frame["case"].unique())
     named = _describe_cases(report, cases)
     reached = f"down to {format_tolerance(report.tolerance)} of the error of the zero impulse"
-    engine = next((rank for e in report.engines if (rank := e.rank(report, cases)) is not None), None)
+    engine = next(
+        (
+            rank
+            for e in report.engines
+            if (rank := e.rank(report.records, cases, report.tolerance, report.limit)) is not None
+        ),
+        None,
+    )
     if not len(ranking) or not ranking["solved"].iloc[0]:
         stopped = "Stopped: no" if report.is_stopped else "No"
         return Statement(_add_engine(f"{stopped} solver brings {named} {reached}.", engine, None))
@@ -94,7 +101,7 @@ def _recommend_for(report: Report, frame: pd.DataFrame) -> Statement:
     return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
 
 
-def _describe_misses(report: Report, runs: pd.DataFrame, cases: Sequence[str], solver: str) -> str:
+def _describe_misses(report: Contents, runs: pd.DataFrame, cases: Sequence[str], solver: str) -> str:
     """Return the sentence on the cases that the recommended solver misses, each with its smallest residual."""
     own = runs[runs["solver"] == solver]
     left = own.groupby("case", observed=True)["relative"].min().reindex(list(cases))
@@ -122,7 +129,7 @@ def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
     return separator.join(texts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _describe_cases(report: Report, names: Sequence[str]) -> str:
+def _describe_cases(report: Contents, names: Sequence[str]) -> str:
     """Return words for cases: steps of sequences, built-in problems, or the structure that all of them have."""
     infos, lost = [report.records.cases[c] for c in names], report.records.left_out
     sequences = list(dict.fromkeys(i.sequence for i in infos if i.sequence))

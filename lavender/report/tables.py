@@ -17,123 +17,30 @@ import pandas as pd
 from lavender.base.deadline import format_seconds
 from lavender.judge.residuals import at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
+from lavender.report.ranking import (
+    MAX_NOISE,
+    PREFERRED_SOLVER,
+    get_times,
+    rank_solvers,
+    select_starts,
+)
 from lavender.report.records import Skip, describe_target, format_tolerance
 from lavender.report.text import format_count, format_residual
 
 if TYPE_CHECKING:
-    from lavender.report.findings import Report
+    from lavender.report.contents import Contents
 
 Frame: TypeAlias = pd.DataFrame
-MEAN_TIME_SHIFT = (
-    1e-5  # [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
-)
-# Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
-# the minimum, and within these bounds.
-MIN_NOISE, MAX_NOISE = 0.05, 0.25
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
 SERVED_QUANTILE = (
     0.9  # A solver is recommended for a time or budget if it serves at least this share of the cases.
 )
 RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
-PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
 DEATHS = ("ERROR", "KILLED", "CRASHED")
 MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = (
     4,
     4.0,
 )  # An exponent is fitted to at least so many cases and ratio of rows.
-STRUCTURE_ORDER = (
-    *("separate", "chain", "mesh", "stack", "pile", "dense"),
-    *("redundant", "friction", "large mass ratio", "asymmetric"),
-)
-
-
-# -- selection ---------------------------------------------------------------------------------------------
-
-
-def select_ranked_runs(frame: Frame) -> Frame:
-    """Return the runs that rankings count: to a tolerance, if there are any, in the order "given"."""
-    mode = "tol" if (frame["mode"] == "tol").any() else "budget"
-    return select_starts(frame[frame["mode"] == mode])
-
-
-def select_starts(frame: Frame) -> Frame:
-    """Return the runs from the start that counts: cold, or carried over the steps of a sequence."""
-    runs = frame[frame["order"] == "given"]
-    single = runs["step"] < 0
-    carries = runs["solver"].isin(runs.loc[runs["start"] == "carried", "solver"].unique())
-    start = runs["start"].astype(str)
-    return runs[np.where(single | ~carries, start == "cold", start == "carried")]
-
-
-def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
-    """Group single cases by structure, and steps by their sequence. A case is in the group of each of its words.
-
-    If the cases of a word have several laws, each law is a group: "pile, coulomb". Words of the same cases form one
-    group: "stack / friction".
-    """
-    cases = frame.drop_duplicates("case")[["case", "structure", "law", "sequence"]].astype(str)
-    single = cases[cases["sequence"] == ""]
-    words = single.assign(word=single["structure"].str.split(", ")).explode("word")
-    names: dict[tuple[str, ...], list[str]] = {}
-    order = {word: i for i, word in enumerate(STRUCTURE_ORDER)}
-    for word, some in sorted(words.groupby("word"), key=lambda x: (order.get(x[0], len(order)), x[0])):
-        laws = some["law"].value_counts().index
-        for law in laws:
-            members = tuple(some.loc[some["law"] == law, "case"])
-            names.setdefault(members, []).append(word if len(laws) == 1 else f"{word}, {law}")
-    groups = {" / ".join(words): list(members) for members, words in names.items()}
-    steps = cases[cases["sequence"] != ""].groupby("sequence")["case"].agg(list)
-    return {**groups, **{f"sequence {name}": members for name, members in steps.items()}}
-
-
-def compute_mean(times: Any, axis: int = -1) -> Any:
-    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`."""
-    return np.exp(np.log(np.asarray(times) + MEAN_TIME_SHIFT).mean(axis=axis)) - MEAN_TIME_SHIFT
-
-
-def get_times(frame: Frame, tolerance: float) -> Frame:
-    """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
-    return _get_times_of_runs(select_ranked_runs(frame), tolerance)
-
-
-def _get_times_of_runs(runs: Frame, tolerance: float) -> Frame:
-    """Compute `get_times` from ranked runs."""
-    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].assign(
-        time=lambda x: x["time"].fillna(0.0)
-    )
-    times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
-    return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
-
-
-def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
-    """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
-
-    Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
-
-    Returns
-    -------
-    DataFrame
-        By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `worst` [s], `hardest` (case), `tie`.
-    """
-    runs = select_ranked_runs(frame)
-    times = _get_times_of_runs(runs, tolerance)
-    ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"], observed=True).median()
-    false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
-    ranking = pd.DataFrame({
-        "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
-        "mean": compute_mean(times.fillna(limit)) if len(times.columns) else math.nan,
-        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
-        "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
-    }, index=times.index)  # fmt: skip
-    ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
-    first = ranking.iloc[:1]
-    equal = [ranking[name] == value for name in ("false", "solved") for value in first[name]]
-    noise = ranking["noise"].fillna(MIN_NOISE)
-    near = ranking["mean"] <= first["mean"].max() * (1.0 + np.maximum(noise, noise.iloc[:1].max()))
-    tie = np.logical_and.reduce([*equal, near, ranking["solved"] > 0]) if len(ranking) else []
-    preferred = ranking.index == PREFERRED_SOLVER
-    ranking = ranking.assign(tie=tie, later=~(preferred & tie))
-    return ranking.sort_values(["tie", "later"], ascending=[False, True], kind="stable").drop(columns="later")
 
 
 def count_solved(solved: int, cases: int) -> str:
@@ -144,7 +51,7 @@ def count_solved(solved: int, cases: int) -> str:
 # -- tables ------------------------------------------------------------------------------------------------
 
 
-def tabulate_fastest(report: Report) -> Frame:
+def tabulate_fastest(report: Contents) -> Frame:
     """Tabulate the fastest solver to each tolerance by structure and sequence, with the solvers that tie with it."""
     rows = []
     for name, cases in report.structures.items():
@@ -164,7 +71,7 @@ def tabulate_fastest(report: Report) -> Frame:
     return pd.DataFrame(rows)
 
 
-def tabulate_times(report: Report) -> Frame:
+def tabulate_times(report: Contents) -> Frame:
     """Tabulate the mean time of each solver to each tolerance by law, and the number of cases that reach it."""
     tables = []
     for law, some in report.frame.groupby("law", observed=True):
@@ -183,7 +90,7 @@ def tabulate_times(report: Report) -> Frame:
     return table.drop(columns=[c for c in table if c.startswith("time")]) if report.is_campaign else table
 
 
-def tabulate_cases(report: Report) -> Frame:
+def tabulate_cases(report: Contents) -> Frame:
     """Tabulate each case: size, fastest solver to the middle tolerance, and residual of its stored answer."""
     times = get_times(report.frame, report.tolerance)
     false = report.frame[report.frame["claim_check"] == CONTRADICTED]
@@ -202,7 +109,7 @@ def tabulate_cases(report: Report) -> Frame:
     return table if any(row["stored answer [-]"] for row in rows) else table.iloc[:, :-1]
 
 
-def tabulate_runs(report: Report) -> Frame:
+def tabulate_runs(report: Contents) -> Frame:
     """Tabulate the time to each tolerance, smallest residual, status and claim of each solver on each case."""
     runs = report.frame[(report.frame["order"] == "given") & (report.frame["step"] < 0)]
     keys = ["case", "solver", "start"]
@@ -226,7 +133,7 @@ def tabulate_runs(report: Report) -> Frame:
     ).drop(columns="start")
 
 
-def tabulate_claims(report: Report) -> Frame:
+def tabulate_claims(report: Contents) -> Frame:
     """Tabulate how many claims of each solver the judge confirms."""
     f = report.newest
     counts = pd.DataFrame({
@@ -241,7 +148,7 @@ def tabulate_claims(report: Report) -> Frame:
     return table
 
 
-def select_failures(report: Report) -> Frame:
+def select_failures(report: Contents) -> Frame:
     """Return runs that missed their tolerance above the round-off floor, that died, and false claims."""
     f = report.frame
     floor = [at_floor(x, y) for x, y in zip(f["relative"], f["roundoff_floor"], strict=True)]
@@ -251,7 +158,7 @@ def select_failures(report: Report) -> Frame:
     return f[missed | died | (f["claim_check"] == CONTRADICTED)]
 
 
-def tabulate_failures(report: Report) -> Frame:
+def tabulate_failures(report: Contents) -> Frame:
     """Tabulate failed runs with the row of the largest error and the reason."""
     f = select_failures(report)
     conflict = f["status_conflict"].astype(str)
@@ -265,7 +172,7 @@ def tabulate_failures(report: Report) -> Frame:
     })  # fmt: skip
 
 
-def tabulate_costs(report: Report) -> Frame:
+def tabulate_costs(report: Contents) -> Frame:
     """Tabulate how the time to the middle tolerance grows with the number of rows: time = a rows^exponent.
 
     The exponent is fitted to the logarithms of the cases that a solver solves.
@@ -289,7 +196,7 @@ def tabulate_costs(report: Report) -> Frame:
     return pd.DataFrame(rows).sort_values("fit at 1000 rows [s]") if rows else pd.DataFrame()
 
 
-def tabulate_budgets(report: Report) -> Frame:
+def tabulate_budgets(report: Contents) -> Frame:
     """Tabulate the residual of each solver after fixed numbers of iterations: median and 90th percentile."""
     runs = select_starts(report.frame[report.frame["mode"] == "budget"])
     groups = runs.groupby(["solver", "max_iter"], observed=True)["relative"]
@@ -299,7 +206,7 @@ def tabulate_budgets(report: Report) -> Frame:
     return table.rename_axis("solver").reset_index() if len(runs) else pd.DataFrame()
 
 
-def tabulate_in_time(report: Report) -> Frame:
+def tabulate_in_time(report: Contents) -> Frame:
     """Tabulate the solver with the smallest residual within each time by structure; none if it serves too few cases."""
     runs, rows = select_starts(report.frame), []
     for name, cases in report.structures.items():
@@ -317,7 +224,7 @@ def tabulate_in_time(report: Report) -> Frame:
     return pd.DataFrame(rows)
 
 
-def tabulate_sequences(report: Report) -> Frame:
+def tabulate_sequences(report: Contents) -> Frame:
     """Tabulate the time and iterations of all steps of each sequence, cold and with carried (warm) impulses."""
     runs = report.frame[(report.frame["step"] >= 0) & (report.frame["order"] == "given")].astype(
         {"start": str}
@@ -337,13 +244,13 @@ def tabulate_sequences(report: Report) -> Frame:
     return out
 
 
-def tabulate_engines(report: Report) -> Frame:
+def tabulate_engines(report: Contents) -> Frame:
     """Tabulate engines' own answers, and the fastest solver here on the same cases, to the middle tolerance."""
     target, rows = f"to {format_tolerance(report.tolerance)}", []
     for e in report.engines:
         cases = [n for n, i in report.records.cases.items() if e.contains(i.source)]
         ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance, report.limit)
-        engine = e.rank(report, cases)
+        engine = e.rank(report.records, cases, report.tolerance, report.limit)
         first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
         rows.append({
             "recorded": e.folder, "steps": e.steps, "not recorded": e.left_out, "rows": e.rows,
@@ -357,7 +264,7 @@ def tabulate_engines(report: Report) -> Frame:
     return pd.DataFrame(rows)
 
 
-def tabulate_changes(report: Report) -> Frame:
+def tabulate_changes(report: Contents) -> Frame:
     """Tabulate times to a tolerance that differ from an earlier run beyond noise, on cases with the same numbers.
 
     Earlier times are multiplied by the change of the time of the loop of fixed work on the same case.
@@ -384,7 +291,7 @@ def tabulate_changes(report: Report) -> Frame:
     return pd.DataFrame(rows).assign(compared=len(both)) if rows else pd.DataFrame({"compared": [len(both)]})
 
 
-def tabulate_idle(report: Report) -> Frame:
+def tabulate_idle(report: Contents) -> Frame:
     """Tabulate cases that the zero impulse solves, with the largest error of any solver, in units."""
     idle = report.newest[report.newest["nothing_to_do"].astype(bool)].sort_values("velocity")
     idle = idle.drop_duplicates("case", keep="last")
@@ -395,11 +302,3 @@ def tabulate_idle(report: Report) -> Frame:
 def tabulate_skips(skips: Iterable[Skip]) -> Frame:
     """Tabulate pairs of case and solver that did not run, or not to the end, with the reason."""
     return pd.DataFrame([{"case": s.case, "solver": s.solver, "reason": s.reason} for s in skips])
-
-
-def choose_time_budgets(times: Frame) -> tuple[float, ...]:
-    """Return three decades of time [s] about the median over the cases of the fastest time."""
-    fastest = times.min().dropna()
-    fastest = fastest[fastest > 0.0]
-    middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
-    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-__all__ = ["DECISIONS", "NUMBERS", "Number", "describe_numbers"]
+__all__ = ["DECISIONS", "NUMBERS", "SMALL_ROWS", "Number", "describe_numbers"]
 
 
 class Number(NamedTuple):
@@ -78,6 +78,9 @@ NUMBERS = (
 DECISIONS: Any = SimpleNamespace(
     **{number.name: number.value for number in NUMBERS}
 )  # The values as attributes.
+# Up to this many rows, the compiled call `SolverSpec.small` is tried first, because Python's overhead dominates a
+# solve.
+SMALL_ROWS = int(DECISIONS.small_rows)
 
 
 def describe_numbers() -> str:

@@ -22,7 +22,6 @@ from lavender.judge.solution import Claim
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.costs import Cost
-from lavender.solvers.decisions import DECISIONS
 
 if TYPE_CHECKING:
     from lavender.solvers.small import SmallCall
@@ -30,9 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
-# Up to this many rows, the compiled call `SolverSpec.small` is tried first, because Python's overhead dominates a
-# solve.
-SMALL_ROWS = int(DECISIONS.small_rows)
 # Modules with the SPECS that are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
 

@@ -22,16 +22,11 @@ from lavender.judge.solution import Claim, SolverStage, Status, format_work_coun
 from lavender.problem import Problem
 from lavender.solvers.costs import (
     RATES,
-    estimate_formation_cost,
-    estimate_judge_setup_cost,
-    estimate_pass_cost,
-    get_loose_limit,
 )
-from lavender.solvers.decisions import DECISIONS
+from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
-from lavender.solvers.registry import SMALL_ROWS, get
 from lavender_ext.batch.many import Limits, solve_new_generalized_problem
 from lavender_ext.small.call import Islands, Rules, Small
 
@@ -86,26 +81,6 @@ def make_limits(
             ]
         )
     )
-
-
-def get_call_time_fraction(problem: Problem, seconds: float) -> float:
-    """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
-
-    With at most SMALL_ROWS rows, the call may use all of the time. Larger problems may fail in the call, so it may use
-    only a fraction of the time, into which its set-up must fit. The kernel stops at the estimated cost of this time.
-    """
-    if seconds == inf or len(problem.b) <= SMALL_ROWS:
-        return 1.0
-    if problem.generalized is None and problem.law in ("linear", "lcp"):
-        return 0.0
-    if 1e9 * seconds > get_loose_limit(problem):
-        return DECISIONS.time_share
-    if problem.generalized is not None:
-        cost = estimate_judge_setup_cost(problem) + estimate_pass_cost(problem)
-    else:
-        sweeps = MAX_SWEEPS_BEFORE_FACTOR * get("anderson").load()().cost(problem).iteration
-        cost = RATES["island row"] * problem.m + estimate_formation_cost(problem) + sweeps
-    return DECISIONS.time_share if 1e-9 * cost <= DECISIONS.time_share * seconds else 0.0
 
 
 def get_small_call(problem: Problem) -> Any:

@@ -75,11 +75,8 @@ from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import Solver, SolverSpec, get
-from lavender.solvers.small import (
-    AUTO,
-    NO_TIME_MESSAGE,
-    get_call_time_fraction,
-)
+from lavender.solvers.small import AUTO, NO_TIME_MESSAGE
+from lavender.solving.compiled_call import get_call_time_fraction
 from lavender.solving.log import Recorder, SolveLog, get_relaxation
 from lavender.solving.loop import Loop
 from lavender.solving.singular_programs import program_backends, run_program_backends

@@ -11,14 +11,42 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
 from lavender.problem import Problem
-from lavender.solvers.registry import SMALL_ROWS, SolverSpec
-from lavender.solvers.small import get_call_time_fraction
+from lavender.solvers.costs import (
+    RATES,
+    estimate_formation_cost,
+    estimate_judge_setup_cost,
+    estimate_pass_cost,
+    get_loose_limit,
+)
+from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
+from lavender.solvers.registry import SolverSpec, get
+from lavender.solvers.small import MAX_SWEEPS_BEFORE_FACTOR
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
 from lavender_ext.judge.measure import all_finite
 
 COST_PER_SECOND = 0.9e9  # [ns/s] Estimated cost that a compiled call may have per second of its time limit.
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
+
+
+def get_call_time_fraction(problem: Problem, seconds: float) -> float:
+    """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
+
+    With at most SMALL_ROWS rows, the call may use all of the time. Larger problems may fail in the call, so it may use
+    only a fraction of the time, into which its set-up must fit. The kernel stops at the estimated cost of this time.
+    """
+    if seconds == math.inf or len(problem.b) <= SMALL_ROWS:
+        return 1.0
+    if problem.generalized is None and problem.law in ("linear", "lcp"):
+        return 0.0
+    if 1e9 * seconds > get_loose_limit(problem):
+        return DECISIONS.time_share
+    if problem.generalized is not None:
+        cost = estimate_judge_setup_cost(problem) + estimate_pass_cost(problem)
+    else:
+        sweeps = MAX_SWEEPS_BEFORE_FACTOR * get("anderson").load()().cost(problem).iteration
+        cost = RATES["island row"] * problem.m + estimate_formation_cost(problem) + sweeps
+    return DECISIONS.time_share if 1e-9 * cost <= DECISIONS.time_share * seconds else 0.0
 
 
 def solve_small(

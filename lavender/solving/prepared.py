@@ -45,8 +45,9 @@ from lavender.solvers.costs import (
     SCIPY_MODULES,
     estimate_import_cost,
 )
+from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
-from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
+from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, create_unjudged, decide_empty_rows, finish, name_lost_row
 from lavender.solving.limits import (

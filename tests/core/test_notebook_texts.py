@@ -50,7 +50,7 @@ def test_plot_shows_the_worst_rows_and_the_history(solution):
         solution.plot(rows=0)
 
 
-@pytest.mark.parametrize("name", ["io", "bench", "suite", "report", "contract", "export", "engine", "scene"])
+@pytest.mark.parametrize("name", ["io", "suite", "report", "contract", "export", "engine", "scene"])
 def test_completion_of_a_namespace_shows_public_names_only(name):
     module = importlib.import_module(getattr(lv, name).__name__)
     assert dir(module) == sorted(module.__all__)

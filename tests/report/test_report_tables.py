@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lavender.base.deadline import format_seconds
-from lavender.report import Report, tables
+from lavender.report import Report, ranking, tables
 from lavender.report.engine import read_engine_answers
 from lavender.report.recommendation import recommend
 from lavender.report.table import Cell, Table
@@ -16,7 +16,7 @@ from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, records_of
 
 
 def rank(*made, tolerance=1e-6, **more):
-    return tables.rank_solvers(Report(records_of(*made, **more)).frame, tolerance, 2.0)
+    return ranking.rank_solvers(Report(records_of(*made, **more)).frame, tolerance, 2.0)
 
 
 def test_get_times_loose_tolerance_and_budgets_do_not_count():
@@ -26,9 +26,9 @@ def test_get_times_loose_tolerance_and_budgets_do_not_count():
         record("a", "pgs", 1e-6, 1e-9, **BUDGET),
     ]
     frame = Report(records_of(*made)).frame
-    assert tables.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
-    assert tables.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
-    assert math.isnan(tables.get_times(frame, 1e-9).loc["pgs", "a"])
+    assert ranking.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
+    assert ranking.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
+    assert math.isnan(ranking.get_times(frame, 1e-9).loc["pgs", "a"])
 
 
 def test_rank_solvers_solved_cases_come_before_time_and_false_claims_last():
@@ -185,7 +185,7 @@ def test_recommend_names_worst_case_ties_misses_and_the_call():
     made = [record(c, s, t, 1e-8) for c in "abc" for s, t in (("auto", 1e-3), ("direct", 1.0001e-3))]
     made += [record("d", s, 1.0, 1e-2) for s in ("auto", "direct")]
     (statement,) = recommend(Report(records_of(*made)))
-    mean = format_seconds(tables.compute_mean([1e-3, 1e-3, 1e-3, 2.0]))
+    mean = format_seconds(ranking.compute_mean([1e-3, 1e-3, 1e-3, 2.0]))
     assert statement.text == (
         f"Use auto: it solves 3 of your 4 stacks in {mean} on average (a miss counted as 2.00 s), cold, down to 1e-6 "
         f"of the error of the zero impulse. As fast within the noise of the repetitions: direct ({mean}). It misses d "
@@ -250,12 +250,12 @@ def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
     text = recommend(report)[0].text
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
-    mean = tables.compute_mean([t if x <= 1e-6 else 2.0 for t, x in answers])
+    mean = ranking.compute_mean([t if x <= 1e-6 else 2.0 for t, x in answers])
     expected = f"solves {solved} of 2 in {format_seconds(mean)}" if solved else "solves none of them"
     assert expected in text
     (row,) = tables.tabulate_engines(report).to_dict("records")
     assert row["first here"] == "auto" and row["first to 1e-6 [s]"] == pytest.approx(
-        tables.compute_mean([4e-5, 8e-5])
+        ranking.compute_mean([4e-5, 8e-5])
     )
     assert math.isnan(row["own to 1e-6 [s]"]) == (solved == 0)
 

@@ -13,7 +13,7 @@ from random_problems import as_matrix, general, random_generalized_problem, rand
 import lavender as lv
 from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
-from lavender.solvers import costs
+from lavender.solvers import costs, decisions
 from lavender.solving.auto import METHODS, DecisionTree, Stage, starts_relaxed
 
 
@@ -69,7 +69,7 @@ def test_each_line_is_reached_and_named(name):
     assert [name for name in methods if registry.get(name).refuses(problem)] == []
     found = lv.prepare(make(), "auto").solve(tol=1e-6)
     assert found.success
-    compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= registry.SMALL_ROWS else set()
+    compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= decisions.SMALL_ROWS else set()
     searched = (
         {"least"} if set(expected) & {"newton", "newton over rows"} and problem.generalized is not None else set()
     )  # least violation

@@ -50,7 +50,7 @@ class Tuning:
     busy : str
         A warning if other processes used the processors during the timing; else empty.
     notes : str
-        Sentences about what differs from a simulation of the model as it is: no sleep, a smaller spread.
+        Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     n_held_worlds : int
         Number of worlds held back.
     error_limit : float, m/s, optional

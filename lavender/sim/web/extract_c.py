@@ -44,7 +44,7 @@ PROLOGUE = """\
 #include <string.h>
 
 #if defined(__FAST_MATH__) || (defined(_MSC_VER) && defined(_M_FP_FAST))
-#error "lavender: -ffast-math changes what the kernels compute; build lavender.c without it"
+#error "lavender: -ffast-math changes the results of the kernels; build lavender.c without it"
 #endif
 #if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD > 1
 #error "lavender: registers wider than float64 change what the kernels compute; on x86 build with -msse2 -mfpmath=sse"

@@ -20,6 +20,7 @@ import lavender as lv
 from lavender import contract, registry
 from lavender.base.errors import TooLarge
 from lavender.problem import operators
+from lavender.solvers import decisions
 from lavender.solving import auto
 
 OURS = lv.available(external=False)
@@ -246,7 +247,7 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
         raise error
 
     problem = random_contact_problem(3, contacts=60, bodies=20, friction="coulomb")
-    assert problem.m > registry.SMALL_ROWS
+    assert problem.m > decisions.SMALL_ROWS
     kinds = {auto.Newton, auto.Step, auto.Iterations, auto.Sweeps}
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
