@@ -98,8 +98,7 @@ def test_the_test_of_the_quick_start_passes_as_a_file_of_its_own(tmp_path):
     (text,) = (text for *_, text in blocks(ROOT / "docs" / "quickstart.md", "python") if "import pytest" in text)
     path = tmp_path / "test_mine.py"
     path.write_text(text, encoding="utf-8")
-    without = ("-p", "no:cacheprovider", "-p", "no:lavender-phenomena")  # the second as in pyproject.toml
-    assert "6 passed" in python("-m", "pytest", "-q", *without, path, cwd=tmp_path).stdout
+    assert "6 passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", path, cwd=tmp_path).stdout
 
 
 @pytest.mark.parametrize("name", list(modules_with_doctests()))
