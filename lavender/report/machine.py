@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib.util
 import json
 import os
 import platform
@@ -21,6 +22,7 @@ from typing import Any
 from lavender._version import __version__
 from lavender.base.errors import require_packages
 from lavender.report.records import Run
+from lavender.solvers import registry
 from lavender_ext.sweep import serial
 
 # The processes of backends may use this fraction of the machine's memory together.
@@ -147,7 +149,7 @@ def get_processor_clock() -> dict[str, str]:
 
 @cache
 def describe_build() -> dict[str, str]:
-    """Describe the build: commit of a checkout, hash of the kernels, compiler, flags, BLAS."""
+    """Describe the build: commit of a checkout, hashes of kernels and solvers, compiler, flags, BLAS."""
     package = Path(__file__).resolve().parents[1]
     library = Path(str(serial.__file__))
     found = {"commit": commit} if (commit := get_commit(package.parent)) else {}
@@ -155,6 +157,7 @@ def describe_build() -> dict[str, str]:
     for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
         kernels.update(path.read_bytes())
     found["kernels"] = kernels.hexdigest()[:12]
+    found["solvers"] = hash_solver_sources()
     found |= read_compiler_versions(library.read_bytes())
     flags = sysconfig.get_config_var("CFLAGS")
     found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
@@ -163,6 +166,19 @@ def describe_build() -> dict[str, str]:
 
     blas = [f"{i['internal_api']} {i['version']}" for i in threadpool_info() if i.get("user_api") == "blas"]
     return found | {"blas": ", ".join(sorted(set(blas)))}
+
+
+def hash_solver_sources() -> str:
+    """Return a hash of the source files of all registered solvers, plug-ins included."""
+    sources = hashlib.sha256()
+    for name, spec in sorted(registry.specs().items()):
+        factory = spec.factory
+        module = factory.partition(":")[0] if isinstance(factory, str) else factory.__module__
+        with contextlib.suppress(ImportError, ValueError, OSError):  # no such module, or one without a file
+            found = importlib.util.find_spec(module)
+            if found is not None and found.origin is not None:
+                sources.update(name.encode() + Path(found.origin).read_bytes())
+    return sources.hexdigest()[:12]
 
 
 def get_commit(root: Path) -> str:

@@ -52,8 +52,8 @@ from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augm
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
                                       PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
-                                      compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
-                                      is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
+                                      compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
+                                      is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
 from lavender_ext.newton.system cimport (BARRIER, BODIES, SPARSE, factor_newton_system, multiply_system_matrix,

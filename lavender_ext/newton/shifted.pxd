@@ -179,8 +179,8 @@ cdef inline bint update_shift(newton_t* n) noexcept nogil:
 cdef inline double find_line_minimum(newton_t* n, double slope) noexcept nogil:
     """Return t of (2) to a tenth of the slope at t = 0."""
     cdef double low = 0.0, high = 1.0, t = 1.0, now
-    cdef int32_t i
-    for i in range(MAX_BISECTIONS):
+    cdef int32_t _
+    for _ in range(MAX_BISECTIONS):
         evaluate_shifted_map(n, t, False)
         now = dot(n.hdz, n.r, n.s.e.m)
         if fabs(now) <= 0.1 * fabs(slope):

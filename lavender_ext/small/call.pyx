@@ -364,7 +364,7 @@ cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_
 
 cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
                             const int32_t* place) noexcept nogil:
-    """Copy the island's entries of A."""
+    """Copy the entries of A between the island's rows; other entries, zeros of immovable bodies, have a place of -1."""
     cdef int32_t i, k, q, row, at = 0, n = 0
     cdef int32_t* indptr = <int32_t*>x.a.indptr
     indptr[0] = 0
@@ -372,9 +372,10 @@ cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t*
         i = block[k]
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(a.indptr[row], a.indptr[row + 1]):
-                (<int32_t*>x.a.indices)[at] = place[a.indices[q]]
-                (<double*>x.a.data)[at] = a.data[q]
-                at += 1
+                if place[a.indices[q]] >= 0:
+                    (<int32_t*>x.a.indices)[at] = place[a.indices[q]]
+                    (<double*>x.a.data)[at] = a.data[q]
+                    at += 1
             n += 1
             indptr[n] = at
 
@@ -520,16 +521,21 @@ cdef class Islands(Small):
         Small.__init__(self, data, over)
         self.count = count
         cdef const int32_t* ptr = over.blocks.ptr
-        cdef int32_t i, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
+        cdef int32_t i, q, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
         self.size, self.block = np.zeros((self.count, N_SIZES), np.int32), np.empty(k, np.int32)
         cdef int32_t[:, ::1] size = self.size
         cdef int32_t[::1] block = self.block, first = np.empty(self.count + 1, np.int32)
+        cdef int32_t[::1] island = np.empty(ptr[k], np.int32)       # of each row
+        for i in range(k):
+            for q in range(ptr[i], ptr[i + 1]):
+                island[q] = label[i]
         for i in range(k):
             rows = ptr[i + 1] - ptr[i]
             size[label[i], 0] += rows
             size[label[i], 1] += 1
             if not over.factored:
-                size[label[i], 2] += over.csr.indptr[ptr[i + 1]] - over.csr.indptr[ptr[i]]
+                for q in range(over.csr.indptr[ptr[i]], over.csr.indptr[ptr[i + 1]]):
+                    size[label[i], 2] += island[over.csr.indices[q]] == label[i]
             if i < joints:
                 size[label[i], 3] += rows
                 size[label[i], 4] += 1
@@ -560,7 +566,7 @@ cdef class Islands(Small):
         cdef const int32_t[::1] block = self.block
         cdef const int32_t[:, ::1] size = self.size     # N_SIZES of each island
         cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
-        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, integers, number, body
+        cdef int32_t[::1] place = np.full(p.n_rows, -1, np.int32), at, order, integers, number, body
         cdef double[::1] numbers, work
         cdef int32_t i, j, q, m, k, n = -1, first = 0
         cdef int64_t swept, read, unchecked = 0
@@ -615,5 +621,6 @@ cdef class Islands(Small):
                 for j in range(k):
                     q = block[first + j]
                     memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
+                    memset(&place[p.ptr[q]], 255, (p.ptr[q + 1] - p.ptr[q]) * sizeof(int32_t))     # -1: in no island
                 first += k
         return good

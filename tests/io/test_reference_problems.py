@@ -86,6 +86,13 @@ def test_exact_solvers_end_on_every_problem_without_friction(problem_dir, solver
             assert found.success or found.status is lv.Status.ROUNDOFF_LIMIT, (name, found)
 
 
+@pytest.mark.parametrize("name", [n for n in FILES if n.endswith(".hdf5")] or [pytest.param("", id="no folder")])
+def test_auto_solves_every_reference_problem_with_friction(problem_dir, name):
+    """In one of them, A has stored zeros between the rows of islands on an immovable body."""
+    found = lv.solve(lavender.io.load(problem_dir / name), "auto", tol=1e-6)
+    assert good(found, 1e-6), found
+
+
 #: Real friction problems on which 20,000 sweeps fail or take thousands.
 HARD = ["fc3d_2cubes_t0", "fc3d_OneObject-i100000-499", "fc3d_LMGC_100_PR_PerioBox-i00361-60-03000"]
 

@@ -583,3 +583,16 @@ def test_list_steps_are_in_numeric_order(tmp_path):
     steps = cases.list_steps_in_folder(tmp_path)
     assert [item.source.rpartition("_")[2] for item in steps] == ["1.npz", "9.npz", "10.npz"]
     assert [i.sequence for i in report.resolve_sources([tmp_path])] == ["", "", ""]  # No blocks are named.
+
+
+def test_records_of_a_plug_in_with_changed_code_are_measured_again(tmp_path, monkeypatch, register):
+    path = tmp_path / "edited_solver.py"
+    path.write_text("from lavender.solvers.pgs import ProjectedGaussSeidel as Edited\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register(
+        lv.SolverSpec("edited", "edited_solver:Edited", laws=("lcp",), summary="of a test", max_iter=200)
+    )
+    before = machine.hash_solver_sources()
+    assert machine.hash_solver_sources() == before
+    path.write_text(path.read_text() + "# changed\n")
+    assert machine.hash_solver_sources() != before

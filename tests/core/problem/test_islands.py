@@ -20,6 +20,7 @@ from random_problems import (
 )
 
 import lavender as lv
+from benchmarks.core_problems import forms, stacks
 from lavender.problem.ordering import compute_block_colors, compute_block_levels_from_ground
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import get
@@ -281,3 +282,19 @@ def test_find_islands_stored_zero_of_matrix_connects_nothing():
     a = sp.csr_array((np.array([2.0, 0.0, 0.0, 2.0]), np.array([0, 1, 0, 1]), np.array([0, 2, 4])), shape=(2, 2))
     assert a.nnz == 4
     assert find_islands(lv.Problem.lcp(a, [1.0, 1000.0]))[0] == 2
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+def test_solve_stored_zeros_between_islands_with_friction_have_no_effect(law):
+    """Forty small stacks over A with an entry for each pair of rows: the compiled call copies each island out of A."""
+    sparse = forms(stacks(40, 2, 0.4, False, 1))["matrix"].relaxed(law)
+    m = sparse.m
+    stored = (sparse.csr.toarray().ravel(), np.tile(np.arange(m), m), np.arange(0, m * m + 1, m))
+    full = lv.Problem(sparse.b, sparse.cones, sp.csr_array(stored, shape=(m, m)), friction=sparse.friction).relaxed(law)
+    assert full.csr.nnz == m * m
+    assert find_islands(full)[0] == 40
+    for name in ("auto", "newton", "anderson", "admm"):
+        one, other = (lv.solve(p, name, tol=1e-8) for p in (sparse, full))
+        assert one.success and other.success, name
+        # Both are solutions to 1e-8 of impulses up to 1 N s; A is well conditioned.
+        np.testing.assert_allclose(other.impulse, one.impulse, atol=1e-6)
