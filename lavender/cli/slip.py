@@ -65,6 +65,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
         write_figure(draw_slip(explanations), out)
     print_table(make_console(), summarize_slip(explanations), optional=NARROW_SLIP_OMITS)
     worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
-    print_escaped(worst.sentence)
+    n = next(i for i, e in enumerate(explanations, 1) if e is worst)
+    place = f"State {n} of {len(explanations)} with contact: " if len(explanations) > 1 else ""
+    print_escaped(place + worst.sentence)
     if worst.remedies:
         print_table(make_console(), worst.remedies_table)

@@ -159,14 +159,13 @@ class ProblemData:
             get_shape("key", self.key)
             check_unmasked("key", self.key)
             key = np.asarray(self.key)
-            if (
-                key.shape != (k,)
-                or key.dtype.kind not in "ui"
-                or (key.dtype.kind == "i" and key.size and key.min() < 0)
-            ):
+            if key.shape != (k,) or key.dtype.kind not in "ui":
                 raise InputError(
-                    f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed"
+                    f"key has shape {key.shape} and dtype {key.dtype}; ({k},) integers are needed"
                 )
+            if key.dtype.kind == "i" and key.size and key.min() < 0:
+                i = int(key.argmin())
+                raise InputError(f"key has {key[i]} at [{i}]; integers from 0 to 2**64 - 1 are needed")
             put(self, "key", mark_read_only(key.astype(np.uint64)))
         if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
             put(self, "names", as_names("blocks", self.names, k))

@@ -1,5 +1,6 @@
 """`lavender slip`."""
 
+import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -60,3 +61,16 @@ def test_a_narrow_terminal_keeps_names_and_causes_whole(lavender, tmp_path, monk
     assert long_name in table and "engine" in table and "dominant" in table and "coulomb" not in table
     assert {"load", "above", "friction", "limit"} <= set(table.split())  # The cause is wrapped and not cut.
     assert max(map(len, table.splitlines()[:-1])) <= 80
+
+
+def test_the_sentence_names_the_state_of_several(lavender, tmp_path):
+    """The second state is in the air; the third slides fastest."""
+    (tmp_path / "slope.xml").write_text(SLOPE)
+    qpos = np.tile([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0], (3, 1))
+    qpos[1, 2] = 5.0
+    qvel = np.zeros((3, 6))
+    qvel[2, 0] = 1.0
+    np.savez(tmp_path / "states.npz", qpos=qpos, qvel=qvel)
+    code, output, error = lavender("slip", tmp_path / "slope.xml", "--states", tmp_path / "states.npz")
+    assert code == 0, error
+    assert "State 2 of 2 with contact: " in output

@@ -124,15 +124,18 @@ class Tuning:
     def within_limit(self) -> Measured | None:
         """Fastest setting with no error above `error_limit`, also on the worlds held back if it was judged there.
 
-        If the present setting takes the same time within noise, it is returned. The result is None if all settings
-        exceed the limit, or without a limit.
+        Of settings that take the same time within noise, the present one is returned, else the most accurate. The
+        result is None if all settings exceed the limit, or without a limit.
         """
         if self.error_limit is None:
             return None
         now = self.present_result
         good = [m for m in self._same_problem if self._compute_largest_error(m) <= self.error_limit]
-        noise = {id(now): 1.0 - TIME_NOISE_FRACTION}
-        return min(good, key=lambda m: m.mean_step_time * noise.get(id(m), 1.0), default=None)
+        fastest = min((m.mean_step_time for m in good), default=0.0)
+        ties = [m for m in good if (1.0 - TIME_NOISE_FRACTION) * m.mean_step_time <= fastest]
+        return (
+            now if any(m is now for m in ties) else min(ties, key=self._compute_largest_error, default=None)
+        )
 
     @property
     def most_accurate(self) -> Measured:
