@@ -192,7 +192,7 @@ ERRORS = {
         *((partial(lv.Problem.contact, I3, np.ones(3), [1], friction=law), "'coulomb' or 'cone'")
           for law in ("couloumb", np.array([0.5, 0.5]))),
         (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 entries for 2 blocks"),
-        (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
+        (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), r"key has -1 at \[0\]"),
         (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already contains compliance on its diagonal"),
         (lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=ROWS), "exactly one is needed"),
         (lambda: lv.Problem(np.ones(4), contacts(0.5, 3), np.eye(4)), "law is not supported for a round cone"),

@@ -258,8 +258,3 @@ def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangen
     cones = lv.Cones.contacts(np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0])
     assert problem == lv.Problem.from_jacobian(jac, mass, v, cones=cones)
     assert problem.cones.n_tangents.tolist() == tangents
-
-
-def test_a_negative_key_is_named_with_its_place():
-    with pytest.raises(lv.InputError, match=r"key has -1 at \[0\]; integers from 0"):
-        lv.Problem.lcp(np.eye(2), np.ones(2), key=[-1, 1])
