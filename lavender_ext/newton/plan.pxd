@@ -22,8 +22,7 @@
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
                     AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
                                               rigid
-                    MORE_PATHS                paths with other ratios of smoothing                SECOND_SHIFTED
-                    SECOND_SHIFTED            shifted Newton from the convex point                COULOMB_DAMPED_NEWTON
+                    MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
@@ -81,9 +80,8 @@ cdef enum:                      # states of PLAN_COULOMB
     SECOND_DE_SAXCE = 6
     AUGMENTED_DE_SAXCE = 7
     MORE_PATHS = 8
-    SECOND_SHIFTED = 9
-    COULOMB_DAMPED_NEWTON = 10
-    COULOMB_END = 11
+    COULOMB_DAMPED_NEWTON = 9
+    COULOMB_END = 10
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -97,7 +95,6 @@ cdef enum:
     MIN_SHIFTED_ROWS = 300      # With fewer rows the paths cost less than the convex point.
     START_SHIFTED_FACTORISATIONS = 40   # Budget of shifted Newton from the start; many piles take fewer than 30.
     FIRST_SHIFTED_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
-    SHIFTED_PATIENCE = 200      # Shifted Newton ends if so many factorisations do not halve the change of centre and shift.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
     FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
@@ -345,7 +342,7 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
                 copy_vector(n, n.saved_z, n.best_z)
                 n.mostly_slides = slides_mostly(n, n.saved_z)
                 if not n.mostly_slides:
-                    begin_shifted_newton(n, n.best_z, START_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
+                    begin_shifted_newton(n, n.best_z, START_SHIFTED_FACTORISATIONS)
     elif state == START_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
         begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
@@ -361,7 +358,7 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             copy_vector(n, n.saved_z, n.progress.best_z)
             n.mostly_slides = n.mostly_slides or slides_mostly(n, n.saved_z)
         if n.has_convex_start and not n.mostly_slides:
-            begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS, SHIFTED_PATIENCE)
+            begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS)
     elif state == FIRST_PATH:
         if not has_rigid_joints:
             begin_path(n)
@@ -374,9 +371,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         if n.path.paths < N_PATHS:
             n.stage = MORE_PATHS
             begin_path(n)
-    elif state == SECOND_SHIFTED:
-        if n.has_convex_start:
-            begin_shifted_newton(n, n.saved_z, UNLIMITED, SHIFTED_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)

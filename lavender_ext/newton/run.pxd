@@ -190,7 +190,6 @@ cdef struct shifted_t:          # convex problems with a fixed shift; its vector
     int32_t inner_steps
     int32_t free_updates        # updates in a row without a factorisation
     int32_t updates
-    int32_t patience            # factorisations within which the change must halve
     int32_t since               # factorisations at the last such progress
     int32_t last                # factorisations at which the phase ends
 
@@ -207,7 +206,6 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t proven              # `direction` is a certificate
     int32_t is_cold             # the start is the zero impulse
     int32_t has_augmented       # the caller can factor the augmented system
-    int32_t disabled_phases     # bit set of the phases that are skipped
     int32_t stage               # state of the plan (plan.pxd)
     int32_t has_saved_best
     int32_t has_convex_start    # Coulomb's law: saved_z solves the convex law, or nearly so if many contacts slide
@@ -327,7 +325,7 @@ cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* wo
         n.s.bt = NULL
     n.s.e, n.s.linear = &n.sc.e, &n.linear
     n.s.others = NULL
-    n.s.augmented = n.s.factorisations = n.disabled_phases = 0
+    n.s.augmented = n.s.factorisations = 0
     return x + 5 * small
 
 
@@ -335,9 +333,7 @@ cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* wo
 
 
 cdef inline void push_phase(newton_t* n, int32_t phase) noexcept nogil:
-    """Put a phase on the stack. A disabled phase is not put there and counts as ended."""
-    if n.disabled_phases >> phase & 1:
-        return
+    """Put a phase on the stack."""
     n.stack[n.depth] = phase
     n.depth += 1
 

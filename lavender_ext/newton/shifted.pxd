@@ -25,8 +25,8 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.newton.elements cimport elements_t, invert_small_matrix
 from lavender_ext.newton.natural_map cimport evaluate_all_natural_maps
-from lavender_ext.newton.phases cimport UNLIMITED, begin_damped_newton, push_damped_newton
-from lavender_ext.newton.run cimport (N_SHIFTED, SHIFTED_NEWTON, compute_slack, convex_residual, copy_vector, is_finished,
+from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
+from lavender_ext.newton.run cimport (N_SHIFTED, SHIFTED_NEWTON, convex_residual, copy_vector, is_finished,
                                       judge_and_keep_best_point, newton_t, pop_phase, push_phase, shifted_t)
 from lavender_ext.newton.steps cimport compute_all_normal_shifts
 from lavender_ext.newton.system cimport (NATURAL, factor_newton_system, multiply_system_matrix, solve_natural_map_system)
@@ -38,6 +38,7 @@ cdef enum:
     TRIAL_FACTORISATIONS = 4    # Budget of damped Newton under Coulomb's law, at each decade of the residual.
     MAX_BISECTIONS = 16         # Evaluations of one line search after its first two.
     MAX_FREE_UPDATES = 50       # The phase ends after this many updates (3) in a row without a factorisation.
+    SHIFTED_PATIENCE = 200      # The phase ends if so many factorisations do not halve the change (3).
     SLOW_UPDATES = 5            # Momentum begins if this many updates lower the change of phi by less than `slow_ratio`.
 
 
@@ -56,10 +57,10 @@ cdef inline double momentum() noexcept nogil:
     return 0.8
 
 
-cdef inline void begin_shifted_newton(newton_t* n, const double* z, int32_t limit, int32_t patience) noexcept nogil:
+cdef inline void begin_shifted_newton(newton_t* n, const double* z, int32_t limit) noexcept nogil:
     """Begin at z, with its own shift if it is closer to a solution of Coulomb's law than to one of the convex law.
 
-    The phase ends after `limit` factorisations, or if `patience` of them do not halve the change (3).
+    The phase ends after `limit` factorisations, or if SHIFTED_PATIENCE of them do not halve the change (3).
     """
     cdef shifted_t* x = &n.shifted
     cdef int32_t j, m = n.s.e.m
@@ -80,8 +81,7 @@ cdef inline void begin_shifted_newton(newton_t* n, const double* z, int32_t limi
     x.lowest = 1.0 / 0.0
     x.trial_residual = 1e-2
     x.inner_steps = x.free_updates = x.updates = 0
-    x.patience, x.since = patience, n.s.factorisations
-    x.last = n.s.factorisations + limit if limit < UNLIMITED - n.s.factorisations else UNLIMITED
+    x.since, x.last = n.s.factorisations, n.s.factorisations + limit
     push_phase(n, SHIFTED_NEWTON)
 
 
@@ -144,7 +144,7 @@ cdef inline bint update_shift(newton_t* n) noexcept nogil:
         return False
     if change < 0.5 * x.lowest:
         x.lowest, x.since = change, n.s.factorisations
-    elif n.s.factorisations - x.since > x.patience:
+    elif n.s.factorisations - x.since > SHIFTED_PATIENCE:
         return False
     # Momentum on updates that are slow and keep their direction.
     if x.updates > SLOW_UPDATES and along > 0.0 and by_shift > slow_ratio() * x.history[x.updates % SLOW_UPDATES]:

@@ -1,5 +1,5 @@
 """Declarations of `solve.pyx`: Newton's method over rows and bodies as workspace, start and step (`core/method.pxd`)."""
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t

@@ -28,9 +28,8 @@ from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
-from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
-                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, N_COUNTED, PATH, SHIFTED_NEWTON, bind_index_workspace,
-                                      bind_judge_workspace, bind_real_workspace, convex_residual, judge_workspace_size,
+from lavender_ext.newton.run cimport (N_COUNTED, bind_index_workspace, bind_judge_workspace, bind_real_workspace,
+                                      convex_residual, judge_workspace_size,
                                       method_index_size, method_real_size, newton_t, set_problem, set_reference,
                                       write_certificate, write_impulse)
 from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_problem_supported
@@ -42,18 +41,6 @@ from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, 
                                          determinant_sign, solve_newton_system, multiply_system_matrix)
 
 SYSTEMS = {"barrier": BARRIER, "pair": PAIR, "natural": NATURAL}
-#: Bits of `Solve.disabled_phases`.
-PHASES = {
-    "active set": 1 << ACTIVE_SET,
-    "interior point": 1 << INTERIOR_POINT,
-    "damped Newton": 1 << DAMPED_NEWTON,
-    "damped Newton stretches": 1 << DAMPED_STRETCHES,
-    "interior point with Newton": 1 << INTERIOR_WITH_NEWTON,
-    "augmented Newton": 1 << AUGMENTED_NEWTON,
-    "De Saxce": 1 << DE_SAXCE,
-    "path": 1 << PATH,
-    "shifted Newton": 1 << SHIFTED_NEWTON,
-}
 #: Compliance eps of a path of smoothed problems, relative to d.
 COMPLIANCE = path_compliance()
 cdef double PIVOT_TOLERANCE = 1e-13     # A pivot of a sparse matrix is lost up to this multiple of its diagonal entry.
@@ -418,15 +405,6 @@ cdef class Solve(Method):
     def counts(self):
         """Counts in the order of `COUNTED`."""
         return [self.n.counts[i] for i in range(N_COUNTED)]
-
-    @property
-    def disabled_phases(self):
-        """Bits of `PHASES` that are skipped, for tests and measurements."""
-        return self.n.disabled_phases
-
-    @disabled_phases.setter
-    def disabled_phases(self, int phases):
-        self.n.disabled_phases = phases
 
     # -- single operations, for tests --------------------------------------------------------------
 

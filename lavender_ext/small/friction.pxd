@@ -10,7 +10,7 @@ from lavender_ext.accelerate.accelerated cimport acceleration_t, lav_anderson
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.block_types cimport CONE, blocks_t
-from lavender_ext.core.view cimport csr_t, view_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.small.workspace cimport grow_workspace_to
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_residual_of_score

@@ -13,7 +13,6 @@ from lavender.judge.solution import Status
 from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.suite import box_stack
-from lavender_ext.newton.solve import PHASES
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
@@ -109,18 +108,18 @@ def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
 SLIDING_PILE = "granularF(n=4, sliding=2, seed=10)"  # Four of its 293 contacts slide.
 
 
-def solve_with_phases(problem, disabled=(), budget=300, impulse=None):
-    """Run `newton` without the disabled phases; return its claim and the impulse."""
+def run_newton_claim(problem, budget=300, impulse=None):
+    """Run `newton` without `auto` and the judge; return its claim and the impulse."""
     system = make_system(problem, "velocity" if problem.matrix is None else "impulse")
-    system.solve.disabled_phases = sum(PHASES[name] for name in disabled)
     impulse = (problem.start() if impulse is None else impulse).copy()
     return Newton().run(NewtonState(problem, system), impulse, budget, 1e-6), impulse
 
 
 def test_shifted_newton_pile_slides_solves_coulomb_and_shifted_cone_law():
     problem = suite.case(SLIDING_PILE).problem
-    claim, impulse = solve_with_phases(problem)
+    claim, impulse = run_newton_claim(problem)
     assert claim.status is Status.CONVERGED and "shifted Newton" in claim.message, claim
+    assert claim.iterations < 100, claim  # The paths alone take more than 300.
     assert lv.residual(problem, impulse).relative <= 1e-6
     # De Saxce: with the normals lowered by mu |v_t| the impulse solves the cone law.
     matrix = as_matrix(problem)
@@ -135,17 +134,10 @@ def test_shifted_newton_pile_slides_solves_coulomb_and_shifted_cone_law():
     assert lv.residual(shifted, impulse).relative <= 1e-5
 
 
-def test_shifted_newton_disabled_paths_need_more_factorisations():
-    problem = suite.case(SLIDING_PILE).problem
-    claim, _ = solve_with_phases(problem, ("shifted Newton",))
-    assert claim.status is Status.MAX_ITERATIONS and "path steps" in claim.message, claim
-    assert solve_with_phases(problem)[0].iterations < 100
-
-
 def test_shifted_newton_start_solves_cone_law_begins_there():
     problem = suite.case(SLIDING_PILE).problem
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
-    claim, impulse = solve_with_phases(problem, impulse=convex)
+    claim, impulse = run_newton_claim(problem, impulse=convex)
     assert claim.status is Status.CONVERGED and lv.residual(problem, impulse).relative <= 1e-6
     # Neither the phases of other starts nor the interior point of the cone law run.
     assert "shifted Newton" in claim.message and "De Saxce" not in claim.message, claim
@@ -155,7 +147,7 @@ def test_shifted_newton_start_solves_cone_law_begins_there():
 def test_shifted_newton_most_contacts_slide_other_phases_come_first():
     problem = suite.case("pyramidF(k=8, sliding=0.5)").problem
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
-    claim, _ = solve_with_phases(problem, impulse=convex)
+    claim, _ = run_newton_claim(problem, impulse=convex)
     assert claim.status is Status.CONVERGED and "shifted Newton" not in claim.message, claim
 
 
@@ -167,5 +159,5 @@ def test_shifted_newton_asymmetric_matrix_is_left_to_other_phases():
     asymmetric = lv.Problem(problem.b, problem.cones, matrix + skew - skew.T, friction="coulomb")
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
     for given_problem, runs in ((symmetric, True), (asymmetric, False)):
-        claim, _ = solve_with_phases(given_problem, budget=12, impulse=convex)
+        claim, _ = run_newton_claim(given_problem, budget=12, impulse=convex)
         assert ("shifted Newton" in claim.message) == runs, claim
