@@ -698,7 +698,6 @@ def api_page(site):
         "io",
         "suite",
         "report",
-        "judge.measures",
         "judge.certificates",
     ):
         held = importlib.import_module(f"lavender.{room}")

@@ -31,7 +31,6 @@ import numpy as np
 from panels import Numbers, put_legend_right, show
 
 import lavender as lv
-from lavender.judge.measures import natural_map
 
 N = 8
 BUDGET = 8  # sweeps
@@ -105,7 +104,7 @@ def measure_all(problem, order):
         return {
             "energy": np.sqrt(problem.d @ error**2),
             "velocity": np.abs(problem.d * error).max(),
-            "r_p": natural_map(problem, impulse),
+            "r_p": np.linalg.norm(np.minimum(impulse, problem.slack(impulse))),
             "max |e_n|": np.abs(error).max(),
             "distance": np.sqrt(distance @ a @ distance),
         }

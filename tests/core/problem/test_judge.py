@@ -1,7 +1,5 @@
 """The judge against a NumPy twin that shares nothing with it, and the laws its numbers must obey."""
 
-import dataclasses
-
 import judge_twin
 import numpy as np
 import pytest
@@ -9,20 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judge_twin import spec_of
 from kkt_truth import parts
-from random_problems import (
-    CONTACTS,
-    FORMS,
-    as_matrix,
-    random_contact_problem,
-    random_generalized_problem,
-    random_lcp,
-    seeds,
-)
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_generalized_problem, seeds
 
 import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
-from lavender.judge.measures import natural_map, qp_residual, siconos_error
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -174,35 +163,6 @@ def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(frictio
     if friction == "coulomb":  # a wide cone's nearest point follows the tangents
         off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
         assert off.relative > 2.0 * off.roundoff_floor
-
-
-# -- other measures --------------------------------------------------------------------------------------
-
-
-def test_qp_residual_checks_the_sign_of_multipliers():
-    """min x^2 with x <= 1 and the multiplier -2: every residual but the sign is zero at the wrong point x = 1."""
-    problem = lv.Problem.lcp([[2.0]], [0.0], lower=-np.inf, upper=1.0)
-    wrong = qp_residual(problem, [1.0], [-2.0])
-    assert (wrong.primal, wrong.dual) == (0.0, 0.0)
-    assert wrong.sign == 2.0
-    assert qp_residual(problem, [0.0], [0.0]).worst == 0.0
-
-
-def test_siconos_error_is_zero_at_the_solution_alone():
-    base = random_contact_problem(31, spin=False, rolling=True, joints=0)
-    problem = as_matrix(dataclasses.replace(base, compliance=base.compliance + 0.3))
-    found = lv.solve(problem, "newton", tol=1e-12)
-    assert siconos_error(problem, found.impulse)["relative"] < 1e-10
-    assert siconos_error(problem, found.impulse + 0.01)["relative"] > 1e-3
-
-
-@given(seed=seeds)
-def test_natural_map_is_the_plain_formula(seed):
-    problem = random_lcp(seed)
-    lam = np.random.default_rng(seed).normal(size=problem.m)
-    c, w = problem.cones, problem.matrix @ lam - problem.b
-    expected = np.linalg.norm(lam - np.clip(lam - w, c.lower, c.upper))
-    np.testing.assert_allclose(natural_map(problem, lam), expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
