@@ -6,6 +6,7 @@ LAVENDER_TOLD=write, and reads what changed.
 
 import json
 import os
+from collections import namedtuple
 from itertools import zip_longest
 from pathlib import Path
 
@@ -15,9 +16,15 @@ from newton_steps import NewtonSteps
 
 import lavender as lv
 from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
-from lavender.sim.web.scenes import EXPERIMENTS, PRESETS, Side
+from lavender.sim.web.scenes import PRESETS_PATH
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
+
+Side = namedtuple("Side", ["iterations", "warm_start", "order", "solver"], defaults=["given", "sweeps"])
+PRESETS = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
+for preset in PRESETS:
+    preset["sides"] = [Side(**side) for side in preset["sides"]]
+EXPERIMENTS = [preset for preset in PRESETS if preset["numbers"]]
 
 GOLDEN = Path(__file__).with_name("told.json")
 WARM, COLD = Side(16, True, ""), Side(16, False, "")  # in the scene's own order
@@ -115,20 +122,20 @@ def opening(v):
     v.page.keyboard.press(" ")
     v.page.click("#reset")  # a slow machine is at any step by now
     v.js("lavender.advance(300)")
-    yield both(PRESETS[0].scene, 300, PRESETS[0].sides)
+    yield both(PRESETS[0]["scene"], 300, PRESETS[0]["sides"])
     a, b = v.js("lavender.sides.map((side) => side.gap())")
     assert b > 5.0 * a  # the sentence says that links part
 
 
 def presets(v):
-    for preset in (*PRESETS, *EXPERIMENTS):
-        v.page.get_by_role("button", name=preset.title, exact=True).click()
+    for preset in PRESETS:
+        v.page.get_by_role("button", name=preset["title"], exact=True).click()
         v.page.keyboard.press("Escape")
         v.js("lavender.play(false)")
         v.js("lavender.choose(lavender.scene.name)")
         v.page.wait_for_function("!lavender.waiting")
         v.js("lavender.advance(30)")
-        yield both(preset.scene, 30, preset.sides)
+        yield both(preset["scene"], 30, preset["sides"])
 
 
 def address(v):
@@ -226,13 +233,13 @@ def test_a_tour_shows_the_native_numbers_and_says_what_it_said(visit, start):
     [*((preset, {}) for preset in EXPERIMENTS), (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}})],
 )
 def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
-    v = visit("#" + preset.name, **phone)
+    v = visit("#" + preset["name"], **phone)
     v.js("lavender.play(false)")
     v.page.click("#reset")
     v.page.wait_for_function("!lavender.waiting")
     v.js("lavender.advance(240)")
-    assert [v.values(i)[0] for i in (0, 1)] == both(preset.scene, 240, preset.sides)
-    compare_told(preset.name, [v.js(TELL)])
+    assert [v.values(i)[0] for i in (0, 1)] == both(preset["scene"], 240, preset["sides"])
+    compare_told(preset["name"], [v.js(TELL)])
     assert v.js("document.documentElement.scrollWidth <= innerWidth")
     pressed = v.page.locator("#experiments button[aria-pressed=true]").bounding_box()
     assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
