@@ -36,8 +36,8 @@ def check_state_sizes(own: State, size: np.ndarray) -> None:
     """Raise InputError if entries of `size`, other than capacities of arrays, differ from the simulation's own."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
-    if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
-        raise _make_damaged_state_error("its sizes differ from the sizes of this scene")
+    is_same = np.array_equal(size[fixed], own.size[fixed]) and size[list(free)].min() >= 0
+    require_intact(is_same, "its sizes differ from the sizes of this scene")
 
 
 def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
@@ -54,18 +54,18 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     """
     a, b = own.a, new.a
     for name in GIVEN:
-        if a[name].tobytes() != b[name].tobytes():
-            raise _make_damaged_state_error(f"{name} differs from the value of this scene")
+        is_same = a[name].tobytes() == b[name].tobytes()
+        require_intact(is_same, f"{name} differs from the value of this scene")
     kj = int(own.size[SIZE["joints"]])
-    if not np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1]):
-        raise _make_damaged_state_error("the rows of the joints differ from the rows of this scene")
+    is_same = np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1])
+    require_intact(is_same, "the rows of the joints differ from the rows of this scene")
     settings = np.ones(len(own.setting), bool)
     for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
     if own.setting[settings].tobytes() != new.setting[settings].tobytes():
         differs = np.flatnonzero(settings & (own.setting != new.setting))
         changed = [name for name, at in SETTING.items() if at in differs] or ["a NaN"]
-        raise _make_damaged_state_error(f"settings differ from the ones of this scene: {', '.join(changed)}")
+        require_intact(False, f"settings differ from the ones of this scene: {', '.join(changed)}")
     _check_head(own, new, sweeps, is_lost)
     _check_contacts(new)
     if not is_lost:
@@ -95,11 +95,11 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
         "solved": (0, 1),
     }
     for name, (low, high) in ranges.items():
-        if not low <= new.head[HEAD[name]] <= high:
-            raise _make_damaged_state_error(f"{name} is {new.head[HEAD[name]]}, not {low} to {high}")
+        value = new.head[HEAD[name]]
+        require_intact(low <= value <= high, f"{name} is {value}, not {low} to {high}")
     for name in FIXED_HEAD:
-        if new.head[HEAD[name]] != own.head[HEAD[name]]:
-            raise _make_damaged_state_error(f"{name} differs from the value of this scene")
+        is_same = new.head[HEAD[name]] == own.head[HEAD[name]]
+        require_intact(is_same, f"{name} differs from the value of this scene")
 
 
 def _check_contacts(new: State) -> None:
@@ -109,8 +109,8 @@ def _check_contacts(new: State) -> None:
     c, rows = int(new.head[HEAD["contacts"]]), int(new.head[HEAD["contact_rows"]])
     per, n = int(size[SIZE["rows_per_contact"]]), int(size[SIZE["bodies"]])
     cached = b["cache_key"][: new.head[HEAD["cached"]]] >> np.uint64(16)
-    if (cached[1:] < cached[:-1]).any() or (cached >> np.uint64(24) >= n).any():
-        raise _make_damaged_state_error("cache_key is not sorted")
+    is_sorted = (cached[1:] >= cached[:-1]).all() and (cached >> np.uint64(24) < n).all()
+    require_intact(is_sorted, "cache_key is not sorted")
     if not new.head[HEAD["solved"]]:
         return
     ptr = b["ptr"][kj : kj + c + 1].astype(np.int64)
@@ -118,64 +118,53 @@ def _check_contacts(new: State) -> None:
     friction = b["mu"][kj : kj + c] > 0.0
     box = friction & bool(new.head[HEAD["friction_shape"]])
     max_rows = np.where(box, 3, np.where(friction, 6, 1))
-    if (
-        ptr[0] != mj or ptr[-1] != mj + rows
-        or (blocks < np.where(friction, 3, 1)).any() or (blocks > max_rows).any() or blocks.max(initial=1) > per
-    ):  # fmt: skip
-        raise _make_damaged_state_error(
-            f"ptr does not give each of the {c} contacts the rows of its kind, {rows} in total"
-        )
+    has_rows = (blocks >= np.where(friction, 3, 1)).all() and (blocks <= np.minimum(max_rows, per)).all()
+    is_valid = has_rows and ptr[0] == mj and ptr[-1] == mj + rows
+    require_intact(
+        is_valid, f"ptr does not give each of the {c} contacts the rows of its kind, {rows} in total"
+    )
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])
-    if (
-        c
-        and (
-            b["kind"][: kj + c] != get_block_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)
-        ).any()
-    ):
-        raise _make_damaged_state_error("kind does not match the rows of a block")
+    kinds = get_block_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)
+    require_intact(c == 0 or (b["kind"][: kj + c] == kinds).all(), "kind does not match the rows of a block")
     pair = b["contact_pair"][:c]
-    if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
-        raise _make_damaged_state_error("contact_pair names bodies that the scene does not have")
+    is_body = ((pair >= 0) & (pair < n)).all() and np.array_equal(b["contact_body"][:c], b["dyn"][pair])
+    require_intact(c == 0 or is_body, "contact_pair names bodies that the scene does not have")
 
 
 def _check_numbers(own: State, new: State) -> None:
     """Check that numbers are finite, quaternions are normalised, and inertias belong to the scene."""
     b, cached = new.a, int(new.head[HEAD["cached"]])
-    for name in ("x", "v", "joint_impulse", "inv_inertia"):
-        if not np.isfinite(b[name]).all():
-            raise _make_damaged_state_error(f"{name} is not finite")
-    for name in ("cache_impulse", "cache_local", "cache_roll"):
-        if not np.isfinite(b[name][:cached]).all():
-            raise _make_damaged_state_error(f"{name} is not finite")
+    names = "x", "v", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll"
+    for name in names:
+        values = b[name][:cached] if name.startswith("cache") else b[name]
+        require_intact(np.isfinite(values).all(), f"{name} is not finite")
     with np.errstate(over="ignore", invalid="ignore"):
-        if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE).all():
-            raise _make_damaged_state_error("q holds a quaternion that does not have length 1")
-    static = b["dyn"] < 0
-    if b["v"][static].any():
-        raise _make_damaged_state_error("v gives a static body a velocity")
+        is_unit = np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE
+    require_intact(is_unit.all(), "q holds a quaternion that does not have length 1")
+    require_intact(not b["v"][b["dyn"] < 0].any(), "v gives a static body a velocity")
     even = ~b["uneven"][b["body_of"]].astype(bool)
-    if b["inv_inertia"][even].tobytes() != own.a["inv_inertia"][even].tobytes():
-        raise _make_damaged_state_error("inv_inertia differs from the value of this scene")
+    is_same = b["inv_inertia"][even].tobytes() == own.a["inv_inertia"][even].tobytes()
+    require_intact(is_same, "inv_inertia differs from the value of this scene")
 
 
-def _make_damaged_state_error(reason: str) -> InputError:
-    return InputError(f"the snapshot is damaged: {reason}")
+def require_intact(is_valid: Any, reason: str) -> None:
+    """Raise InputError with the reason unless the condition holds."""
+    if not is_valid:
+        raise InputError(f"the snapshot is damaged: {reason}; take a new one with sim.snapshot()")
 
 
 def check_snapshot_fields(snapshot: Any) -> None:
     """Raise InputError if the fields of a snapshot have wrong types or lengths."""
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)
-        if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:
-            raise _make_damaged_state_error(f"{name} is {str(x)[:40]}, not a count")
+        require_intact(type(x) is int and 0 <= x < 2**53, f"{name} is {str(x)[:40]}, not a count")
     for name in ("fingerprint", "lost"):
-        if not isinstance(getattr(snapshot, name), str):
-            raise _make_damaged_state_error(f"{name} is a {type(getattr(snapshot, name)).__name__}, not text")
+        x = getattr(snapshot, name)
+        require_intact(isinstance(x, str), f"{name} is a {type(x).__name__}, not text")
     for name, dtype in (("size", np.int32), ("real", np.float64), ("index", np.int32), ("keys", np.uint64)):
         x = getattr(snapshot, name)
-        if not isinstance(x, np.ndarray) or x.dtype != dtype or x.ndim != 1:
-            raise _make_damaged_state_error(f"{name} is not a vector of {np.dtype(dtype).name}")
-    if len(snapshot.size) != N_SIZES:
-        raise _make_damaged_state_error(f"size has {len(snapshot.size)} entries, not {N_SIZES}")
+        is_vector = isinstance(x, np.ndarray) and x.dtype == dtype and x.ndim == 1
+        require_intact(is_vector, f"{name} is not a vector of {np.dtype(dtype).name}")
+    require_intact(len(snapshot.size) == N_SIZES, f"size has {len(snapshot.size)} entries, not {N_SIZES}")

@@ -12,7 +12,7 @@ from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.base.lazy_import import import_module_lazily
 from lavender.io.stored import lock_step_folder
 from lavender.problem import Problem
-from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes
+from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes, require_intact
 from lavender.sim.engine.film import Film, make_film_header
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
@@ -362,17 +362,14 @@ class Simulation(Stepping):
         check_state_sizes(self.state, size)
         found_lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
         used = compute_buffer_lengths(size)
-        if found_lengths != (used[0], used[1], max(used[2], 1)):
-            raise InputError(
-                "the snapshot is damaged, because its arrays do not have the sizes that it declares: take "
-                "a new one with sim.snapshot()"
-            )
+        is_complete = found_lengths == (used[0], used[1], max(used[2], 1))
+        require_intact(is_complete, "its arrays do not have the sizes that it declares")
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         lost = snapshot.lost
         check_state(self.state, state, self._sweeps, bool(lost))
-        if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
-            raise InputError(f"the snapshot is damaged: {lost[:40]!r} is not the body with the lost state")
+        is_lost_body = not lost or lost == self._names[state.head[HEAD["lost"]]]
+        require_intact(is_lost_body, f"{lost[:40]!r} is not the body with the lost state")
         self.state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
         self._last, self._end_reason = None, ""

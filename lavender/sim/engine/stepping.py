@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
@@ -41,24 +40,6 @@ LAST_STEP = 2**31 - 1  # The counter of substeps in `head` restarts from 0 after
 P = ParamSpec("P")
 R = TypeVar("R")
 S = TypeVar("S", bound="Stepping")
-
-
-@dataclass(frozen=True)
-class _PendingClaim:
-    """Result of a solve on the engine's arrays, from which the `Solution` is built at its first access.
-
-    Parameters
-    ----------
-    status_code : int
-        Result of `Substep.solve`.
-    sweeps, factorisations : int
-    time : float, s
-    """
-
-    status_code: int
-    sweeps: int
-    factorisations: int
-    time: float
 
 
 def run_exclusively(
@@ -129,7 +110,8 @@ class Stepping:
         self._restored = False
         # Copy of the state, if a step can be stopped between substeps.
         self._state_before_step: State | None = None
-        self._last: Solution | _PendingClaim | None = None
+        # Solution of the last substep, or a function that builds it at its first access.
+        self._last: Solution | Callable[[], Solution] | None = None
 
     # -- running --------------------------------------------------------------------------------
 
@@ -160,8 +142,8 @@ class Stepping:
 
         None with the built-in sweeps, or if the last substep had no rows.
         """
-        if isinstance(self._last, _PendingClaim):
-            self._last = self._build_solution(self._last)
+        if callable(self._last):
+            self._last = self._last()
         return self._last
 
     @run_exclusively
@@ -402,24 +384,23 @@ class Stepping:
         The impulses are bit for bit the result of lavender.solve(problem, "newton"), without building the problem.
         """
         start = perf_counter()
-        status_code, sweeps, factorisations, _ = self.state.warm_start_phase.solve(self._warm_tol)
-        if status_code:
-            self._last = _PendingClaim(status_code, sweeps, factorisations, perf_counter() - start)
-        return bool(status_code)
+        *counts, _ = self.state.warm_start_phase.solve(self._warm_tol)
+        if counts[0]:
+            self._last = partial(self._build_solution, counts, perf_counter() - start)
+        return bool(counts[0])
 
-    def _build_solution(self, pending: _PendingClaim) -> Solution:
+    def _build_solution(self, counts: list[int], solve_time: float) -> Solution:
         """Build the solution of the last substep. Its arrays do not change until the next substep."""
         problem = self._build_problem(self.state, steps=self._steps)
-        claim = make_warm_start_claim(pending.status_code, pending.sweeps, pending.factorisations)
+        claim = make_warm_start_claim(*counts)
         assert claim is not None
         impulse = self.state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)
         options.pop("tol", None)
-        return finish(
-            FinishedRun(
-                problem, get("newton"), options, impulse, claim, tol=self._warm_tol, solve_time=pending.time
-            )
+        run = FinishedRun(
+            problem, get("newton"), options, impulse, claim, tol=self._warm_tol, solve_time=solve_time
         )
+        return finish(run)
 
     def _solve(self, problem: Problem) -> FloatArray:
         """Return impulses (m,) [N s] of the registered solver; a failed solve is treated as `on_failure` requires."""
