@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import Any
@@ -173,9 +174,10 @@ def _run_command(args: Sequence[str] | None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # File names may not be valid UTF-8.
     try:
-        code = cli.main(
-            args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
-        )
+        with _print_warnings_as_sentences():
+            code = cli.main(
+                args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
+            )
         sys.stdout.flush()
     except LavenderError as error:
         print_escaped(f"lavender: {error}", err=True)
@@ -201,6 +203,22 @@ def _run_command(args: Sequence[str] | None) -> int:
         click.echo(f"lavender: {error}{_explain_os_error()}", err=True)
         code = EXIT_BAD_INPUT
     return code if isinstance(code, int) else 0
+
+
+@contextlib.contextmanager
+def _print_warnings_as_sentences() -> Iterator[None]:
+    """Print each UserWarning as one line, without the line of source that issued it."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def show_sentence(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if category is UserWarning:
+                print_escaped(f"lavender: warning: {message}", err=True)
+            else:
+                show(message, category, *place, **more)
+
+        warnings.showwarning = show_sentence
+        yield
 
 
 def _explain_os_error() -> str:

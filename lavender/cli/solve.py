@@ -77,7 +77,7 @@ def solve(
                 worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
             )
     except TaskFailed as error:  # The solver ended its process, or was ended after its time limit.
-        print_escaped(f"lavender: {error}", err=True)
+        print_escaped(f"lavender: {solver}: {error}", err=True)
         raise click.exceptions.Exit(EXIT_UNMET) from None
     if output is not None:
         import numpy as np

@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import click
 
 from lavender.cli.options import escape_markup, make_console
+
+if TYPE_CHECKING:
+    from lavender.solvers.registry import SolverSpec
+
+#: Words of the column "capabilities": (field of `SolverSpec`, word, explanation).
+CAPABILITIES = (
+    ("exact", "exact", "ends after finitely many steps or at rounding accuracy"),
+    ("box_friction_laws", "boxes", "accepts contacts with friction that bound each tangent separately"),
+    ("impulse", "warm start", "starts from impulse="),
+    ("resumable", "budget", "runs exactly max_iter iterations with tol=0"),
+    ("order", "order", "accepts order="),
+    ("seed", "seed", "accepts seed="),
+    ("history", "history", "records history=True"),
+)
 
 
 @click.command()
@@ -21,31 +38,53 @@ def solvers(name: str | None) -> None:
         _describe_solver(name)
 
 
+def _get_capabilities(spec: SolverSpec) -> str:
+    """Return the capabilities of a solver as words."""
+    return ", ".join(word for field, word, _ in CAPABILITIES if getattr(spec, field))
+
+
+def _join_in_order(words: Sequence[str], present: frozenset[str]) -> str:
+    return " ".join(word for word in words if word in present)
+
+
 def _describe_solver(name: str) -> None:
-    """Print summary, reference, options and observed behaviour of a solver."""
+    """Print summary, reference, capabilities, options and observed behaviour of a solver."""
+    from importlib.metadata import version
+
     from lavender.external.backends import describe_backend, get_observed_version
+    from lavender.problem import LAWS, OPERATORS
     from lavender.solvers import registry
 
     if name not in registry.specs():
         registry.get(name)  # Raises UnknownName with similar names.
-    spec, reason = registry.specs()[name], registry.known()[name]
-    lines = [f"{name}: {spec.summary}", spec.reference and f"Reference: {spec.reference}", reason]
-    lines += [f"Option {option}: {text}" for option, text in spec.options.items()]
-    sentences = describe_backend(name)
-    if sentences:
+    spec = registry.specs()[name]
+    observations, measures = describe_backend(name)
+    facts = (
+        ("Not installed", registry.known()[name]),
+        ("Plug-in of", spec.distribution and f"{spec.distribution} {version(spec.distribution)}"),
+        ("Reference", spec.reference),
+        ("Laws", _join_in_order(LAWS, spec.laws)),
+        ("Reads", _join_in_order(OPERATORS, spec.operators)),
+        ("Capabilities", _get_capabilities(spec)),
+        *((f"Option {option}", text) for option, text in spec.options.items()),
+    )
+    lines = [f"{name}: {spec.summary}", *(f"{title}: {text}" for title, text in facts if text)]
+    if observations:
         lines += [
             f"Observed with version {get_observed_version(name)}, called alone at its default settings:"
         ]
-        lines += [f"- {sentence}" for sentence in sentences]
+        lines += [f"- {sentence}" for sentence in observations]
     elif spec.external:
         lines += ["Its behaviour was not observed."]
+    if measures:
+        lines += ["lavender therefore calls it as follows:", *(f"- {sentence}" for sentence in measures)]
     console = make_console()
-    for line in filter(None, lines):
+    for line in lines:
         console.print(escape_markup(line), highlight=False)
 
 
 def _list_solvers() -> None:
-    """Print a table of the solvers."""
+    """Print a table of the solvers, installed ones first."""
     from rich.table import Table
 
     from lavender.problem import LAWS, OPERATORS
@@ -55,31 +94,18 @@ def _list_solvers() -> None:
     for name in ("solver", "laws", "reads", "capabilities", "description"):
         table.add_column(name, no_wrap=name == "solver", overflow="fold")
     reasons = registry.known()
-    # Installed solvers come first.
-    order = sorted(registry.specs().items(), key=lambda pair: (reasons[pair[0]] is not None, pair[0]))
-    for name, spec in order:
-        abilities = [
-            word
-            for word, has in (
-                ("exact", spec.exact),
-                ("boxes", bool(spec.box_friction_laws)),
-                ("warm start", spec.impulse),
-                ("budget", spec.resumable),
-                ("order", spec.order),
-                ("seed", spec.seed),
-                ("history", spec.history),
-            )
-            if has
-        ]
+    for name, spec in sorted(registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0])):
         reason = reasons[name]
-        description = escape_markup(spec.summary) if reason is None else f"[yellow]{escape_markup(reason)}[/]"
-        laws = [law for law in LAWS if law in spec.laws]
         table.add_row(
             escape_markup(name),
-            " ".join(laws),
-            " ".join(o for o in OPERATORS if o in spec.operators),
-            ", ".join(abilities),
-            description,
-            style="" if reason is None else "dim",
+            _join_in_order(LAWS, spec.laws),
+            _join_in_order(OPERATORS, spec.operators),
+            _get_capabilities(spec),
+            f"[yellow]{escape_markup(reason)}[/]" if reason else escape_markup(spec.summary),
+            style="dim" if reason else "",
         )
-    make_console().print(table)
+    legend = Table("capability", "meaning", box=None, pad_edge=False, header_style="bold")
+    for _, word, meaning in CAPABILITIES:
+        legend.add_row(word, meaning)
+    console = make_console()
+    console.print(table, "", legend, sep="\n")

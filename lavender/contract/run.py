@@ -23,7 +23,7 @@ def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, str
     process = ProcessBackend(run_check, environment={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
     try:
         for check in list_checks(spec):
-            remote = spec.from_entry_point
+            remote = bool(spec.distribution)
             yield check, run_remotely(process, name, check, timeout) if remote else find_failure(spec, check)
     finally:
         process.close()

@@ -193,15 +193,15 @@ TRIANGLE_SENTENCES = {
 #: Remedy of the adapter for an observation, by field of `Behaviour`.
 ADAPTER_REMEDIES = {
     "triangle": "Both triangles of P are passed equal in every bit, or the one that is read.",
-    "start": "These arrays are passed if a start is given.",
+    "start": "The arrays of a start are passed if one is given.",
     "linear_term": "Calls with smaller tolerances follow until the judge accepts the answer.",
     "small_part": "Calls with smaller tolerances follow until the judge accepts the answer.",
     "smallest": "Programs are scaled to numbers near 1.",
     "far_bound": "Far bounds are left out, and are checked at the solution.",
     "fixed_multiplier": "Bounds are passed as rows.",
-    "infeasible_x": "The start is returned, and the claim counts only with a certificate.",
-    "contradictory": "The judge contradicts such a claim.",
-    "unbounded": "The judge contradicts such a claim.",
+    "infeasible_x": "A claim of infeasibility returns the start, and counts only with a certificate.",
+    "contradictory": "The judge contradicts a wrong claim about contradictory rows.",
+    "unbounded": "The judge contradicts a wrong claim about an unbounded program.",
 }
 
 
@@ -236,18 +236,16 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
     return sentences | dict(b.notes)
 
 
-def describe_backend(name: str) -> list[str]:
-    """Return sentences on the behaviour of the backend `name`, with the remedies of its adapter."""
+def describe_backend(name: str) -> tuple[list[str], list[str]]:
+    """Return sentences on the behaviour of the backend `name` alone, and on the measures of its adapter."""
     behaviour = _get_behaviour(name)
     if behaviour is None:
-        return []
+        return [], []
     usual = Behaviour(behaviour.version)
-    return [
-        f"{text} {ADAPTER_REMEDIES[key]}"
-        if key in ADAPTER_REMEDIES and getattr(behaviour, key) != getattr(usual, key)
-        else text
-        for key, text in describe_behaviour(behaviour).items()
+    measures = [
+        text for key, text in ADAPTER_REMEDIES.items() if getattr(behaviour, key) != getattr(usual, key)
     ]
+    return [*describe_behaviour(behaviour).values()], [*dict.fromkeys(measures)]
 
 
 def explain_contradicted_claim(name: str, problem: Problem, status: Status) -> str:

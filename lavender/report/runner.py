@@ -87,7 +87,7 @@ def remove_times(record: Record, time_limit: float) -> Record:
 
 def is_third_party_solver(spec: SolverSpec) -> bool:
     """Whether a solver is code of another package that a separate process can import by its name."""
-    return spec.from_entry_point or (spec.builtin and (spec.external or bool(spec.requires)))
+    return bool(spec.distribution) or (spec.builtin and (spec.external or bool(spec.requires)))
 
 
 def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
@@ -175,7 +175,8 @@ def run(
     if plan.campaign:
         items = [replace(item, sequence="", step=-1) for item in items]
     names = select_solver_names(solvers)
-    packages = {module for name in names for module in registry.specs()[name].requires}
+    specs = [registry.specs()[name] for name in names]
+    packages = {package for spec in specs for package in (*spec.requires, spec.distribution) if package}
     this = machine.describe_run({**asdict(plan), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
@@ -258,9 +259,7 @@ class Runner:
 
         if backend == "loky" and memory is None:
             memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
-        local = tuple(
-            spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.from_entry_point)
-        )
+        local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
         order = Order(self.plan, self.this, memory, local)
         known: dict[tuple[str, str], list[Record]] = {}
         for record in self.known.values():

@@ -30,7 +30,7 @@ from lavender.solving.solve import solve
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN_CPU_TIME = 60.0  # [s] A worker without a parent is killed this CPU time after its task's limit.
 OUTCOME_ARRAYS = ("impulse", "certificate")  # Fields of `Outcome`, in the order in which they are sent.
-DIED_MESSAGE = "its code ended its process; report this to its authors, and leave it out (--solvers)"
+DIED_MESSAGE = "its code ended its process; report this to its authors, and use another solver"
 GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limits, before a worker is killed.
 
 
@@ -141,7 +141,7 @@ def solve_isolated(
         The solver raised an exception, did not end, or ended the worker.
     """
     spec = registry.get(name)
-    if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
+    if not spec.distribution or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
         import_numerical_modules(*spec.requires)  # The first solve's time does not include the import.
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
     # Raises an error if the solver rejects the problem or an option.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
@@ -24,6 +25,8 @@ from lavender.problem.derived import cached_property
 from lavender.solvers.costs import Cost
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from lavender.solvers.small import SmallCall
 
 __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
@@ -31,6 +34,7 @@ __all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available"
 
 # Modules with the SPECS that are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
+ENTRY_POINT_GROUP = "lavender.solvers"
 
 
 class SolverOptions(TypedDict, total=False):
@@ -196,8 +200,9 @@ class SolverSpec:
 
     Attributes
     ----------
-    from_entry_point : bool
-        Whether the solver was found by its entry point, so that other processes find it, too.
+    distribution : str
+        Name of the installed package in which lavender found the solver by an entry point; else empty. Solvers with an
+        entry point are found by other processes, too.
     builtin : bool
         Whether the solver is part of this package. Other solvers get copies of the data, and their results are checked
         (`external/foreign.py`).
@@ -236,7 +241,7 @@ class SolverSpec:
     bounded_variant: str = ""
     refusal: Callable[[Problem], str | None] | None = None
     small: SmallCall | None = None
-    from_entry_point = False
+    distribution = ""
     builtin = False
 
     def __post_init__(self) -> None:
@@ -454,22 +459,57 @@ def load_all() -> None:
 @cache
 def register_all_solvers() -> None:
     """Fill `registered` with the built-in solvers and the plug-ins."""
-    # Imported here: it takes a tenth of the time of `import lavender`.
-    from importlib.metadata import entry_points
-
     for table in TABLES:
         register_specs_of_module(table)
-    for entry in entry_points(group="lavender.solvers"):
+    for entry in _find_entry_points():
+        _register_plugin(entry)
+
+
+def _find_entry_points() -> list[EntryPoint]:
+    """Return the entry points of all plug-ins. A warning names a package with an entry_points.txt that is not valid."""
+    # Imported here: it takes a tenth of the time of `import lavender`.
+    from importlib.metadata import distributions, entry_points
+
+    with suppress(Exception):
+        return list(entry_points(group=ENTRY_POINT_GROUP))
+    entries: list[EntryPoint] = []
+    for distribution in distributions():
         try:
-            spec = entry.load()
-            spec = spec if isinstance(spec, SolverSpec) else spec()
-            _add_spec(spec, replace=False)
-            object.__setattr__(spec, "from_entry_point", True)
-        # A plug-in may raise any error; a warning suffices, so that other solvers can be used.
+            entries += distribution.entry_points.select(group=ENTRY_POINT_GROUP)
         except Exception as error:
-            warnings.warn(
-                f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4
-            )
+            if ENTRY_POINT_GROUP in (distribution.read_text("entry_points.txt") or ""):
+                warnings.warn(
+                    f"solver plug-ins of {distribution.name} were left out: its entry_points.txt has a line that "
+                    f"is not name = module:attribute ({format_error(error)})",
+                    stacklevel=2,
+                )
+    return entries
+
+
+def _register_plugin(entry: EntryPoint) -> None:
+    """Register the solver of an entry point. A warning names one that fails, or has another name than its solver."""
+    distribution = entry.dist.name if entry.dist else entry.name
+    title = f"solver plug-in {entry.name!r} ({entry.value}) of {distribution}"
+    try:
+        if not entry.pattern.match(entry.value):
+            raise InputError("its entry point is not of the form module:attribute")
+        spec = entry.load()
+        spec = spec if isinstance(spec, SolverSpec) else spec()
+        if isinstance(spec, SolverSpec) and spec.name in registered:
+            raise InputError(f"another solver is named {spec.name!r}; give its SolverSpec a name of its own")
+        _add_spec(spec, replace=False)
+    # A plug-in may raise any error, or exit; a warning suffices, so that other solvers can be used.
+    except (Exception, SystemExit) as error:
+        text = str(error) if isinstance(error, InputError) else format_error(error)
+        warnings.warn(f"{title} was left out: {text}", stacklevel=2)
+        return
+    object.__setattr__(spec, "distribution", distribution)
+    if spec.name != entry.name:
+        warnings.warn(
+            f"{title} has a solver named {spec.name!r}: use this name; its authors should give the entry point and "
+            "the SolverSpec the same name",
+            stacklevel=2,
+        )
 
 
 def register(spec: SolverSpec, *, replace: bool = False) -> None:

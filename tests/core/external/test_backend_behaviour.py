@@ -96,10 +96,12 @@ def test_explanation_of_a_contradicted_claim_quotes_the_entry_that_fits():
 
 
 def test_description_of_a_backend_has_its_observations_and_what_its_adapter_does():
-    sentences = backends.describe_backend("highs")
-    assert any("1e+15" in s and "left out" in s for s in sentences)
+    observations, measures = backends.describe_backend("highs")
+    assert any("1e+15" in sentence for sentence in observations)
+    assert any("Far bounds are left out" in sentence for sentence in measures)
+    assert not {*observations} & {*measures}
     assert backends.describe_backend("clarabel_cone") == backends.describe_backend("clarabel")
-    assert backends.describe_backend("gurobi") == []
+    assert backends.describe_backend("gurobi") == ([], [])
 
 
 def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():

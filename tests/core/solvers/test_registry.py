@@ -6,6 +6,7 @@ import importlib.metadata
 import pickle
 import sys
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -179,6 +180,8 @@ class Entry:
     """An entry point as importlib.metadata gives them."""
 
     value = "package:SPEC"
+    dist = SimpleNamespace(name="package")
+    pattern = importlib.metadata.EntryPoint.pattern
 
     def __init__(self, name, load):
         self.name, self.load = name, load
@@ -193,13 +196,13 @@ def raises():
     [
         (raises, "needs a licence"),
         (lambda: raises, "needs a licence"),
-        (lambda: named("pgs"), "registered already"),
+        (lambda: named("pgs"), "another solver is named 'pgs'"),
         (lambda: lambda: 7, "SolverSpec"),
     ],
     ids=["import", "factory", "name of ours", "no spec"],
 )
 def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypatch):
-    entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
+    entries = [Entry("broken", load), Entry("good_one", lambda: named("good_one"))]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "registered", {})
     registry.register_all_solvers.cache_clear()
