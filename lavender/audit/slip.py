@@ -1,7 +1,7 @@
 """Explain why contacts slip: solve an engine's step again in variants, each of which replaces one more property.
 
     explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
-    print(explanation.table); print(explanation.sentence)
+    print(explanation)                                              # speeds, causes, and the fastest contact
 
 The sliding speed of a contact is the norm of v_t = J_t v+ - target, the tangential relative velocity after the step
 minus the velocity of the surface, such as a conveyor belt's. Softened friction rows (with compliance) are an exception:
@@ -15,16 +15,17 @@ computed from the impulses of these variants; each variant includes the replacem
     coulomb     Coulomb's law in place of the convex relaxation
 
 The difference of v_t between two consecutive variants is the part of the slip that the replaced property causes:
-unfinished iterations, the shape of the cone, compliance, the relaxation. The sliding in the last variant cannot be
-prevented by Coulomb friction, because the load along the surface exceeds mu times the normal force. The parts are
-norms of vector differences, so the parts of one contact can add up to more than its speed.
+unfinished iterations, the shape of the cone, compliance, the relaxation. The sliding in the last variant remains under
+Coulomb's law with friction at its limit, mu times the normal force: the contact slid before the step, or the load along
+the surface is above this limit. The parts are norms of vector differences, so the parts of one contact can add up to
+more than its speed.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
 from lavender.report.table import Table
-from lavender.report.text import NONE, format_size
+from lavender.report.text import NONE, format_size, format_sizes
 from lavender.solving.solve import solve
 
 #: {variant: cause of its difference from the next variant}, in the order of replacement.
@@ -44,21 +45,18 @@ CAUSES = {
     "solved": "shape of the cone",
     "disk": "softness of friction",
     "hard": "convex relaxation",
-    "coulomb": "load above the friction limit",
-}
-#: Remedy of each cause, with the names of MuJoCo's settings.
-REMEDIES = {
-    "unfinished solving": "more iterations or a smaller tolerance of the engine's solver",
-    "shape of the cone": 'elliptic friction cones (MuJoCo: cone="elliptic")',
-    "softness of friction": "stiffer friction rows (MuJoCo: impratio above 1, or a shorter time constant in solref)",
-    "convex relaxation": "an engine with Coulomb's law; shorter time steps reduce this part",
-    "load above the friction limit": "a larger friction coefficient or normal force",
+    "coulomb": "sliding at the friction limit",
 }
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
-# Settings are compared again after this number of further steps, when creep has become steady.
-REMEDY_STEPS = 25
+REMEDY_STEPS = 25  # Settings are compared after this number of further steps, when creep has become steady.
+MAX_REMAINING_SLIP = 0.9  # A setting helps if at most this fraction of the slip remains.
+#: State of a contact that slides at the friction limit: it becomes slower, or not.
+SLIDING_STATES = (
+    "Friction is above the load along the surface and brakes it.",
+    "The load along the surface is above mu times the normal force.",
+)
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 
 
@@ -91,7 +89,7 @@ class SlipVariant:
 
 @dataclass(frozen=True)
 class Remedy:
-    """Slip of the fastest contact with a setting of MuJoCo.
+    """Slip of the fastest contact with a setting of MuJoCo, as means over `Remedies.states` states.
 
     Parameters
     ----------
@@ -100,7 +98,7 @@ class Remedy:
     slip : float, m/s
         Mean speed of the contact's points in the explained step, simulated with the setting.
     later : float, m/s
-        The same after `REMEDY_STEPS` further steps; nan if the geoms no longer touch.
+        The same after `REMEDY_STEPS` further steps; nan if the geoms no longer touch in one of the runs.
     """
 
     setting: str
@@ -110,7 +108,7 @@ class Remedy:
 
 @dataclass(frozen=True, eq=False)
 class SlipExplanation:
-    """Slip of contacts in each variant of one step; `str()` gives the table and the sentence.
+    """Slip of contacts in each variant of one step; `str()` gives the table and the sentences.
 
     Parameters
     ----------
@@ -118,17 +116,26 @@ class SlipExplanation:
         Names of the chosen contacts.
     variants : tuple of SlipVariant
         In the order of replacement.
+    speeds_before : (contacts,) m/s, optional
+        Sliding speed before the step, if it is known.
+    friction_use : (contacts,), optional
+        Friction force of the engine's answer divided by mu times the normal force, if it is known.
     remedies : tuple of Remedy
         Settings that were simulated, if the model is known and this is its state with the fastest contact.
+    n_states : int
+        Number of states from which the settings were simulated.
     """
 
     contacts: tuple[str, ...]
     variants: tuple[SlipVariant, ...]
+    speeds_before: FloatArray | None = None
+    friction_use: FloatArray | None = None
     remedies: tuple[Remedy, ...] = ()
+    n_states: int = 0
 
     def __str__(self) -> str:
         rows = [self.table.heads, *self.table.rows]
-        return "\n".join("  ".join(map(str, row)) for row in rows) + f"\n{self.sentence}"
+        return "\n".join(["  ".join(map(str, row)) for row in rows] + self.sentences)
 
     @property
     def parts(self) -> dict[str, FloatArray]:
@@ -143,63 +150,84 @@ class SlipExplanation:
         }
 
     @property
+    def slips(self) -> list[ContactSlip]:
+        """Slip of each contact and its parts."""
+        speeds, parts = self.variants[0].speeds, self.parts
+        return [
+            ContactSlip(name, 1, float(speeds[i]), {cause: float(x[i]) for cause, x in parts.items()})
+            for i, name in enumerate(self.contacts)
+        ]
+
+    @property
     def causes(self) -> tuple[str, ...]:
         """Dominant cause of each contact's slip: the largest part; "no slip" below 1e-6 m/s."""
-        parts, speeds = self.parts, self.variants[0].speeds
-        names = list(parts)
-        largest = np.argmax(np.array(list(parts.values())).reshape(len(names), -1), axis=0)
-        return tuple(
-            names[i] if speed > MIN_EXPLAINED_SLIP else "no slip"
-            for i, speed in zip(largest, speeds, strict=True)
-        )
+        return tuple(slip.cause for slip in self.slips)
 
     @property
     def table(self) -> Table:
-        """Sliding speed of each contact in each variant [m/s], and the dominant cause."""
-        heads = ["contact", *(f"{v.name} [m/s]" for v in self.variants), "dominant cause"]
-        rows = []
-        for i, name in enumerate(self.contacts):
-            speeds = [_format_contact_speed(v, i) for v in self.variants]
-            rows.append([name, *speeds, self.causes[i]])
-        return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))
+        """Sliding speed of each contact [m/s], its largest part and the cause of this part."""
+        return _tabulate_slip(self.slips).without_columns("points")
 
     @property
     def remedies_table(self) -> Table:
         """Slip of the fastest contact with each setting [m/s], in the explained step and later."""
         heads = ["setting", "slip [m/s]", f"{REMEDY_STEPS} steps later [m/s]"]
+        columns = [
+            format_sizes([get(r) for r in self.remedies]) for get in (attrgetter("slip"), attrgetter("later"))
+        ]
         rows = [
-            [r.setting, *(NONE if np.isnan(x) else format_size(x) for x in (r.slip, r.later))]
-            for r in self.remedies
+            [r.setting, *(text.replace(NONE, "no contact") for text in texts)]
+            for r, *texts in zip(self.remedies, *columns, strict=True)
         ]
         return Table(heads, rows, words=frozenset({"setting"}))
 
     @property
-    def sentence(self) -> str:
-        """The contact with the largest slip and its cause in one sentence."""
+    def sentences(self) -> list[str]:
+        """Sentences about the contact with the largest slip: its cause and its state."""
         if not self.contacts:
-            return "No contact was chosen."
+            return ["No contact was chosen."]
         i = int(np.argmax(self.variants[0].speeds))
-        speed, cause = self.variants[0].speeds[i], self.causes[i]
-        if cause == "no slip":
-            return f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} m/s."
-        part = self.parts[cause][i]
-        notes = "".join(f" ({v.name}: {v.note})" for v in self.variants if v.note)
-        return (
-            f"{self.contacts[i]} slides fastest, with {format_size(speed)} m/s; the largest part, "
-            f"{format_size(part)} m/s, is caused by: {cause}.{notes} Remedy: {REMEDIES[cause]}."
-            f"{self._format_best_remedy()}"
-        )
+        slip = self.slips[i]
+        if slip.cause == "no slip":
+            return [f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} m/s."]
+        part = format_size(slip.parts[slip.cause])
+        lines = [
+            f"Fastest: {slip.contact} with {format_size(slip.speed)} m/s.",
+            f"Largest part: {slip.cause}, {part} m/s.",
+        ]
+        if self.speeds_before is not None:
+            before = float(self.speeds_before[i])
+            lines.append(f"Before the step it slid with {format_size(before)} m/s.")
+            if slip.cause == CAUSES["coulomb"]:
+                is_braked = self.variants[-1].speeds[i] < before
+                lines.append(SLIDING_STATES[not is_braked])
+        if self.friction_use is not None:
+            lines.append(
+                f"Its friction force is {100.0 * self.friction_use[i]:.0f} % of mu times the normal force."
+            )
+        return lines + [
+            f"Variant {v.name!r}: {v.note}."
+            for v in self.variants
+            if v.note.startswith(("not", UNDEFINED_LAW))
+        ]
 
-    def _format_best_remedy(self) -> str:
-        """Return a sentence about the setting with the least slip later, or nothing if none reduces it."""
-        kept = [r for r in self.remedies if not np.isnan(r.later)]
-        best = min(kept, key=lambda r: r.later, default=None)
-        if best is None or best is self.remedies[0]:
-            return ""
-        return (
-            f" Of the settings below, {best.setting} leaves the least slip: {format_size(best.later)} m/s after "
-            f"{REMEDY_STEPS} further steps, in place of {format_size(kept[0].later)} m/s."
-        )
+    @property
+    def advice(self) -> list[str]:
+        """Lines about the settings that helped when they were simulated, best first; or that none did."""
+        if not self.remedies:
+            return []
+        is_later = not np.isnan(self.remedies[0].later)
+        get_slip = attrgetter("later" if is_later else "slip")
+        before = get_slip(self.remedies[0])
+        helpful = [r for r in self.remedies[1:] if get_slip(r) <= MAX_REMAINING_SLIP * before]
+        time = f"{REMEDY_STEPS} steps later" if is_later else "in the same step"
+        if not helpful:
+            return [f"None of these settings reduces the slip {time} by more than 10 %."]
+        head = f"Settings that help (slip {time}, {format_size(before)} m/s as it is):"
+        return [
+            head,
+            *(f"  {r.setting}: {format_size(get_slip(r))} m/s" for r in sorted(helpful, key=get_slip)),
+        ]
 
 
 def explain_slip(
@@ -255,13 +283,13 @@ def explain_slip(
             "describe the same step of the same model"
         )
     surface = (
-        _find_surface_velocity(measured)
+        find_surface_velocity(measured)
         if surface_velocity is None
         else as_array("surface_velocity", surface_velocity, (measured.m,), unit="m/s")
     )
 
     def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
-        return _compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
+        return compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
 
     variants = [SlipVariant("engine", slip(problem, answer), residual(problem, answer).relative)]
 
@@ -300,7 +328,7 @@ def explain_slip(
     return SlipExplanation(names, tuple(variants))
 
 
-def _compute_slip(
+def compute_slip(
     problem: Problem, blocks: Sequence[int], velocity: FloatArray, surface: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Return the tangential velocity of each contact minus the surface's (tangents,) [m/s]."""
@@ -354,7 +382,7 @@ def _compute_free_row_velocities(problem: Problem) -> FloatArray:
     return np.asarray(problem.jacobian @ problem.velocity(np.zeros(problem.m)).ravel())
 
 
-def _find_surface_velocity(problem: Problem) -> FloatArray:
+def find_surface_velocity(problem: Problem) -> FloatArray:
     """Return the target (m,) [m/s] of rows without compliance, 0 on other rows and if the target is rounding."""
     free = _compute_free_row_velocities(problem)
     target = problem.b + free
@@ -377,223 +405,61 @@ def _replace_soft_friction(problem: Problem, surface: FloatArray) -> tuple[Probl
     return replace(problem, b=b, compliance=soft), True
 
 
-def _format_contact_speed(variant: SlipVariant, i: int) -> str:
-    """Format a contact's speed."""
-    if variant.note.startswith("not solved") or variant.note == UNDEFINED_LAW:
-        return NONE
-    return format_size(float(variant.speeds[i]))
-
-
-def explain_slip_of_states(
-    model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1
-) -> list[SlipExplanation]:
-    """Explain the slip of contacts of a MuJoCo model at given states.
-
-    Parameters
-    ----------
-    model : mujoco.MjModel
-    states : path of an .npz, "keyframes", or arrays, optional
-        As for `lavender.audit`: `states.npz` of an audit or a recording. Default: the model's initial state.
-    contacts : names or a part of names, optional
-        Geoms of the contacts to explain; default: all. States in which these geoms touch nothing are skipped.
-    steps : int, default 1
-        Steps that are simulated from each state, with its controls and without sleep; the last one is explained.
-
-    Returns
-    -------
-    list of SlipExplanation
-        One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings
-        of MuJoCo, each simulated from this state.
-
-    Raises
-    ------
-    InputError
-        No geom has one of the names.
-    """
-    from lavender.io import mujoco as adapter
-    from lavender.io.recorder import read_states, without_sleep
-
-    mj = adapter.import_mujoco()
-    model = without_sleep(mj, model)
-    entries = [contacts] if isinstance(contacts, str) else list(contacts or ())
-    geoms = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) or str(i) for i in range(model.ngeom)]
-    for entry in entries:
-        if model.nflex == 0 and not any(entry in name for name in geoms):
-            known = ", ".join(geoms[:8])
-            raise InputError(
-                f"contacts names {entry!r}, but no geom's name contains it; the geoms are {known}"
-            )
-    data, before = mj.MjData(model), np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-    vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
-    explanations, fastest, start = [], -1, before
-    for vector in vectors:
-        mj.mj_resetData(model, data)
-        if vector is not None:
-            mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
-        for _ in range(steps - 1):
-            mj.mj_step(model, data)
-        mj.mj_forward(model, data)
-        mj.mj_getState(model, data, before, mj.mjtState.mjSTATE_INTEGRATION)
-        problem, disk, surface = _read_step(mj, model, data)
-        measured = problem if disk is None else disk
-        names = [measured.block_name(k) for k in np.flatnonzero(measured.cones.n_tangents > 0).tolist()]
-        touching = [entry for entry in entries if any(entry in name for name in names)]
-        if touching or (names and not entries):
-            explanations.append(
-                explain_slip(
-                    problem,
-                    adapter.impulse(model, data),
-                    contacts=touching or None,
-                    disk=disk,
-                    surface_velocity=surface,
-                )
-            )
-            if fastest < 0 or _get_largest_speed(explanations[-1]) > _get_largest_speed(
-                explanations[fastest]
-            ):
-                fastest, start = len(explanations) - 1, before.copy()
-    if fastest >= 0 and _get_largest_speed(explanations[fastest]) > MIN_EXPLAINED_SLIP:
-        speeds = explanations[fastest].variants[0].speeds
-        name = _get_geoms(explanations[fastest].contacts[int(np.argmax(speeds))])
-        remedies = tuple(
-            Remedy(text, *(_simulate_slip(mj, changed, start, name, n) for n in (0, REMEDY_STEPS)))
-            for text, changed in _change_settings(mj, model)
-        )
-        explanations[fastest] = replace(explanations[fastest], remedies=remedies)
-    return explanations
-
-
-def _get_largest_speed(explanation: SlipExplanation) -> float:
-    """Return the sliding speed of the fastest contact [m/s]."""
-    return float(explanation.variants[0].speeds.max(initial=0.0))
-
-
-def _get_geoms(contact: str) -> str:
+def get_geoms(contact: str) -> str:
     """Return the names of both geoms of a contact, without the contact's number."""
     return contact.partition(" (")[2].rstrip(")") or contact
 
 
-def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None, FloatArray | None]:
-    """Return a step's problem, the one with disks if cones are pyramids, and surface velocities if geoms have them."""
-    from lavender.io import mujoco as adapter
-
-    problem, disk, final = adapter.from_mujoco(model, data), None, data
-    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
-        round_model = copy.deepcopy(model)
-        round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
-        final = mj.MjData(round_model)
-        state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-        mj.mj_setState(round_model, final, state, mj.mjtState.mjSTATE_INTEGRATION)
-        mj.mj_forward(round_model, final)
-        disk = adapter.from_mujoco(round_model, final)
-    if not getattr(model, "flg_surfacevel", False):
-        return problem, disk, None
-    measured = problem if disk is None else disk  # MuJoCo subtracts the surfaces' velocities from J v.
-    return problem, disk, measured.jacobian @ data.qvel - final.efc_vel
-
-
-def _change_settings(mj: Any, model: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the text of each setting that can reduce slip, with the changed model; first the model as it is."""
-    yield "as it is", model
-    ratio, iterations = 10.0 * model.opt.impratio, 10 * int(model.opt.iterations)
-    options: dict[str, dict[str, Any]] = {
-        f'iterations="{iterations}" tolerance="1e-12"': {"iterations": iterations, "tolerance": 1e-12},
-        f'impratio="{ratio:g}"': {"impratio": ratio},
-        'noslip_iterations="20"': {"noslip_iterations": 20},
-    }
-    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
-        cone = {"cone": mj.mjtCone.mjCONE_ELLIPTIC}
-        options |= {'cone="elliptic"': cone} | {
-            f'cone="elliptic" {text}': cone | values for text, values in list(options.items())[1:]
-        }
-    for text, values in options.items():
-        changed = copy.deepcopy(model)
-        for name, value in values.items():
-            setattr(changed.opt, name, value)
-        yield f"<option {text}/>", changed
-    shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
-    if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
-        changed = copy.deepcopy(model)
-        for solref in (changed.geom_solref, changed.pair_solref):
-            solref[solref[:, 0] > shortest] = shortest, 1.0
-        yield f'<geom solref="{shortest:g} 1"/>', changed
-
-
-def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str, steps: int) -> float:
-    """Return the mean sliding speed [m/s] of two geoms in the step after `steps` steps; nan if they do not touch."""
-    data = mj.MjData(model)
-    mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    for _ in range(steps):
-        mj.mj_step(model, data)
-    mj.mj_forward(model, data)
-    problem, disk, surface = _read_step(mj, model, data)
-    measured = problem if disk is None else disk
-    sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-    blocks = [k for k in sliding if _get_geoms(measured.block_name(k)) == geoms]
-    surface = _find_surface_velocity(measured) if surface is None else surface
-    mj.mj_step(model, data)
-    speeds = [np.linalg.norm(v) for v in _compute_slip(measured, blocks, data.qvel, surface)]
-    return float(np.mean(speeds)) if speeds else np.nan
-
-
-@dataclass(frozen=True, eq=False)
-class AverageSlip:
-    """Slip of one contact, averaged over the points and steps in which it occurred.
+@dataclass(frozen=True)
+class ContactSlip:
+    """Slip of one contact, or the mean over its points and the states in which it occurred.
 
     Parameters
     ----------
     contact : str
-        Names of both geoms, without the number of the contact.
+        Name of the contact; for a mean, the names of both geoms.
     count : int
-        Number of contact points between these geoms, summed over all steps.
-    speeds : (variants,) m/s
+        Number of contact points, summed over all states.
+    speed : float, m/s
     parts : dict
         Cause -> part of the slip [m/s].
     """
 
     contact: str
     count: int
-    speeds: FloatArray
+    speed: float
     parts: dict[str, float]
 
     @property
     def cause(self) -> str:
         """Dominant cause: the largest part; "no slip" below 1e-6 m/s."""
-        return (
-            max(self.parts, key=lambda c: self.parts[c]) if self.speeds[0] > MIN_EXPLAINED_SLIP else "no slip"
-        )
+        return max(self.parts, key=lambda c: self.parts[c]) if self.speed > MIN_EXPLAINED_SLIP else "no slip"
 
 
-def average_slip(explanations: Iterable[SlipExplanation]) -> list[AverageSlip]:
-    """Return the slip of each contact, averaged over its points in several steps."""
-    speeds: dict[str, list[list[float]]] = {}
-    parts: dict[str, dict[str, float]] = {}
-    for explanation in explanations:
-        for i, contact in enumerate(explanation.contacts):
-            key = _get_geoms(contact)
-            speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
-            sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
-            for cause, sizes in explanation.parts.items():
-                sums[cause] += float(sizes[i])
+def average_slip(explanations: Iterable[SlipExplanation]) -> list[ContactSlip]:
+    """Return the slip of each pair of geoms, averaged over its points in several states."""
+    groups: dict[str, list[ContactSlip]] = {}
+    for slip in (slip for explanation in explanations for slip in explanation.slips):
+        groups.setdefault(get_geoms(slip.contact), []).append(slip)
     return [
-        AverageSlip(
-            key, len(values), np.mean(values, axis=0), {c: x / len(values) for c, x in parts[key].items()}
+        ContactSlip(
+            geoms, len(slips), float(np.mean([slip.speed for slip in slips])),
+            {cause: float(np.mean([slip.parts[cause] for slip in slips])) for cause in CAUSES.values()},
         )
-        for key, values in speeds.items()
-    ]
+        for geoms, slips in groups.items()
+    ]  # fmt: skip
 
 
 def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
-    """Return the mean sliding speed of each contact [m/s] in each variant over several steps, and its main cause."""
-    explanations = list(explanations)
-    names = [variant.name for variant in explanations[0].variants] if explanations else []
-    undefined = {  # Variants without values in one of the steps.
-        k for e in explanations for k, variant in enumerate(e.variants) if variant.note == UNDEFINED_LAW
-    }
-    rows = []
-    for a in average_slip(explanations):
-        speeds = [NONE if k in undefined else format_size(x) for k, x in enumerate(a.speeds.tolist())]
-        rows.append([a.contact, str(a.count), *speeds, a.cause])
-    heads = ["contact", "steps x points", *(f"{name} [m/s]" for name in names), "dominant cause"]
-    return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))
+    """Return the mean sliding speed of each pair of geoms [m/s] over several states, its largest part and the cause."""
+    return _tabulate_slip(average_slip(explanations))
+
+
+def _tabulate_slip(slips: Iterable[ContactSlip]) -> Table:
+    """Return a table of contacts; a contact without slip has no part."""
+    rows = [
+        [s.contact, str(s.count), format_size(s.speed), format_size(s.parts.get(s.cause, 0.0)), s.cause]
+        for s in slips
+    ]
+    heads = ["contact", "points", "slip [m/s]", "largest part [m/s]", "cause of this part"]
+    return Table(heads, rows, words=frozenset({"contact", "cause of this part"}))

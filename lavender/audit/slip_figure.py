@@ -49,7 +49,7 @@ def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:
         raise InputError(
             "the explanations have no contact to draw: at least one step with a contact is needed"
         )
-    fastest = sorted(averages, key=lambda a: -a.speeds[0])[:MAX_DRAWN_CONTACTS]
+    fastest = sorted(averages, key=lambda a: -a.speed)[:MAX_DRAWN_CONTACTS]
     figure = Figure(figsize=(WIDTH, MARGIN_HEIGHT + BAR_HEIGHT * len(fastest)), layout="constrained")
     axes = figure.add_subplot()
     labels = [f"{a.contact}\n{format_count(a.count, 'point')}".replace("$", r"\$") for a in fastest]
@@ -58,7 +58,7 @@ def draw_slip(explanations: Iterable[SlipExplanation]) -> Figure:
         parts = [a.parts[cause] for a in fastest]
         axes.barh(labels, parts, left=left, color=color, label=cause, height=0.6)
         left = [x + part for x, part in zip(left, parts, strict=True)]
-    speeds = [float(a.speeds[0]) for a in fastest]
+    speeds = [a.speed for a in fastest]
     axes.plot(speeds, labels, "|k", markersize=18, markeredgewidth=2, label="speed in the engine's answer")
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.05 * max(*left, *speeds) or 1.0)

@@ -10,9 +10,6 @@ from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_escaped
 from lavender.io.stored import check_figure_path, check_writable, write_figure
 
-# Columns that a narrow terminal leaves out, in this order.
-NARROW_SLIP_OMITS = ("steps x points", "coulomb [m/s]", "hard [m/s]", "disk [m/s]")
-
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
@@ -30,19 +27,22 @@ NARROW_SLIP_OMITS = ("steps x points", "coulomb [m/s]", "hard [m/s]", "disk [m/s
 def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None) -> None:
     """Explain why contacts of a MuJoCo model slip.
 
-    MODEL.xml is an MJCF file. For each contact, the table shows its mean sliding speed in the engine's answer, in the
-    exact solution of the same problem, with round cones, with friction that is not softened, and with Coulomb's law.
-    The dominant cause is the replacement that changes the speed most, or a load above the friction limit. The sentence
-    below the table names the cause of the fastest contact, and a remedy. Settings of MuJoCo are then tried: the second
-    table shows the slip of this contact with each, in the same step and 25 steps later.
+    MODEL.xml is an MJCF file. The first table shows the speed of each contact along its surface after the step, and
+    the largest part of this speed with its cause: unfinished solving, shape of the cone, softness of friction, convex
+    relaxation, or sliding at the friction limit. A part is the change of the speed if this property is replaced, too:
+    exact solution, round cone, hard friction, Coulomb's law. Settings of MuJoCo are then simulated. The second table
+    shows the speed of the fastest contact with each, in the same step and 25 steps later; the last lines name the
+    settings that help.
 
     Exit code 1: no state has a contact with friction.
     """
-    from lavender.audit.slip import explain_slip_of_states, summarize_slip
+    from lavender.audit.slip import summarize_slip
     from lavender.audit.slip_figure import draw_slip
+    from lavender.audit.slip_states import explain_slip_of_states
     from lavender.base.arrays import check_int
     from lavender.io.recorder import can_sleep, load_model
     from lavender.report.terminal import print_table
+    from lavender.report.text import format_count
 
     steps = check_int("steps", steps, 1)
     if out is not None:
@@ -63,10 +63,19 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
         raise click.exceptions.Exit(EXIT_UNMET)
     if out is not None:
         write_figure(draw_slip(explanations), out)
-    print_table(make_console(), summarize_slip(explanations), optional=NARROW_SLIP_OMITS)
-    worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
-    n = next(i for i, e in enumerate(explanations, 1) if e is worst)
-    place = f"State {n} of {len(explanations)} with contact: " if len(explanations) > 1 else ""
-    print_escaped(place + worst.sentence)
-    if worst.remedies:
-        print_table(make_console(), worst.remedies_table)
+    console = make_console()
+    print_table(console, summarize_slip(explanations), optional=("points",))
+    n = len(explanations)
+    print_escaped(
+        f"slip: mean over the points of {format_count(n, 'state')} with contact, in one step of each"
+    )
+    worst = max(range(n), key=lambda k: explanations[k].variants[0].speeds.max(initial=0.0))
+    if n > 1:
+        print_escaped(f"\nState {worst + 1} of these has the fastest contact:")
+    print_escaped("\n".join(explanations[worst].sentences))
+    if explanations[worst].remedies:
+        print_escaped(
+            f"\nSettings simulated from {format_count(explanations[worst].n_states, 'state')}, mean slip:"
+        )
+        print_table(console, explanations[worst].remedies_table)
+        print_escaped("\n".join(explanations[worst].advice))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import CAUSES, REMEDY_STEPS, average_slip, explain_slip, explain_slip_of_states, summarize_slip
+from lavender.audit.slip import CAUSES, REMEDY_STEPS, SLIDING_STATES, average_slip, explain_slip, summarize_slip
 from lavender.audit.slip_figure import draw_slip
-from lavender.report.text import NONE
+from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -60,7 +60,7 @@ def test_above_the_friction_angle_the_load_is_too_large():
     angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
     steps = 150
     explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
-    assert set(explanation.causes) == {"load above the friction limit"}
+    assert set(explanation.causes) == {"sliding at the friction limit"}
     expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
     assert explanation.variants[-1].speeds == pytest.approx(np.full(len(explanation.contacts), expected), rel=0.05)
 
@@ -95,7 +95,7 @@ def test_the_convex_relaxation_is_a_cause():
     speeds = {v.name: v.speeds[0] for v in explanation.variants}
     assert speeds["solved"] == pytest.approx(1.2) and speeds["coulomb"] == pytest.approx(1.5)
     assert explanation.parts["convex relaxation"] == pytest.approx([0.3])
-    assert explanation.parts["load above the friction limit"] == pytest.approx([1.5])
+    assert explanation.parts["sliding at the friction limit"] == pytest.approx([1.5])
 
 
 def test_the_shape_of_the_cone_is_a_cause():
@@ -107,7 +107,7 @@ def test_the_shape_of_the_cone_is_a_cause():
     assert explanation.parts["shape of the cone"] == pytest.approx([np.sqrt(2.0) - 0.5 - np.sqrt(0.5)])
 
 
-@pytest.mark.parametrize(("grip", "cause"), [(30.0, "softness of friction"), (6.0, "load above the friction limit")])
+@pytest.mark.parametrize(("grip", "cause"), [(30.0, "softness of friction"), (6.0, "sliding at the friction limit")])
 def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
     # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
@@ -139,7 +139,7 @@ def test_chosen_contacts_and_summary():
     explanations = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
     table = summarize_slip(explanations)
     assert [str(row[0]) for row in table.rows] == ["slope, box"]
-    assert table.rows[0][-1] == "load above the friction limit"
+    assert table.rows[0][-1] == "sliding at the friction limit"
     with pytest.raises(lv.InputError, match="but no geom's name contains it"):
         explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
 
@@ -151,7 +151,7 @@ def test_bars_of_the_figure_are_the_parts():
     assert [bar.get_label() for bar in axes.containers] == list(CAUSES.values())
     widths = [float(bar.patches[0].get_width()) for bar in axes.containers]
     assert widths == pytest.approx(list(average.parts.values()), rel=1e-6)
-    assert axes.lines[0].get_xdata() == [average.speeds[0]] and average.count == len(explanations[0].contacts)
+    assert axes.lines[0].get_xdata() == [average.speed] and average.count == len(explanations[0].contacts)
     with pytest.raises(lv.InputError, match="have no contact to draw"):
         draw_slip([])
 
@@ -174,24 +174,53 @@ def test_problems_without_contacts_or_velocities_are_rejected():
         explain_slip(matrix, np.zeros(3))
 
 
-def test_the_sentence_names_a_remedy_that_works():
-    """A larger impratio, the remedy of softness, reduces the slip."""
-    angle = 0.3
-    soft = explain_slip_of_states(block(angle, option='cone="elliptic"'), steps=600)[0]
-    assert "impratio above 1" in soft.sentence
-    stiff = explain_slip_of_states(block(angle, option='cone="elliptic" impratio="10"'), steps=600)[0]
+def test_advice_lists_only_settings_whose_simulated_slip_is_smaller():
+    soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600)[0]
+    as_it_is, *others = soft.remedies
+    advised = [line.strip().rpartition(": ")[0] for line in soft.advice[1:]]
+    helpful = [r.setting for r in sorted(others, key=lambda r: r.later) if r.later <= 0.9 * as_it_is.later]
+    assert advised == helpful and '<option impratio="10"/>' in advised
+    # A larger friction coefficient does not reduce creep, although it is the first idea.
+    assert 'friction="1" of slope and box' in {r.setting for r in others} - set(advised)
+    stiff = explain_slip_of_states(block(0.3, option='cone="elliptic" impratio="10"'), steps=600)[0]
     # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
     assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
 
 
-def test_a_law_that_is_not_defined_has_no_value():
+def test_sentences_of_a_sliding_box_state_that_friction_brakes_it_and_that_no_setting_helps():
+    # At 1 m/s on a slope of tan 0.2 with friction 0.4, friction exceeds the load.
+    model = block(0.2, friction=0.4)
+    states = {"qpos": model.qpos0[None], "qvel": np.eye(model.nv)[:1]}
+    (explanation,) = explain_slip_of_states(model, states, steps=10)
+    assert dominant(explanation) == "sliding at the friction limit"
+    assert SLIDING_STATES[0] in explanation.sentences
+    i = int(np.argmax(explanation.variants[0].speeds))
+    assert 0.0 < explanation.friction_use[i] <= 1.0 + 1e-6  # Friction is within the cone, up to MuJoCo's tolerance.
+    best = min(r.later for r in explanation.remedies[1:] if not np.isnan(r.later))
+    assert best > 0.9 * explanation.remedies[0].later
+    assert explanation.advice == ["None of these settings reduces the slip 25 steps later by more than 10 %."]
+
+
+def test_sentences_of_an_accelerating_box_state_that_the_load_is_above_the_limit():
+    (explanation,) = explain_slip_of_states(block(0.6, 0.5, 'cone="elliptic"'), steps=50)
+    assert SLIDING_STATES[1] in explanation.sentences
+
+
+def test_settings_are_simulated_from_all_states_with_the_fastest_contact():
+    model = block(0.2, friction=0.4, option='cone="elliptic"')
+    speeds = np.array([0.5, 1.0, 0.2])
+    model.qpos0[2] -= 0.0001  # The box touches the slope in its first step.
+    states = {"qpos": np.repeat(model.qpos0[None], 3, axis=0), "qvel": speeds[:, None] * np.eye(model.nv)[:1]}
+    explanations = explain_slip_of_states(model, states, steps=1)
+    assert [e.n_states for e in explanations] == [0, 3, 0]
+    alone = [explain_slip_of_states(model, {k: x[i : i + 1] for k, x in states.items()}, steps=1)[0] for i in range(3)]
+    assert explanations[1].remedies[0].slip == pytest.approx(np.mean([e.remedies[0].slip for e in alone]))
+
+
+def test_a_law_that_is_not_defined_is_stated():
     explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100)
-    table = explanations[0].table
-    column = table.heads.index("coulomb [m/s]")
-    assert {str(row[column]) for row in table.rows} == {NONE}
-    assert "not defined" in explanations[0].sentence
-    summary = summarize_slip(explanations)
-    assert all(str(row[summary.heads.index("coulomb [m/s]")]) == NONE for row in summary.rows)
+    assert "Variant 'coulomb': Coulomb's law is not defined for its round cones." in explanations[0].sentences
+    assert explanations[0].parts["convex relaxation"] == pytest.approx([0.0] * len(explanations[0].contacts))
 
 
 def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
@@ -218,7 +247,7 @@ def test_explain_slip_box_carried_by_conveyor_does_not_slip(form):
     problem = conveyor(form, belt=2.0)
     explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
     assert explanation.variants[0].speeds == pytest.approx([0.95])
-    assert explanation.causes == ("load above the friction limit",)
+    assert explanation.causes == ("sliding at the friction limit",)
 
 
 @pytest.mark.parametrize("form", ["bodies", "J and M"])
@@ -278,7 +307,7 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
             speeds = np.linalg.norm((jacobians @ following.qvel)[:, :2], axis=1)  # The normal is z.
             assert speeds.mean() == pytest.approx(expected, rel=1e-6, abs=1e-12), text
     best = min(explanation.remedies, key=lambda remedy: remedy.later)
-    assert best.setting in explanation.sentence
+    assert best.setting in explanation.advice[1]
     assert best.later < 0.3 * explanation.remedies[0].later
 
 
