@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float, check_int, mark_read_only
+from lavender.base.arrays import FloatArray, check_int, mark_read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
@@ -29,7 +29,7 @@ from lavender.solving.limits import check_time_limit
 from lavender.solving.loop import MIN_TIME_LIMIT
 from lavender.solving.prepared import Prepared, check_accepted, check_arguments
 from lavender.solving.solve import solve
-from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
+from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity, check_velocity_tolerance
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite
 
@@ -374,6 +374,7 @@ def solve_many(
     threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), check_time_limit(time_limit)
     if velocity_tol is not None:
+        velocity_tol = check_velocity_tolerance(velocity_tol, tol)
         tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_arguments(spec, None, tol, max_iter)
@@ -449,7 +450,6 @@ def solve_many(
 
 def _compute_tolerance_for_velocity_error(worlds: Any, velocity_tol: float) -> float:
     """Return the relative residual that guarantees a velocity error [m/s] in every valid world."""
-    velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if isinstance(worlds, Batch):
         # The velocity error of the zero impulse does not depend on the impulse that is judged.
         references = residual_many(worlds, np.zeros(worlds.shape), errors="status").velocity_at_zero

@@ -96,9 +96,9 @@ class Problem(Builders):
     def carry(self, previous: Any, keys: Any = None) -> FloatArray:
         """Build a start (m,) [N s] from the impulses of the previous step, which are assigned to blocks by their keys.
 
-        Blocks without a previous impulse, or with another kind or number of rows, start at Pi(0). If a problem has no
-        keys, the impulses are used if both problems have the same blocks. Tangent impulses are not rotated: use the
-        same tangent directions of a contact in every step.
+        Blocks without a previous impulse, or with another kind or number of rows, start at Pi(0). Problems without keys
+        must have the same blocks. Tangent impulses are not rotated: use the same tangent directions of a contact in
+        every step.
 
         Parameters
         ----------
@@ -114,8 +114,8 @@ class Problem(Builders):
         Raises
         ------
         InputError
-            `previous` is not a solution; `keys` does not have k entries; or `keys` is given, and `previous` has no
-            keys.
+            `previous` is not a solution; `keys` does not have k entries; or a problem has no keys, and the blocks of
+            both differ or `keys` is given.
 
         Examples
         --------
@@ -141,13 +141,25 @@ class Problem(Builders):
             if before.key is None:
                 raise InputError("the problem of the previous step has no keys: build it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
-        start = self.start()
+        start = self._carry(before, impulse)
+        if start is None:
+            keyless = " and ".join(
+                name for name, p in (("this problem", self), ("the previous one", before)) if p.key is None
+            )
+            raise InputError(
+                f"no keys in {keyless}, and the blocks differ ({self.cones.n_blocks} now, {before.cones.n_blocks} "
+                "before), so that impulses cannot be assigned: build both problems with key= (lv.RowBuilder does), or "
+                "solve without impulse="
+            )
+        return start
+
+    def _carry(self, before: Problem, impulse: FloatArray) -> FloatArray | None:
+        """Build a start as `carry` does; None if a problem has no keys and the blocks differ."""
         old_cones, new_cones = before.cones, self.cones
         if self.key is None or before.key is None:
             same_kind = np.array_equal(old_cones.kind, new_cones.kind)
-            if same_kind and np.array_equal(old_cones.ptr, new_cones.ptr):
-                start[:] = impulse
-            return start
+            return impulse.copy() if same_kind and np.array_equal(old_cones.ptr, new_cones.ptr) else None
+        start = self.start()
         old_block_of = {key: block for block, key in enumerate(before.key.tolist())}
         for block, key in enumerate(self.key.tolist()):
             old_block = old_block_of.get(key)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import Parameter, signature
-from math import hypot, inf
+from math import dist, hypot, inf
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
@@ -313,6 +313,18 @@ class RowAssembly:
             self._check_frame(x)
         elif block_type == "slider":
             x["axis"] = self._check_direction("axis", x["axis"])
+        elif block_type == "distance":
+            length = dist(x["anchor_a"], x["anchor_b"]) if x["length"] is None else x["length"]
+            if not length > MIN_MAGNITUDE:
+                cause = (
+                    "anchor_a and anchor_b coincide and length is None"
+                    if x["length"] is None
+                    else "length is 0"
+                )
+                raise InputError(
+                    f"{cause}; a positive length is needed, as a rod of length 0 has no direction: give length, or "
+                    "use ball for two points that coincide"
+                )
         elif block_type == "spring":
             k, c = x["stiffness"], x["damping"]
             if self._dt * (c + self._dt * k) < MIN_MAGNITUDE:

@@ -213,7 +213,8 @@ class RowBuilder(RowAssembly):
         anchor_a, anchor_b : array-like (2,) or (3,), m
             Points on a and on b, in world coordinates.
         length : float, m, optional
-            Distance to keep. Default: the present distance.
+            Distance to keep, above 0. Default: the present distance. If the anchors coincide, the rod pushes b away
+            from a along y in two dimensions and along z in three.
         """
         return self._add("distance", a, b, feature, name, anchor_a, anchor_b, length)
 
@@ -231,7 +232,8 @@ class RowBuilder(RowAssembly):
         anchor_a, anchor_b : array-like (2,) or (3,), m
             Points on a and on b, in world coordinates.
         length : float, m
-            Length of the spring at rest.
+            Length of the spring at rest. If the anchors coincide, the spring acts along y in two dimensions and along
+            z in three.
         stiffness : float, N/m
             k; at least one of `stiffness` and `damping` is positive.
         damping : float, N s/m, default 0

@@ -150,6 +150,7 @@ class Rows:
             "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
         }  # fmt: skip
         object.__setattr__(self, "joint_ptr", ptr)
+        self._check_joint_counts(ptr)
         nonempty = []
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -173,6 +174,16 @@ class Rows:
             self._correct_rounding_or_raise(fault, index)
         # `copy=False` applies to this call only, not to later `replace` calls.
         object.__setattr__(self, "copy", True)
+
+    def _check_joint_counts(self, ptr: IntArray) -> None:
+        """Raise InputError if `joint_ptr` describes other joints than `jac` and `joint_body`."""
+        rows, joints = get_shape("jac", self.jac), get_shape("joint_body", self.joint_body)
+        if len(rows) == 2 and len(joints) == 2 and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
+            raise InputError(
+                f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
+                f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed: "
+                f"joint_ptr=[0, {rows[0]}] and joint_body=[[a, b]] for one joint of {rows[0]} rows"
+            )
 
     def _correct_rounding_or_raise(self, fault: str, index: int) -> None:
         """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""

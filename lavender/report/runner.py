@@ -72,9 +72,12 @@ class Event:
 
 
 def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
-    """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
+    """Return the start of `problem` (m,) [N s] from the impulses of the previous step, if they can be assigned."""
     check_problem(problem)
-    return problem.carry((before, impulse))
+    if not isinstance(before, Problem):
+        raise InputError(f"before is a {type(before).__name__}; the problem of the previous step is needed")
+    start = problem._carry(before, before.impulse_array(impulse))
+    return problem.start() if start is None else start
 
 
 def remove_times(record: Record, time_limit: float) -> Record:

@@ -223,7 +223,7 @@ class Prepared:
         original = self._original if problem is None else problem
         if velocity_tol is not None:
             check_problem(original)
-            tol = relative_tolerance(original, velocity_tol)
+            tol = relative_tolerance(original, velocity_tol, tol)
         if not self._lock.acquire(False):
             raise InUse(
                 f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "

@@ -51,8 +51,8 @@ def solve(
         Relative residual to reach: 0 for an exact solution, 1 for zero impulses (see `judge.residuals`). `tol=0` runs
         exactly `max_iter` iterations; `auto` and solvers that factor end earlier if nothing can be gained.
     velocity_tol : float, optional, m/s (rad/s on angular rows)
-        Velocity error to reach on every row, whatever the relative residual; `tol` is not used. Solvers run to the
-        relative residual that guarantees it (`lavender.solving.velocity`), and `success` refers to it.
+        Velocity error to reach on every row, given in place of `tol`, whatever the relative residual. Solvers run to
+        the relative residual that guarantees it (`lavender.solving.velocity`), and `success` refers to it.
     max_iter : int, optional
         Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: the limit of the
         solver's spec.
@@ -85,7 +85,7 @@ def solve(
     CapabilityError
         The solver does not accept this problem or option; the message says why.
     InputError
-        `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid.
+        `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `tol` and `velocity_tol` are given.
     """
     begun = 0.0 if time_limit is None else perf_counter()
     if type(problem) is not Problem:  # Check this first, because a frequent error is to pass A and b.
@@ -98,7 +98,7 @@ def solve(
     spec = get(solver) if isinstance(solver, str) else _reject_solver(solver)
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if velocity_tol is not None:
-        tol = relative_tolerance(problem, velocity_tol)
+        tol = relative_tolerance(problem, velocity_tol, tol)
     solution: Solution | None = None
     failed_call: tuple[int, ...] | None = None
     is_default = max_iter is None and callback is None and history is False and not options

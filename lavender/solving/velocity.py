@@ -14,16 +14,34 @@ from __future__ import annotations
 from typing import Any
 
 from lavender.base.arrays import check_float
+from lavender.base.errors import InputError
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
 
 # [-] Relative residual of the zero impulse: it is accepted if its own error is small enough.
 MAX_VELOCITY_TOLERANCE = 1.0
+DEFAULT_TOLERANCE = 1e-6  # [-] Default of `tol` of all solves.
 UNFINISHED = (Status.MAX_ITERATIONS, Status.STALLED, Status.TIME_LIMIT)
 
 
-def relative_tolerance(problem: Problem, velocity_tol: float) -> float:
+def check_velocity_tolerance(velocity_tol: float, tol: float) -> float:
+    """Return `velocity_tol` [m/s] as a float.
+
+    Raises
+    ------
+    InputError
+        `velocity_tol` is not above 0, or `tol` is not its default.
+    """
+    velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
+    if tol != DEFAULT_TOLERANCE:
+        raise InputError(
+            f"tol is {tol:g} and velocity_tol is {velocity_tol:g}; a solve has one stopping test: leave one of them out"
+        )
+    return velocity_tol
+
+
+def relative_tolerance(problem: Problem, velocity_tol: float, tol: float) -> float:
     """Return the relative residual (1) that guarantees a velocity error.
 
     Parameters
@@ -31,13 +49,15 @@ def relative_tolerance(problem: Problem, velocity_tol: float) -> float:
     problem : Problem
     velocity_tol : float, m/s
         Largest accepted velocity error of a row (rad/s on angular rows).
+    tol : float
+        Relative residual of the same call, which must be the default.
 
     Raises
     ------
     InputError
-        `velocity_tol` is not above 0.
+        `velocity_tol` is not above 0, or `tol` is not its default.
     """
-    velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
+    velocity_tol = check_velocity_tolerance(velocity_tol, tol)
     reference = residual(problem, problem.start()).velocity_at_zero if problem.m else 0.0
     return (
         min(velocity_tol / reference, MAX_VELOCITY_TOLERANCE) if reference > 0.0 else MAX_VELOCITY_TOLERANCE

@@ -263,7 +263,10 @@ cdef class RowBlocks:
             self.append_angular_row(x, UNIT[k], UNIT[k], error[k])
 
     cdef bint compute_line(self, const arguments_t* x, double* direction, double* size) noexcept:
-        """Compute unit vector and length of the line between both points; return whether they are given."""
+        """Compute unit vector and length of the line between both points; return whether they are given.
+
+        If the points coincide, the vector is y in two dimensions and z in three.
+        """
         cdef double[3] offset
         if not (x.given[0] and x.given[1]):
             return False
@@ -344,6 +347,8 @@ cdef class RowBlocks:
             if not self.compute_line(x, first, &size) or number[0] < 0.0:
                 return False
             bound = size if isnan(number[0]) else number[0]
+            if not bound > min_magnitude():                # A rod of length 0 has no direction.
+                return False
             self.append_linear_row(x, first, x.vector[0], x.vector[1], size - bound)
         elif kind == SPRING:
             stiffness, damping = number[1], number[2]

@@ -51,7 +51,7 @@ CALLS = {
     "report.make_sequence": Call(report.make_sequence, {"problems": [LCP], "name": "walk"}),
     "report.select_solver_names": Call(lambda solvers: report.select_solver_names(solvers), {"solvers": ["pgs"]}),
     "report.carry_impulses": Call(
-        report.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}
+        report.carry_impulses, {"before": LCP, "impulse": B, "problem": LCP}
     ),
     "report.classify_structure": Call(report.classify_structure, {"problem": LCP}),
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),

@@ -320,6 +320,26 @@ def test_a_tangent_can_be_chosen():
     np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
 
 
+@pytest.mark.parametrize(("length", "cause"), [(None, "coincide and length is None"), (0.0, "length is 0")])
+def test_rod_of_length_zero_raises_an_error_that_recommends_ball(length, cause):
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
+    point = (0.0, 0.0, 1.0)
+    lengths = {} if length is None else {"length": [1.0, length]}
+    with pytest.raises(lv.InputError, match=f"{cause}.*use ball"):
+        builder.distance(-1, 0, point, point, length)
+    with pytest.raises(lv.InputError, match=f"distance 1: .*{cause}"):
+        builder.joints("distance", [(-1, 0)] * 2, anchor_a=[(1.0, 0.0, 0.0), point], anchor_b=[point] * 2, **lengths)
+
+
+def test_rod_with_coinciding_anchors_pushes_b_along_z():
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
+    point = (0.0, 0.0, 0.0)
+    builder.distance(-1, 0, point, point, 1.0)
+    _, velocity = solved(builder, tol=1e-10)
+    # eq. 1: the rod is 1 m too short, and a step of length DT removes a fifth of it; v_z = 0.2 / DT to 1e-9 relative.
+    np.testing.assert_allclose(velocity[0, :3], [0.0, 0.0, 0.2 / DT], rtol=1e-9, atol=1e-9)
+
+
 #: Arguments of array calls in three dimensions by type of block; "point" and "axis" are random vectors.
 ARRAYS = {
     "ball": {"anchor": "point"},

@@ -136,7 +136,12 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
     solution = lv.solve(before, tol=1e-9)
     assert np.array_equal(before.carry(solution), solution.impulse)
     three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
-    assert three.carry((three, np.ones(3))).all() and not four.carry((three, np.ones(3))).any()
+    assert three.carry((three, np.ones(3))).all()
+    with pytest.raises(lv.InputError, match=r"this problem and the previous one, .* \(4 now, 3 before\), .*key="):
+        four.carry((three, np.ones(3)))
+    with pytest.raises(lv.InputError, match=r"no keys in the previous one, "):
+        dataclasses.replace(four, key=np.arange(4)).carry((three, np.ones(3)))
+    assert not lv.report.carry_impulses(three, np.ones(3), four).any()  # a report starts such a step from zero
     assert np.array_equal(dataclasses.replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (
         (np.zeros(7), None, "a Solution"),

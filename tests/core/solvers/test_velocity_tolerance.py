@@ -71,3 +71,17 @@ def test_prepared_and_many_take_it():
     batch = lv.Batch(jac, np.eye(2), v_free, cones=lv.Cones.contacts(0.5, tangents=1))
     many = lv.solve_many(batch, velocity_tol=1e-6)
     assert many.success.all() and (lv.residual_many(batch, many.impulse).velocity_error <= 1e-6).all()
+
+
+def test_a_tolerance_and_a_velocity_error_together_raise_an_error_that_names_both():
+    problem = contact_problem(0)
+    calls = (
+        lambda **more: lv.solve(problem, **more),
+        lambda **more: lv.prepare(problem, "pgs").solve(**more),
+        lambda **more: lv.solve_many([problem], **more),
+    )
+    for call in calls:
+        for tol in (0.0, 1e-9):
+            with pytest.raises(lv.InputError, match=f"tol is {tol:g} and velocity_tol is 0.001; .*leave one"):
+                call(tol=tol, velocity_tol=1e-3)
+        call(velocity_tol=1e-3)
