@@ -517,15 +517,23 @@ def _classify_coupling_graph(problem: Problem) -> tuple[str, int]:
 
 
 def _is_bilateral(problem: Problem) -> bool:
-    """Return whether more pairs of bodies share a joint than a contact; for a matrix, whether most blocks are free."""
+    """Return whether more pairs of bodies share a joint than a contact; for a matrix, whether most blocks are free.
+
+    A joint has a free row. Limits, motors, and contacts written as bounded rows (`Problem.boxed`) have none: they count
+    as contacts, unless a joint connects the same bodies.
+    """
     if problem.law == "linear":
         return True
     r, c = problem.rows, problem.cones
     if r is not None:
-        joints, contacts = (
-            len(np.unique(np.sort(x, axis=1), axis=0)) for x in (r.joint_body, r.contact_body)
-        )
-        return joints > contacts
+        n = c.ptr[r.n_joints]
+        free_rows = np.append(0, np.cumsum(np.isinf(c.lower[:n]) & np.isinf(c.upper[:n])))
+        has_free_row = np.diff(free_rows[c.ptr[: r.n_joints + 1]]) > 0
+        low, high = np.sort(r.block_bodies, axis=1).astype(np.int64).T
+        pairs = (low + 1) * (r.n_bodies + 1) + high
+        joints, bounded = pairs[: r.n_joints][has_free_row], pairs[: r.n_joints][~has_free_row]
+        contacts = np.append(pairs[r.n_joints :], np.setdiff1d(bounded, joints))
+        return len(np.unique(joints)) > len(np.unique(contacts))
     first = c.ptr[:-1][~c.is_contact]
     free = np.count_nonzero(np.isinf(c.lower[first]) & np.isinf(c.upper[first]))
     return bool(2 * free > c.n_blocks)

@@ -493,10 +493,24 @@ def make_pile_among_separate_rows():
     return lv.Problem.lcp(np.maximum(a, a.T), np.ones(106))
 
 
+def make_driven_chain(n=6):
+    """Bars in a plane; each joint has a hinge, a limit and a motor."""
+    position = np.column_stack([np.arange(n) + 0.5, np.zeros(n)])
+    builder = lv.RowBuilder(np.ones(n), np.full(n, 3.0), np.tile([0.0, -0.1, 0.0], (n, 1)), 1 / 60, position)
+    for i in range(n):
+        builder.hinge(i - 1, i, (float(i), 0.0))
+        builder.limit(i - 1, i, value=0.0, lower=-1.0, upper=1.0)
+        builder.motor(i - 1, i, speed=0.0, max_torque=1.0)
+    return builder.problem()
+
+
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
         (chain(6), ("chain",)),
+        (make_driven_chain(), ("chain", "redundant")),
+        (suite.case("boxed_friction(n=2)").problem, ("stack", "redundant")),
+        (suite.case("boxed_friction(n=3, scene=granular)").problem, ("pile", "redundant")),
         (lv.Problem.linear(*spd(20)), ("dense",)),
         (stack(6), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
