@@ -273,6 +273,23 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
   return i < 0 ? LAV_OK : refuse(at, LAV_ERROR_NUMBER, name, i);
 }
 
+/* Return the index of the largest of three numbers. */
+static int64_t find_largest(const double *x) {
+  const int64_t i = fabs(x[1]) > fabs(x[0]) ? 1 : 0;
+  return fabs(x[2]) > fabs(x[i]) ? 2 : i;
+}
+
+/* Return the first entry of an invalid inverse inertia that is negative on the diagonal, or differs from its mirror image. */
+static int64_t find_inertia_entry(const double *t) {
+  int64_t i, j;
+  for (i = 0; i < 3; i++)
+    if (t[4 * i] < 0.0) return 4 * i;
+  for (i = 0; i < 3; i++)
+    for (j = i + 1; j < 3; j++)
+      if (fabs(t[3 * i + j] - t[3 * j + i]) > ROUNDED * fabs(t[4 * i])) return 3 * i + j;
+  return 0;
+}
+
 #define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
 #define NEEDED(name, n) GIVE_BACK(check_numbers(q->name, (n), 1, #name, at))
 
@@ -280,6 +297,7 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   const int64_t n = q->n_bodies, c = q->n_blocks - q->n_joints, mj = q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints;
   rows_t r; /* The check reads only the fields that are set here. */
   const struct core_faults_body_tolerances_t tolerances = {ROUNDED, ROUNDED, ROUNDED, 0.0};
+  const char *vector;
   double length;
   int64_t i = 0;
   r.n_bodies = q->n_bodies;
@@ -304,14 +322,16 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   switch (core_faults_find_body_fault(&r, &tolerances, &i)) {
     case core_faults_FAULT_MASS: return refuse(at, q->inv_mass[i] < 0.0 ? LAV_ERROR_MASS : LAV_ERROR_NUMBER, "inv_mass", i);
     case core_faults_FAULT_INERTIA_SIZE: return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
-    case core_faults_FAULT_INERTIA: return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
+    case core_faults_FAULT_INERTIA:
+      return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i + find_inertia_entry(q->inv_inertia + 9 * i));
     case core_faults_FAULT_JOINT_BODY: return refuse(at, LAV_ERROR_INDEX, "joint_body", i);
     case core_faults_FAULT_JOINT_PAIR: return refuse(at, LAV_ERROR_PAIR, "joint_body", 2 * i);
     case core_faults_FAULT_CONTACT_BODY: return refuse(at, LAV_ERROR_INDEX, "contact_body", i);
     case core_faults_FAULT_CONTACT_PAIR: return refuse(at, LAV_ERROR_PAIR, "contact_body", 2 * i);
     case core_faults_FAULT_FRAME:
       length = core_rows_dot3(q->normal + 3 * i, q->normal + 3 * i);
-      return refuse(at, LAV_ERROR_FRAME, fabs(sqrt(length) - 1.0) <= ROUNDED ? "tangent" : "normal", 3 * i);
+      vector = fabs(sqrt(length) - 1.0) <= ROUNDED ? "tangent" : "normal";
+      return refuse(at, LAV_ERROR_FRAME, vector, 3 * i + find_largest((vector[0] == 'n' ? q->normal : q->tangent) + 3 * i));
   }
   return LAV_OK;
 }
