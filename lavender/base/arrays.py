@@ -8,7 +8,7 @@ solution, so the message about a number out of range suggests a unit to change.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -22,10 +22,8 @@ from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
-ArrayLike = (
-    npt.ArrayLike
-)  #: Type of arguments: a number, nested sequences of numbers, or an array; docstrings give shape and unit.
-
+#: Type of arguments: a number, nested sequences of numbers, or an array; docstrings give shape and unit.
+ArrayLike = npt.ArrayLike
 
 FLOAT64, FLOAT32, INT32 = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.int32)
 FLOAT_DTYPES = {FLOAT32, FLOAT64}  # Batches read arrays of these dtypes in place.
@@ -80,14 +78,7 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
     ):
         try:
             array = read(value)
-        except (
-            AttributeError,
-            BufferError,
-            NotImplementedError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:
+        except Exception as error:  # Every library raises other exceptions.
             reason = error
             continue
         if isinstance(array, np.ndarray) and array.dtype != object:
@@ -166,9 +157,7 @@ def as_array(
         copy = False
     row_shape = shape[1:]
     if array.shape == (0,) and row_shape and not shape[0] and None not in row_shape:
-        array = array.reshape(
-            0, *row_shape
-        )  # An empty list has shape (0,), whether it lists rows or numbers.
+        array = array.reshape(0, *row_shape)  # An empty list has shape (0,) if it lists rows, too.
     if not _matches_shape(array.shape, shape):
         sizes = ", ".join("any" if n is None else str(n) for n in shape)
         required = f"({sizes}{',' * (len(shape) == 1)})"
@@ -179,7 +168,8 @@ def as_array(
             "-2^31 to 2^31 - 1 are needed"
         )
     if array.dtype.itemsize > 8:
-        array = _round_to_float64(array)
+        with np.errstate(over="ignore", under="ignore"):
+            array = array.astype(np.float64)  # Long doubles out of range become infinite without a warning.
     array = np.array(array, dtype, order="C") if copy else np.require(array, dtype, ["C", "A", "E"])
     if finite and array.dtype.kind == "f":
         check_finite_and_in_range(label, array, unit)
@@ -375,78 +365,63 @@ def as_array_view(name: str, value: Any, shape: tuple[int | None, ...]) -> np.nd
     return as_array(name, value.view() if type(value) is np.ndarray else value, shape, copy=False)
 
 
-def _round_to_float64(wide: np.ndarray) -> np.ndarray:
-    """Round long doubles to float64; numbers out of range become infinite without a warning."""
-    with np.errstate(over="ignore", under="ignore"):
-        return wide.astype(np.float64)
+def _raise_at_first(
+    name: str, requirement: str, array: np.ndarray, is_bad: Any, csr: Any = None, advice: str = ""
+) -> NoReturn:
+    """Raise InputError at the first entry of the mask `is_bad`; if `csr` is given, `array` is its data."""
+    bad = np.argwhere(is_bad)
+    index, value = bad[0], array[tuple(bad[0])]
+    if csr is not None:
+        row = np.searchsorted(csr.indptr, index[0], side="right") - 1
+        index = np.array([row, csr.indices[index[0]]])
+    raise InputError(
+        f"{name} must {requirement}; entry [{', '.join(map(str, index))}] is {value:g} ({len(bad)} such "
+        f"entries){advice}"
+    )
 
 
 def check_finite(name: str, array: np.ndarray, csr: Any = None) -> None:
     """Raise InputError at the first NaN or infinity of an array; if `csr` is given, `array` is its data."""
     if not all_finite(array.reshape(-1)):
-        bad = np.argwhere(~np.isfinite(array))
-        raise InputError(
-            f"{name} must be finite; entry [{_format_index(bad[0], csr)}] is {array[tuple(bad[0])]} "
-            f"({len(bad)} such entries)"
-        )
-
-
-def _format_index(index: np.ndarray, csr: Any) -> str:
-    """Format an index; with `csr`, the row and column of its data at this index."""
-    if csr is not None:
-        row = np.searchsorted(csr.indptr, index[0], side="right") - 1
-        index = np.array([row, csr.indices[index[0]]])
-    return ", ".join(map(str, index))
+        _raise_at_first(name, "be finite", array, ~np.isfinite(array), csr)
 
 
 def check_finite_and_in_range(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
     """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
-    if checks.all_in_valid_range(array.reshape(-1)):
-        return
-    check_finite(name, array, csr)
-    bad = np.argwhere(np.abs(array) > MAX_MAGNITUDE)
-    raise InputError(
-        f"{name} must be at most {MAX_MAGNITUDE:g} in size; entry [{_format_index(bad[0], csr)}] is "
-        f"{array[tuple(bad[0])]:g} ({len(bad)} such entries): {_suggest_unit(unit)}"
-    )
+    if not checks.all_in_valid_range(array.reshape(-1)):
+        check_finite(name, array, csr)
+        requirement, is_bad = f"be at most {MAX_MAGNITUDE:g} in size", np.abs(array) > MAX_MAGNITUDE
+        _raise_at_first(name, requirement, array, is_bad, csr, _suggest_unit(unit))
 
 
 def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -> None:
     """Raise InputError at the first number that is negative, or neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE]."""
-    flat = array.reshape(-1)
-    position = checks.find_invalid_magnitude_in_array(flat)
-    if position < 0:
-        return
-    check_finite_and_in_range(name, array, unit)
-    check_not_negative(name, flat)
-    index = ", ".join(map(str, np.unravel_index(position, array.shape)))
-    raise InputError(
-        f"{name} must be 0 or at least {MIN_MAGNITUDE:g}; entry [{index}] is {flat[position]:g}: {_suggest_unit(unit)}"
-    )
+    if checks.find_invalid_magnitude_in_array(array.reshape(-1)) >= 0:
+        check_finite_and_in_range(name, array, unit)
+        check_not_negative(name, array)
+        requirement, is_bad = f"be 0 or at least {MIN_MAGNITUDE:g}", (array > 0.0) & (array < MIN_MAGNITUDE)
+        _raise_at_first(name, requirement, array, is_bad, advice=_suggest_unit(unit))
+
+
+def check_not_nan(name: str, array: np.ndarray) -> None:
+    """Raise InputError at the first NaN of an array."""
+    if np.isnan(array).any():
+        _raise_at_first(name, "not be NaN", array, np.isnan(array))
+
+
+def check_not_negative(name: str, array: np.ndarray) -> None:
+    """Raise InputError at the first negative entry of an array."""
+    if (array < 0).any():
+        _raise_at_first(name, "not be negative", array, array < 0)
 
 
 def _suggest_unit(unit: str) -> str:
     """Return advice which unit to change for a quantity with this unit."""
     if unit == "-":
-        return "this quantity has no unit that you could change"
+        return ": this quantity has no unit that you could change"
     letters = set(unit.replace("rad", "").replace("N s", "kg m/s"))
     units = [name for letter, name in (("k", "mass"), ("m", "length"), ("s", "time")) if letter in letters]
-    return f"another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"
-
-
-def check_not_nan(name: str, array: np.ndarray) -> None:
-    """Raise InputError at the first NaN of an array."""
-    bad = np.flatnonzero(np.isnan(array))
-    if len(bad):
-        raise InputError(f"{name} must not be NaN; entry [{bad[0]}] is NaN ({len(bad)} such entries)")
-
-
-def check_not_negative(name: str, array: np.ndarray) -> None:
-    """Raise InputError at the first negative entry of an array."""
-    for_kernel = array.ndim == 1 and array.dtype is FLOAT64 and array.flags.c_contiguous
-    if checks.has_negative_number(array) if for_kernel else array.size and array.min() < 0:
-        i = int(np.argmin(array))
-        raise InputError(f"{name} must not be negative; entry [{i}] is {array[i]}")
+    return f": another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"
 
 
 def check_sequence(name: str, value: Any, things: str) -> list[Any]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -58,11 +58,9 @@ class UnknownName(LavenderError, KeyError):
         matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.5)
         matches = [lower_case] if lower_case in by_lower_case else matches
         similar = [by_lower_case[match] for match in matches]
-        hint = (
-            f"did you mean {' or '.join(map(repr, similar))}?"
-            if similar
-            else f"known: {', '.join(known) or 'none'}"
-        )
+        hint = f"known: {', '.join(known) or 'none'}"
+        if similar:
+            hint = f"did you mean {' or '.join(map(repr, similar))}?"
         noun, of, owner = kind.partition(" of ")
         self.message = f"unknown {noun} {name!r}{of}{owner}; {hint}"
         super().__init__(self.message)
@@ -81,9 +79,6 @@ def check_name(kind: str, name: object, known: Collection[str]) -> str:
     if not isinstance(name, str) or name not in known:
         raise UnknownName(kind, name, known)
     return name
-
-
-_Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
 
 def _restore_unknown_name(message: str) -> UnknownName:

@@ -15,17 +15,6 @@ from importlib import import_module
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "import_lock",
-    "import_module_lazily",
-    "import_module_under_lock",
-    "import_numerical_modules",
-    "issparse",
-    "lapack",
-    "sparse",
-    "spatial",
-]
-
 _lock = RLock()
 _imported = set[str]()  # Names that `import_numerical_modules` has imported completely.
 
@@ -73,8 +62,9 @@ class _LazyModule:
 
 
 if TYPE_CHECKING:
-    import scipy.linalg.lapack as lapack
-    from scipy import sparse, spatial
+    from scipy import sparse as sparse
+    from scipy import spatial as spatial
+    from scipy.linalg import lapack as lapack
 else:
     sparse, spatial, lapack = map(_LazyModule, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
 

@@ -10,8 +10,6 @@ import json
 import os
 from typing import Any
 
-__all__ = ["RATES", "RATES_PATH"]
-
 # os.path is used because pathlib would take 4 % of the time of `import lavender`.
 RATES_PATH = os.path.join(os.path.dirname(__file__), "rates.json")
 

@@ -36,8 +36,6 @@ from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.checks import are_lower_triangles_valid, are_pointers_valid
 from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
 
-__all__ = ["Batch"]
-
 ERRORS = ("raise", "status")
 BODY_FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")
 BODY_PAIRS = ("joint_body", "contact_body")

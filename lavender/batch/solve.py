@@ -46,8 +46,6 @@ if TYPE_CHECKING:
         callback: Callback | None
 
 
-__all__ = ["Solutions", "solve_many"]
-
 # Worlds that are not started before the deadline are called late. Their start is their answer.
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}

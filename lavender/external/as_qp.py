@@ -595,7 +595,7 @@ def _build_program_form(scaled: _ScaledProblem) -> QP:
     rows = unknown[n_shared:] - offset
     # Scale by the largest entries of the rows of (5) and their violations at x = 0.
     sizes = np.zeros(n + m)
-    for matrix, row_first in ((qp.hessian, 0), (qp.jacobian, n)):
+    for matrix, row_first in ((qp.generalized.mass, 0), (qp.generalized.jac, n)):
         row_of_entry = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
         for first, index in ((row_first, row_of_entry), (0, matrix.indices)):
             np.maximum.at(sizes, first + index, np.abs(matrix.data))
@@ -619,7 +619,7 @@ def _build_program_form(scaled: _ScaledProblem) -> QP:
     general = np.flatnonzero(is_general)
     r = len(general)
     root = np.where(is_general, row_unit, 1.0 / unit)
-    jac, hessian = qp.jacobian, qp.hessian
+    jac, hessian = qp.generalized.jac, qp.generalized.mass
     if len(rows) < m or n_x < n:
         jac, hessian = jac[rows][:, variables], hessian[variables][:, variables]
     entries = jac.data * np.repeat(root * unit, np.diff(jac.indptr))

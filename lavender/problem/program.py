@@ -36,7 +36,6 @@ import numpy.typing as npt
 
 from lavender.base.arrays import (
     FloatArray,
-    IntArray,
     as_array,
     as_array_view,
     check_nonnegative_magnitudes,
@@ -55,7 +54,7 @@ from lavender.problem.generalized import (
     convert_to_compressed_rows,
     extract_lower_triangle,
 )
-from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
+from lavender_ext.core.assemble import dense_to_csr, stack_csr_matrices
 from lavender_ext.core.checks import max_abs_of_array
 from lavender_ext.judge.measure import all_finite, compute_program_residuals
 
@@ -129,19 +128,19 @@ class QPSolution:
     @cached_property
     def _curvature(self) -> FloatArray:
         """P x (n,)."""
-        return self.qp.multiply_hessian(self.x)
+        return self.qp.generalized.momentum_of(self.x)
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
         """Primal, dual and gap residual; the three residuals relative to their terms; the largest relative residual."""
         qp, multipliers, min_force = self.qp, self.qp.select_row_multipliers(self.impulse), 0.0
         if max_abs_of_array(qp.q) == 0.0:
-            min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
-        jac, order = qp.compressed_rows
+            min_force = CURVATURE_SHARE * float((abs(qp.generalized.mass) @ np.abs(self.x)).max(initial=0.0))
+        general = qp.generalized
         result: tuple[float, ...] = compute_program_residuals(
-            self.x, qp.q, self._curvature, qp.multiply_jacobian_transposed(multipliers),
-            qp.multiply_jacobian(self.x), qp.target, multipliers,
-            qp.free, jac, self.x if order is None else self.x[order], qp.estimate_variable_sizes, min_force,
+            self.x, qp.q, self._curvature, general.force(multipliers), general.velocity_of(self.x), qp.target,
+            multipliers, qp.free, general.operator.jac, self.x if general.order is None else self.x[general.order],
+            qp.estimate_variable_sizes, min_force,
         )  # fmt: skip
         return result
 
@@ -210,10 +209,10 @@ class QuadraticProgram:
         Right-hand sides of (2).
     free : int
         Number of rows of A and of variables with lb = ub, which are the first rows.
-    generalized : Generalized or None
-        J of (2) and M = P; None if P is singular.
-    singular : (P, J) or None
-        If P is singular: P with both triangles, and J, each as (indptr, indices, data).
+    generalized : Generalized
+        J of (2) and M = P, which is not factored if P is singular.
+    is_singular : bool
+        Whether P is singular: the problem is (5), which only solvers of quadratic programs accept.
     n_equalities, n_inequalities : int or None
         Number of rows of A and of G; None without A or G.
     kept : (mi,) int or None
@@ -225,8 +224,8 @@ class QuadraticProgram:
     q: FloatArray
     target: FloatArray
     free: int
-    generalized: Generalized | None
-    singular: tuple[Compressed, Compressed] | None
+    generalized: Generalized
+    is_singular: bool
     n_equalities: int | None
     n_inequalities: int | None
     kept: IntpArray | None
@@ -234,18 +233,14 @@ class QuadraticProgram:
     lower: IntpArray | None
     upper: IntpArray | None
 
-    @property
-    def is_singular(self) -> bool:
-        """Whether P is singular: the problem is (5), which only solvers of quadratic programs accept."""
-        return self.generalized is None
-
     def problem_fields(self) -> dict[str, Any]:
         """Return the fields b, cones and matrix or generalized of the constraint problem."""
-        if self.generalized is not None:
+        general = self.generalized
+        if not self.is_singular:
             cones = _make_one_sided_cones(self.free, len(self.target))
-            return {"b": self.generalized.bias(self.target), "cones": cones, "generalized": self.generalized}
-        n, jac = len(self.q), self.jacobian
-        matrix = sp.csr_array(sp.block_array([[self.hessian, -jac.T], [jac, None]], format="csr"))
+            return {"b": general.bias(self.target), "cones": cones, "generalized": general}
+        n, jac = len(self.q), general.jac
+        matrix = sp.csr_array(sp.block_array([[general.mass, -jac.T], [jac, None]], format="csr"))
         matrix.eliminate_zeros()
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
@@ -258,67 +253,22 @@ class QuadraticProgram:
 
     def convert_to_saddle_form(self) -> QuadraticProgram:
         """Return this program in the form (5), which is used for a singular P, also if P is definite."""
-        if self.generalized is None:
-            return self
-        general = self.generalized
-        hessian, jac = ((x.indptr, x.indices, x.data) for x in (general.mass, general.jac))
-        return replace(self, generalized=None, singular=(hessian, jac))
-
-    @cached_property
-    def hessian(self) -> sp.csr_array:
-        """P (n, n), both triangles."""
-        if self.generalized is not None:
-            return self.generalized.mass
-        assert self.singular is not None
-        return sp.csr_array(self.singular[0][::-1], shape=(len(self.q), len(self.q)))
-
-    @cached_property
-    def jacobian(self) -> sp.csr_array:
-        """J (m, n)."""
-        if self.generalized is not None:
-            return self.generalized.jac
-        assert self.singular is not None
-        return sp.csr_array(self.singular[1][::-1], shape=(len(self.target), len(self.q)))
-
-    @property
-    def compressed_rows(self) -> tuple[Compressed, IntArray | None]:
-        """J as (indptr, indices, data), and the variable of each of its columns (None: in order)."""
-        if self.generalized is not None:
-            return self.generalized.operator.jac, self.generalized.order
-        assert self.singular is not None
-        return self.singular[1], None
-
-    def multiply_hessian(self, x: FloatArray) -> FloatArray:
-        """Compute P x (n,)."""
-        return self.hessian @ x if self.generalized is None else self.generalized.momentum_of(x)
-
-    def multiply_jacobian(self, x: FloatArray) -> FloatArray:
-        """Compute J x (m,)."""
-        return self.jacobian @ x if self.generalized is None else self.generalized.velocity_of(x)
-
-    def multiply_jacobian_transposed(self, multipliers: FloatArray) -> FloatArray:
-        """Compute J^T lambda (n,) for multipliers (m,)."""
-        if self.generalized is None:
-            return self.jacobian.T @ multipliers
-        return self.generalized.force(multipliers)
+        return replace(self, is_singular=True)
 
     def estimate_variable_sizes(self) -> FloatArray:
         """Compute the size of each variable (n,) without constraints, |q_i| / P_ii or |v*_i|, in the order of J."""
         general = self.generalized
-        if general is None:
-            diagonal = self.hessian.diagonal()
-            return np.divide(np.abs(self.q), diagonal, out=np.zeros(len(self.q)), where=diagonal > 0.0)
         ptr, _, value = general.operator.mass  # The lower triangle, with the diagonal last in each row.
-        force, free = np.abs(self.q), np.abs(general.v_free)
-        if general.order is not None:
-            force, free = force[general.order], free[general.order]
-        size = force / value[ptr[1:] - 1]
-        out: FloatArray = np.where(size > 0.0, size, free)
-        return out
+        order = slice(None) if general.order is None else general.order
+        diagonal = value[ptr[1:] - 1]
+        size: FloatArray = np.divide(
+            np.abs(self.q)[order], diagonal, out=np.zeros(len(self.q)), where=diagonal > 0.0
+        )
+        return size if self.is_singular else np.where(size > 0.0, size, np.abs(general.v_free)[order])
 
     def recover_variables(self, impulse: FloatArray) -> FloatArray:
         """Compute x (n,) from the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""
-        if self.generalized is None:
+        if self.is_singular:
             return impulse[: len(self.q)].copy()
         return self.generalized.v_free + self.generalized.change(impulse)
 
@@ -406,10 +356,9 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         rows.add_bounds(low, lb, 1.0)  # pyright: ignore[reportArgumentType]
         rows.add_bounds(up, ub, -1.0)  # pyright: ignore[reportArgumentType]
     jac, target = rows.stacked
-    general = _factor_definite(lower, jac, q)
+    general, is_singular = _factor_hessian(lower, jac, q)
     return QuadraticProgram(
-        q=q, target=mark_read_only(target), free=free, generalized=general,
-        singular=None if general is not None else (mirror_lower_triangle(*lower), jac),
+        q=q, target=mark_read_only(target), free=free, generalized=general, is_singular=is_singular,
         n_equalities=n_a, n_inequalities=n_g,
         kept=finite_rows, fixed=fixed, lower=low, upper=up,
     )  # fmt: skip
@@ -437,11 +386,10 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
             "problem of Problem.from_qp with a singular P is needed"
         )
     lower = extract_lower_triangle("P", hessian, "give both triangles")
-    rows = convert_to_compressed_rows("J", jac)
-    _factor_definite(lower, rows, -b[:n])
+    general, _ = _factor_hessian(lower, convert_to_compressed_rows("J", jac), -b[:n])
     return QuadraticProgram(
-        q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=None,
-        singular=(mirror_lower_triangle(*lower), rows), n_equalities=free,
+        q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=general,
+        is_singular=True, n_equalities=free,
         n_inequalities=len(b) - n - free, kept=None, fixed=None, lower=None, upper=None,
     )  # fmt: skip
 
@@ -575,8 +523,8 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
 # -- definiteness of P --------------------------------------------------------------------------------
 
 
-def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Generalized | None:
-    """Return J and M = P of (4), or None if P is singular.
+def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[Generalized, bool]:
+    """Return J and M = P of (4), and whether P is singular; M is then not factored.
 
     Raises
     ------
@@ -586,17 +534,17 @@ def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Gener
     momentum, unfactored = -q, Generalized.from_validated(jac, lower)
     definite = _factor_shifted(unfactored, np.zeros(len(q)), momentum)
     if definite is not None and definite.operator.least_pivot > MAX_SINGULAR_PIVOT:
-        return definite
+        return definite, False
     diagonal = lower[2][lower[0][1:] - 1]
     is_zero = diagonal == 0.0
     shift = np.where(is_zero, diagonal.max(initial=0.0) or 1.0, SEMIDEFINITE_SHIFT * diagonal)
-    if (
-        not _has_empty_zero_diagonal_rows(lower, is_zero)
-        or _factor_shifted(unfactored, shift, momentum) is None
-    ):
+    ptr, idx, val = lower
+    # Rows and columns of P with a zero diagonal entry are empty, or P is indefinite.
+    is_coupled = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)
+    if is_coupled.any() or _factor_shifted(unfactored, shift, momentum) is None:
         check_nonnegative_magnitudes("the diagonal of P", np.abs(diagonal))
         raise InputError(f"P is not positive semidefinite: {_describe_indefinite(lower, diagonal)}")
-    return None
+    return unfactored, True
 
 
 def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
@@ -605,13 +553,6 @@ def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray
         return unfactored.with_diagonal_shift(d, momentum)
     except InputError:
         return None
-
-
-def _has_empty_zero_diagonal_rows(lower: Compressed, is_zero: npt.NDArray[np.bool_]) -> bool:
-    """Return whether rows and columns of P with a zero diagonal entry are empty; if they are not, P is indefinite."""
-    ptr, idx, val = lower
-    is_entry = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)
-    return not is_entry.any()
 
 
 def _describe_indefinite(lower: Compressed, diagonal: FloatArray) -> str:

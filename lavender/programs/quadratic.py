@@ -191,7 +191,7 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
 
 def _loses_digits(qp: QuadraticProgram, tol: float) -> bool:
     """Return whether P is definite, and a solve by its factor loses the digits that `tol` needs."""
-    if qp.generalized is None:
+    if qp.is_singular:
         return False
     operator = qp.generalized.operator
     return bool(operator.n * 2.0**-53 * operator.condition > MAX_LOSS * tol)
@@ -259,7 +259,7 @@ def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> Q
         return answer
     # Search a feasible point: minimise the sum of unit_i x_i^2 under the program's constraints.
     unit = problem.d[: len(qp.q)]
-    general = Generalized(qp.jacobian, sp.diags_array(unit), np.zeros(len(unit)))
+    general = Generalized(qp.generalized.jac, sp.diags_array(unit), np.zeros(len(unit)))
     cones = problem.cones.select(np.arange(len(qp.q), problem.n_blocks))
     nearest = Problem(qp.target, cones, generalized=general, copy=False)
     left = None if end == math.inf else max(end - perf_counter(), 1e-6)

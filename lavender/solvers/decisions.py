@@ -9,8 +9,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-__all__ = ["DECISIONS", "NUMBERS", "SMALL_ROWS", "Number", "describe_numbers"]
-
 
 class Number(NamedTuple):
     """A number on which a decision of `auto` depends.

@@ -30,8 +30,8 @@ from lavender.judge.residuals import compute_stopping_residual
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.costs import RATES
-from lavender.solvers.registry import Cost, Solver
+from lavender.solvers.costs import RATES, Cost
+from lavender.solvers.registry import Solver
 
 
 @dataclass(frozen=True)

@@ -61,15 +61,6 @@ def max_abs_of_array(x):
     return validate.norm_inf(as_double_pointer(x, x.size), x.size)
 
 
-def has_negative_number(const double[::1] x):
-    """Return whether any number is below 0."""
-    cdef Py_ssize_t i
-    for i in range(x.shape[0]):
-        if x[i] < 0.0:
-            return True
-    return False
-
-
 def are_pointers_valid(const int32_t[::1] ptr, int min_size):
     """Return whether the pointers begin with 0 and increase by at least min_size."""
     return ptr.shape[0] > 0 and find_pointer_fault(&ptr[0], ptr.shape[0] - 1, 2147483647, min_size) < 0

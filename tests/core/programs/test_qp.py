@@ -407,7 +407,7 @@ def test_a_singular_hessian_is_kept_and_auto_names_the_backend_that_ran():
     problem = lv.Problem.from_qp(P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat")
     assert problem.generalized is None and problem.has_singular_program
     np.testing.assert_array_equal(problem.dense()[:3, :3], P)
-    np.testing.assert_array_equal(problem.qp.hessian.toarray(), P)
+    np.testing.assert_array_equal(problem.qp.generalized.mass.toarray(), P)
     first = next(name for name in ("piqp", "clarabel", "osqp") if name in BACKENDS)
     for solution in (lv.solve(problem, tol=1e-9), lv.solve_qp(problem).solution, lv.prepare(problem).solve()):
         assert solution.stages[0].solver == first and first in solution.message
