@@ -27,7 +27,7 @@ import lavender as lv
 from benchmarks.output import markdown
 from lavender import suite
 
-STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
+DIFFERENCE_STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
 AGREES = 1e-6
 TIMES = 5.0
 SOLVED = 1e-12
@@ -131,7 +131,7 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
     # Start from zero: a start at the floor would be returned unchanged. If there are several motions, use the nearest.
     start = solution.impulse if problem.law == "coulomb" else None
     best, error, before = None, np.inf, None
-    for h in STEPS:
+    for h in DIFFERENCE_STEPS:
         low, high = (solved(along(problem, x, change), start) for x in (-h, h))
         if low is None or high is None:
             continue

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 #: Solvers that accept compressed columns; the others abort the process.
 SPARSE = ("PGS", "CONVEXQP_PG")
 #: Maximum iterations of methods with sweeps as iterations, which cannot be stopped by a time limit.
-SWEEPS, STEPS, PROBE = 1_000_000, 1000, 50
+MAX_SWEEPS, MAX_STEPS, PROBE = 1_000_000, 1000, 50
 
 
 def options(sn, name, tolerance, problem, cap):
@@ -76,7 +76,7 @@ def main():
         if info != 0 and seconds > 0.0:
             # Estimate the iterations within the limit from the time of one iteration.
             each = seconds / max(1, min(done, PROBE))
-            cap = int(min(SWEEPS if sweeps else STEPS, max(PROBE, limit / each)))
+            cap = int(min(MAX_SWEEPS if sweeps else MAX_STEPS, max(PROBE, limit / each)))
             seconds, x, info, done = once(tolerance, cap)
         spent = seconds
         for _ in range(20):

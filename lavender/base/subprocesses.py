@@ -364,9 +364,8 @@ def _kill_with_parent(lifeline: int) -> None:
 
 def limit_cpu_time(extra: float) -> None:
     """Make the system kill this process after `extra` more CPU time [s], in case the parent has ended and cannot."""
-    with contextlib.suppress(
-        ImportError, ValueError, OSError, OverflowError
-    ):  # An infinite limit raises OverflowError: no limit is then set.
+    # An infinite limit raises OverflowError: no limit is then set.
+    with contextlib.suppress(ImportError, ValueError, OSError, OverflowError):
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

@@ -24,17 +24,15 @@ MAX_THREADS = 1024
 @cache
 def get_thread_pool() -> ThreadPoolExecutor:
     """Return the pool of threads of this process."""
-    from concurrent.futures import (
-        ThreadPoolExecutor,
-    )  # Imported here: it takes 5 ms, and only this function needs it.
+    # Imported here: it takes 5 ms, and only this function needs it.
+    from concurrent.futures import ThreadPoolExecutor
 
     return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="lavender")
 
 
 if hasattr(os, "register_at_fork"):  # Windows cannot fork.
-    os.register_at_fork(
-        after_in_child=get_thread_pool.cache_clear
-    )  # A forked process has no threads of its parent and needs a new pool.
+    # A forked process has no threads of its parent and needs a new pool.
+    os.register_at_fork(after_in_child=get_thread_pool.cache_clear)
 
 
 @contextmanager

@@ -50,9 +50,8 @@ def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) ->
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
         return None
     at = np.array(six)
-    push, turn = (
-        part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)
-    )  # Shape (bodies, c, 3, 3).
+    # Shape (bodies, c, 3, 3).
+    push, turn = part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)
     moment = push.swapaxes(2, 3) @ turn  # The sum of d (r x d)^T is [r]^T.
     on = push.any(axis=(2, 3))
     k, count, first, last = (

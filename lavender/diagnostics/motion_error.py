@@ -150,9 +150,8 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     elif isinstance(reference, Solution):
         reference = reference.impulse
     reference = mark_read_only(np.array(problem.impulse_array(reference, "reference")))
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # Numbers that are not finite are None; `note` names them.
+    # Numbers that are not finite are None; `note` names them.
+    with np.errstate(over="ignore", invalid="ignore"):
         return _compute_error(problem, x, reference)
 
 

@@ -32,9 +32,8 @@ MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense ma
 # Larger systems of up to this many rows are factored as dense matrices if a contact slides, or if A is not symmetric.
 MAX_DENSE_ROWS = 400
 
-Solve = Callable[
-    [FloatArray, bool], FloatArray
-]  # Function that solves G x = r; its arguments are r and whether to transpose G.
+# Function that solves G x = r; its arguments are r and whether to transpose G.
+Solve = Callable[[FloatArray, bool], FloatArray]
 
 
 def factor_dense(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:

@@ -297,9 +297,8 @@ def _multiply_transposed(a: Any, y: FloatArray) -> FloatArray:
     columns = a[:, cancels].tocsc()
     halves = []
     for x in (columns.data, y[columns.indices]):
-        high = VELTKAMP_FACTOR * x - (
-            VELTKAMP_FACTOR * x - x
-        )  # Veltkamp's splitting: both halves have 26 bits.
+        # Veltkamp's splitting: both halves have 26 bits.
+        high = VELTKAMP_FACTOR * x - (VELTKAMP_FACTOR * x - x)
         halves.append((high, x - high))
     terms = np.array([p * q for p, q in product(*halves)]).T.ravel().tolist()
     out[cancels] = [math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())]

@@ -186,9 +186,8 @@ class Residual:
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = DEFAULT_THRESHOLD
-    _float64_relative: float = field(
-        default=math.nan, repr=False
-    )  # Relative residual before the refinement for an ill-conditioned M.
+    # Relative residual before the refinement for an ill-conditioned M.
+    _float64_relative: float = field(default=math.nan, repr=False)
 
     @property
     def at_floor(self) -> bool:

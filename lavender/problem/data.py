@@ -171,9 +171,8 @@ class ProblemData:
             put(self, "names", as_names("blocks", self.names, k))
         put(self, "name", str(self.name))
         self.law  # noqa: B018 - computed with the checks, because every solve reads it
-        put(
-            self, "copy", True
-        )  # `copy` applies to this call only: problems derived from this one copy by default.
+        # `copy` applies to this call only: problems derived from this one copy by default.
+        put(self, "copy", True)
 
     def _set_rhs(self, b: FloatArray) -> None:
         """Replace the zeros of a new problem's right-hand side by b (m,) [m/s].
@@ -383,13 +382,11 @@ def check_problem(problem: Any) -> None:
     """Raise InputError unless `problem` is a `Problem`."""
     if not isinstance(problem, ProblemData):
         advice = "make one with Problem.lcp(A, b, lower, upper), linear, contact, from_rows or from_jacobian"
-        if isinstance(
-            getattr(problem, "problem", None), ProblemData
-        ):  # The object is a case, or the result of reading a file.
+        if isinstance(getattr(problem, "problem", None), ProblemData):
+            # The object is a case, or the result of reading a file.
             advice = "give its .problem"
-        elif callable(
-            getattr(problem, "velocity_after", None)
-        ):  # The object is a `RowBuilder`, which is not imported here.
+        elif callable(getattr(problem, "velocity_after", None)):
+            # The object is a `RowBuilder`, which is not imported here.
             advice = "give the result of its .problem()"
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
 

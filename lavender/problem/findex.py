@@ -104,9 +104,8 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     findex = np.full(cones.n_rows, -1, np.int32)
     rows, coefficient = np.flatnonzero(cones.friction_rows), cones.friction_coefficient.copy()
     first_tangent = cones.ptr[:-1][cones.is_box] + 1
-    coefficient[first_tangent] = cones.coefficients[
-        cones.is_box, 0
-    ]  # A tangent without friction gets exactly 0.
+    # A tangent without friction gets exactly 0.
+    coefficient[first_tangent] = cones.coefficients[cones.is_box, 0]
     upper[rows] = coefficient[rows]
     lower[rows] = -coefficient[rows]
     findex[rows] = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))[rows]

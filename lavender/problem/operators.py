@@ -268,9 +268,8 @@ class Operators(ProblemData):
         """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
         self._check_bound_of_generalized()
         assert self.generalized is not None
-        y = (
-            self.metric.whitened()
-        )  # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
+        # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
+        y = self.metric.whitened()
         indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
@@ -322,9 +321,8 @@ class Operators(ProblemData):
         if not len(empty):
             return empty
         if self.generalized is not None:
-            pattern = self.generalized.jac[
-                empty
-            ]  # Since M is positive definite, A_ii = 0 of a nonzero row of J is an underflow.
+            # Since M is positive definite, A_ii = 0 of a nonzero row of J is an underflow.
+            pattern = self.generalized.jac[empty]
         elif self.rows is not None:
             inverse = self.rows.inverse_mass_matrix().astype(bool).astype(float)
             pattern = self.rows.jacobian(self.cones)[empty].astype(bool).astype(float) @ inverse

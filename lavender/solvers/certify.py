@@ -178,9 +178,8 @@ def certify_by_least_violation(log: Any) -> None:
         return
     for fraction in NEARLY_RIGID_COMPLIANCES:
         eps = np.where(has_compliance, 1.0, fraction) * d
-        soft = replace(
-            rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
-        )  # Set rows of J with negligible entries to zero.
+        # Set rows of J with negligible entries to zero.
+        soft = replace(rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps))
         kernel = general.prepare_islands(soft)
         if kernel is None or not log.deadline.fits(RATES["linear program"]):
             return

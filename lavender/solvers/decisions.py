@@ -73,9 +73,8 @@ NUMBERS = (
 )  # fmt: skip
 
 
-DECISIONS: Any = SimpleNamespace(
-    **{number.name: number.value for number in NUMBERS}
-)  # The values as attributes.
+# The values as attributes.
+DECISIONS: Any = SimpleNamespace(**{number.name: number.value for number in NUMBERS})
 # Up to this many rows, the compiled call `SolverSpec.small` is tried first, because Python's overhead dominates a
 # solve.
 SMALL_ROWS = int(DECISIONS.small_rows)

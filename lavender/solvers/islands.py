@@ -58,9 +58,8 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
         np.concatenate([bodies.joint_body[joints].ravel(), bodies.contact_body[contacts].ravel()])
     )
     used = used[used >= 0]
-    number_in_part = np.full(
-        bodies.n_bodies + 1, -1, np.int32
-    )  # The last entry belongs to the static body, -1.
+    # The last entry belongs to the static body, -1.
+    number_in_part = np.full(bodies.n_bodies + 1, -1, np.int32)
     number_in_part[used] = np.arange(len(used))
     joint_rows = int(np.diff(bodies.joint_ptr)[joints].sum())
     part = replace(

@@ -90,9 +90,8 @@ class PivotState:
         )
         get_zero_impulse_reference(problem)
         # [s] Time of one round with a compiled factor: first an estimate for free rows, then the last round's time.
-        sweep_cost = (
-            RATES["symmetric sweep entry"] * problem.csr_data.work
-        )  # [ns] Includes the computation of w.
+        # [ns] Includes the computation of w.
+        sweep_cost = RATES["symmetric sweep entry"] * problem.csr_data.work
         self.seconds = 1e-9 * (estimate_band_factor_cost(problem.m, band) + sweep_cost)
         self.rows = Pivoting(
             problem.csr_data, band, order, PIVOT_TOLERANCE, problem.metric, self.outside, problem.law == "linear",

@@ -173,9 +173,8 @@ class BoundedRowSolver(Solver):
         own = self.solver.cost(problem)
         if problem.law in ("linear", "lcp"):
             return own
-        ratio = bound_converted_row_count(problem) / max(
-            problem.m, 1
-        )  # Rows of (1) or (2) per row of the problem.
+        # Rows of (1) or (2) per row of the problem.
+        ratio = bound_converted_row_count(problem) / max(problem.m, 1)
         return Cost(lambda: ratio * own.setup + RATES["rows of contact"] * problem.m)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:

@@ -439,9 +439,8 @@ registered: dict[str, SolverSpec] = {}
 def register_specs_of_module(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
     for spec in import_module_under_lock(table).SPECS:
-        registered.pop(
-            spec.name, None
-        )  # Restore the order of the table, from which `get` may have registered a solver before.
+        # Restore the order of the table, from which `get` may have registered a solver before.
+        registered.pop(spec.name, None)
         _add_own(spec)
 
 

@@ -136,9 +136,8 @@ class Sweeping(SweepSolver):
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
         is_default = type(self.order) is str and self.order == "given" and self.ground is None
-        if (
-            is_default and type(self.seed) is int and self.seed == 0
-        ):  # As `compute_block_order`, in half the time.
+        if is_default and type(self.seed) is int and self.seed == 0:
+            # As `compute_block_order`, in half the time.
             blocks = np.arange(problem.cones._blocks.n_blocks, dtype=np.int32)
             split = 0 if problem.rows is None else problem.rows.n_joints
             order = Order(blocks, split, GIVEN, np.zeros(1, np.uint64), is_given=True)

@@ -246,7 +246,7 @@ def wall(n: int = 10, sliding: float = 0.0, mu: float = 0.6) -> Draft:
     position: list[list[float]] = []
     contacts: list[tuple[int, int, list[float], list[float]]] = []
 
-    def lay(below: int, brick: int, x: float, z: float, half: float) -> None:
+    def add_face_contacts(below: int, brick: int, x: float, z: float, half: float) -> None:
         contacts.extend((below, brick, [x + half * s, 0.5 * t, z], [0.0, 0.0, 1.0]) for s, t in signs)
 
     for course in range(n):
@@ -255,11 +255,11 @@ def wall(n: int = 10, sliding: float = 0.0, mu: float = 0.6) -> Draft:
             x, z, brick = 2.0 * k + shift, float(course), course * n + k
             position.append([x, 0.0, z + 0.5])
             if course == 0:
-                lay(-1, brick, x, z, 1.0)
+                add_face_contacts(-1, brick, x, z, 1.0)
             else:
                 for below in (k - 1 + shift, k + shift):
                     if 0 <= below < n:
-                        lay(first + below, brick, x + below - k + 0.5 - shift, z, 0.5)
+                        add_face_contacts(first + below, brick, x + below - k + 0.5 - shift, z, 0.5)
             if k > 0:
                 contacts.extend(
                     (brick - 1, brick, [x - 1.0, 0.5 * s, z + 0.5 + 0.5 * t], [1.0, 0.0, 0.0])

@@ -216,9 +216,8 @@ def _write_animation(views: list[FilmView], path: Path, size: float, rate: float
     suffix = path.suffix.lower()
     first, last = min(view.time[0] for view in views), max(view.time[-1] for view in views)
     if suffix == ".gif":
-        rate = 100.0 / max(
-            2, round(100.0 / rate)
-        )  # GIF stores the duration of a frame in hundredths of a second.
+        # GIF stores the duration of a frame in hundredths of a second.
+        rate = 100.0 / max(2, round(100.0 / rate))
     # Frames are evenly spaced in simulated time: a frame of a film with fewer steps is shown for longer.
     times = np.arange(first, last + 0.5 / rate, 1.0 / rate)
     chosen = np.stack([np.searchsorted(s.time, times - 1e-9).clip(0, len(s.time) - 1) for s in views], axis=1)

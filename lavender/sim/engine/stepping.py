@@ -448,9 +448,8 @@ class Stepping:
         for row in range(per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
-        if (
-            per == 6
-        ):  # The rolling rows are the last two rows of a contact, with or without a torsion row before them.
+        if per == 6:
+            # The rolling rows are the last two rows of a contact, with or without a torsion row before them.
             no_torsion = end - first == 5
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
         return out
