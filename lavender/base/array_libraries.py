@@ -37,8 +37,7 @@ def find_converter(like: Any) -> Callable[[np.ndarray], Any] | None:
     if like is None or isinstance(like, np.ndarray):
         return None
     library = type(like).__module__.partition(".")[0]
-    convert = _CONVERTERS.get("jax" if library == "jaxlib" else library)
-    if convert is not None:
+    if convert := _CONVERTERS.get(library):
         return lambda array: convert(array, like)
     if hasattr(like, "__array_namespace__") and hasattr(like, "__dlpack__"):
         namespace = like.__array_namespace__()
@@ -87,10 +86,9 @@ def _to_warp(array: np.ndarray, like: Any) -> Any:
     import warp
 
     floats = (warp.float16, warp.float32, warp.float64)
-    dtype = (
-        like.dtype if array.dtype.kind == "f" and like.dtype in floats else warp.dtype_from_numpy(array.dtype)
-    )
+    is_float = array.dtype.kind == "f" and like.dtype in floats
+    dtype = like.dtype if is_float else warp.dtype_from_numpy(array.dtype)
     return warp.array(np.ascontiguousarray(array), dtype=dtype, device=like.device)
 
 
-_CONVERTERS = {"torch": _to_torch, "jax": _to_jax, "cupy": _to_cupy, "warp": _to_warp}
+_CONVERTERS = {"torch": _to_torch, "jax": _to_jax, "jaxlib": _to_jax, "cupy": _to_cupy, "warp": _to_warp}

@@ -145,16 +145,10 @@ def as_array(
     if array.dtype.kind not in "buif":
         raise InputError(f"{label} has dtype {array.dtype}; real numbers are needed")
     check_unmasked(label, value)
-    if (
-        dtype is np.int32
-        and array.dtype.kind == "f"
-        and array.size
-        and not np.array_equal(array, np.rint(array))
-    ):
+    if dtype is np.int32 and array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
         raise InputError(f"{label} holds {array[array != np.rint(array)][0]:g}; whole numbers are needed")
     if array.ndim == 0 and len(shape) == 1 and shape[0] is not None:
-        array = np.full(shape[0], array)
-        copy = False
+        array, copy = np.full(shape[0], array), False
     row_shape = shape[1:]
     if array.shape == (0,) and row_shape and not shape[0] and None not in row_shape:
         array = array.reshape(0, *row_shape)  # An empty list has shape (0,) if it lists rows, too.
@@ -189,11 +183,9 @@ def as_float_array(name: str, value: Any) -> np.ndarray:
     get_shape(name, value)
     check_unmasked(name, value)
     array = to_numpy(name, value)
-    if array.dtype in FLOAT_DTYPES:
-        return array
     native = array.dtype.newbyteorder("=")
     if native in FLOAT_DTYPES:
-        return array.astype(native)
+        return array.astype(native, copy=False)
     return as_array(name, array, (None,) * array.ndim, finite=False)
 
 
@@ -264,12 +256,11 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
 
 
 def check_float(
-    name: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
+    name: str, value: Any, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
 ) -> float:
     """Return `value` as a float; raise InputError unless it is finite, in [low, high], and larger than `above`."""
-    if isinstance(value, (bool, np.timedelta64)) or not isinstance(
-        value, (int, float, np.integer, np.floating)
-    ):
+    is_number = isinstance(value, (int, float, np.integer, np.floating))
+    if not is_number or isinstance(value, (bool, np.timedelta64)):
         raise InputError(f"{name} is {value!r}; a number is needed")
     try:
         x = float(value)
@@ -287,14 +278,10 @@ def check_float(
     return x
 
 
-def check_int(name: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
+def check_int(name: str, value: Any, low: int = 0, high: int | None = 2**31 - 1) -> int:
     """Return `value` as an int; raise InputError unless it is an integer in [low, high] (high None: no limit)."""
-    if (
-        isinstance(value, (bool, np.timedelta64))
-        or not isinstance(value, (int, np.integer))
-        or value < low
-        or (high is not None and value > high)
-    ):
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+    if not is_integer or value < low or (high is not None and value > high):
         upto = "" if high is None else f" to {high}"
         raise InputError(f"{name} is {value!r}; a whole number from {low}{upto} is needed")
     return int(value)
@@ -353,8 +340,6 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
 def get_common_precision(*values: Any) -> str:
     """Return "float32" if all values that are not None are dense or sparse arrays of float32, else "float64"."""
     types = {getattr(x, "dtype", None) for x in values if x is not None}
-    if types == {FLOAT32} or FLOAT64 in types:
-        return "float64" if FLOAT64 in types else "float32"
     # float32 in the other byte order is a different dtype of the same precision.
     is_single = bool(types) and all(isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types)
     return "float32" if is_single else "float64"
@@ -426,10 +411,8 @@ def _suggest_unit(unit: str) -> str:
 
 def check_sequence(name: str, value: Any, things: str) -> list[Any]:
     """Return a sequence as a list; raise InputError for texts, sparse matrices and objects that are not sequences."""
-    is_sequence = (
-        isinstance(value, Iterable) and getattr(value, "ndim", 1) != 0 and not isinstance(value, type)
-    )
-    if isinstance(value, (str, bytes)) or not is_sequence or issparse(value):
+    is_sequence = isinstance(value, Iterable) and getattr(value, "ndim", 1) != 0
+    if isinstance(value, (str, bytes, type)) or not is_sequence or issparse(value):
         raise InputError(f"{name} is {value!r:.60}; a sequence of {things} is needed")
     return list(value)
 

@@ -2,22 +2,14 @@
 
 import importlib.util
 
-#: Compiled module of which the existence is tested: the judge's, which every solve calls.
-MODULE = "lavender_ext.judge.measure"
+# The judge's module stands for all kernels, since every solve calls it.
+if importlib.util.find_spec("lavender_ext.judge.measure") is None:
+    # Imported only for the message: it takes 4 % of the time of `import lavender`.
+    from pathlib import Path
 
-
-def check_build(module: str = MODULE) -> None:
-    """Raise ImportError if a compiled module of the kernels cannot be found."""
-    if importlib.util.find_spec(module) is None:
-        # Imported only for the message: it takes 4 % of the time of `import lavender`.
-        from pathlib import Path
-
-        spec = importlib.util.find_spec("lavender_ext")
-        folder = Path(spec.origin).parent if spec is not None and spec.origin else Path("lavender_ext")
-        raise ImportError(
-            f"the kernels in {folder} are not built. From a clone: run `pip install -e .` in {folder.parent} (it needs "
-            "a C compiler); with lavender installed elsewhere: start Python outside this folder, which hides it"
-        )
-
-
-check_build()
+    spec = importlib.util.find_spec("lavender_ext")
+    folder = Path(spec.origin).parent if spec is not None and spec.origin else Path("lavender_ext")
+    raise ImportError(
+        f"the kernels in {folder} are not built. From a clone: run `pip install -e .` in {folder.parent} (it needs a C "
+        "compiler); with lavender installed elsewhere: start Python outside this folder, which hides it"
+    )

@@ -83,9 +83,6 @@ def format_seconds(t: float) -> str:
     """Format a time [s] with three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):
         return "–"
-    for scale, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
-        if t >= 0.9995 * scale or unit == "µs":
-            x = t / scale
-            digits = max(0, 2 - math.floor(math.log10(x))) if x >= 1.0 else 2
-            return f"{x:.{digits}f} {unit}"
-    return "–"
+    unit, scale = ("s", 1.0) if t >= 0.9995 else ("ms", 1e-3) if t >= 0.9995e-3 else ("µs", 1e-6)
+    x = t / scale
+    return f"{x:.{max(0, 2 - math.floor(math.log10(max(x, 1.0))))}f} {unit}"

@@ -246,9 +246,8 @@ class ProcessBackend:
 
 
 def _close_streams(process: subprocess.Popen[bytes]) -> None:
-    for stream in (process.stdin, process.stdout):
+    for stream in filter(None, (process.stdin, process.stdout)):
         with contextlib.suppress(OSError):
-            assert stream is not None
             stream.close()
 
 
@@ -294,7 +293,10 @@ def serve_requests(lifeline: int, memory: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if lifeline >= 0:
         _kill_with_parent(lifeline)
-    requests, answers = _detach_standard_streams()
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    null = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null, 0)  # The function's own input and output are the null device.
+    os.dup2(null, 1)
     if memory:
         with contextlib.suppress(ImportError, ValueError, OSError):
             import resource
@@ -309,31 +311,16 @@ def serve_requests(lifeline: int, memory: int) -> None:
             return
         try:
             arguments = pickle.loads(request)  # Unpickling is safe, as only the parent sends requests.
-            if function is None:
-                (function,) = arguments
-                text, numbers = _pack_answer({}, ())
-            else:
-                text, numbers = _pack_answer(*function(*arguments))
+            fields, arrays = ({}, ()) if function is None else function(*arguments)
+            function = arguments[0] if function is None else function
+            sizes = [None if x is None else int(np.size(x)) for x in arrays]
+            numbers = b"".join(np.ascontiguousarray(x, float).tobytes() for x in arrays if x is not None)
+            text = json.dumps({**fields, "sizes": sizes}).encode()
         except BaseException as error:  # A panic of Rust code, for example, is not an Exception.
             failure = {"error": str(error)[:MAX_ERROR_LENGTH], "kind": type(error).__name__}
             text, numbers = json.dumps(failure).encode(), b""
         answers.write(struct.pack("<QQ", len(text), len(numbers)) + text + numbers)
         answers.flush()
-
-
-def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, bytes]:
-    sizes = [None if x is None else int(np.size(x)) for x in arrays]
-    numbers = b"".join(np.ascontiguousarray(x, float).tobytes() for x in arrays if x is not None)
-    return json.dumps({**fields, "sizes": sizes}).encode(), numbers
-
-
-def _detach_standard_streams() -> tuple[IO[bytes], IO[bytes]]:
-    """Return the streams of requests and answers, and redirect standard output and error to the null device."""
-    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    null = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null, 0)
-    os.dup2(null, 1)
-    return requests, answers
 
 
 def _kill_with_parent(lifeline: int) -> None:
