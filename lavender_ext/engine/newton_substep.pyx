@@ -15,6 +15,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, islands_t
@@ -27,8 +28,8 @@ from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.newton.solve cimport start_newton_over_bodies, bodies_workspace_size, step_newton_system
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, compute_joint_bandwidth,
-                                             bind_warm_workspace, judge_impulse, measure_as_engine, solve_from_warm_start,
-                                             warm_t, warm_workspace_size, zero_impulse_errors)
+                                             bind_warm_start, judge_impulse, measure_as_engine, solve_from_warm_start, warm_t,
+                                             zero_impulse_errors)
 
 
 cdef enum:
@@ -40,9 +41,21 @@ cdef enum:
     MAX_SUBSTEP_FACTORISATIONS = 200    # maximum number of factorisations of a substep, because an image waits for the substep
 
 
-cdef inline int64_t own_index_size(const view_t* v) noexcept nogil:
-    """Return the number of scratch integers in addition to the integers of Newton's method."""
-    return SCRATCH_HEADER + v.r.n_bodies + 2 * <int64_t>v.r.n_joints + 1 + island_workspace_integers(v)
+cdef struct memory_t:           # arrays of a substep, besides `warm_t`
+    int32_t* header             # (SCRATCH_HEADER)
+    int32_t* newton             # integers of Newton's method
+    int32_t* islands            # `island_workspace_integers`
+    double* nu                  # (m)
+    double* reference           # (blocks, 3)
+
+
+cdef inline void bind_substep_memory(const view_t* v, int64_t newton, warm_t* s, memory_t* memory, arena_t* a) noexcept nogil:
+    """Take the arrays, with `newton` integers for Newton's method; s.width is set, unless only the integers are used."""
+    memory.header, memory.newton = take_integers(a, SCRATCH_HEADER), take_integers(a, newton)
+    memory.nu = take_doubles(a, v.p.n_rows)
+    bind_warm_start(s, &v.p, v.r, a)
+    memory.islands = take_integers(a, island_workspace_integers(v))
+    memory.reference = take_doubles(a, 3 * <int64_t>v.p.n_blocks)
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -50,18 +63,19 @@ cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double*
     """Return the number of scratch integers with which `lav_newton_plan` begins, -1 if too many; all_stages = 0: first phase."""
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t needed
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
     cdef workspace_t n
+    cdef warm_t s
+    cdef memory_t memory
+    cdef arena_t a = make_arena(NULL, NULL)
     bind_engine_arrays(size, real, index, keys, &e, used)
     bind_substep_problem(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
-    needed = own_index_size(&v)
-    if all_stages and bodies_workspace_size(&v, NULL, &n):
-        needed += n.n_index
-    return <int32_t>needed if needed < INDEX_LIMIT else -1
+    s.width = 0
+    bind_substep_memory(&v, n.n_index if all_stages and bodies_workspace_size(&v, NULL, &n) else 0, &s, &memory, &a)
+    return <int32_t>a.n_index if a.n_index < INDEX_LIMIT else -1
 
 
 cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
@@ -73,29 +87,35 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     """
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t needed
+    cdef int64_t needed = 0, own
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
     cdef workspace_t n
+    cdef warm_t s
+    cdef memory_t memory
+    cdef arena_t a = make_arena(NULL, NULL)
     bind_engine_arrays(size, real, index, keys, &e, used)
     bind_substep_problem(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
-    scratch[1] = 0
-    needed = 0
+    s.width = 0
+    bind_substep_memory(&v, 0, &s, &memory, &a)
+    own, scratch[1] = a.n_index, 0
     if all_stages and bodies_workspace_size(&v, NULL, &n):
-        scratch[1] = <int32_t>(available - own_index_size(&v))
+        scratch[1] = <int32_t>(available - own)
         n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
         start_newton_over_bodies(&v, NULL, &n, NULL)                # Computes the pattern and the size of the other workspace.
         if n.is_bound:
             needed = n.n_real
-        elif scratch[1] < n.n_index < INDEX_LIMIT - own_index_size(&v):
-            scratch[2] = <int32_t>(n.n_index + own_index_size(&v))
+        elif scratch[1] < n.n_index < INDEX_LIMIT - own:
+            scratch[2] = <int32_t>(n.n_index + own)
             return SCRATCH_TOO_SMALL
         else:
             scratch[1] = 0                              # The factor has too many entries: only the first phase runs.
-    scratch[0] = compute_joint_bandwidth(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
-    needed += warm_workspace_size(&p, scratch[0]) + p.n_rows + 3 * <int64_t>p.n_blocks
+    a = make_arena(NULL, scratch)
+    bind_substep_memory(&v, scratch[1], &s, &memory, &a)
+    scratch[0] = compute_joint_bandwidth(&p, &r, s.last_joint)
+    needed += a.n_real + <int64_t>scratch[0] * p.n_rows
     return <int32_t>needed if needed < INDEX_LIMIT else -1
 
 
@@ -114,7 +134,7 @@ cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o,
 
 
 cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
-                                   int32_t* scratch, double* workspace, double* lam, double* v) noexcept nogil:
+                                          const memory_t* memory, double* workspace, double* lam, double* v) noexcept nogil:
     """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
     cdef int32_t j, result = solve_from_warm_start(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
@@ -132,12 +152,12 @@ cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, war
             s.relative = 0.0
             return JUDGED
         return UNDECIDED
-    if not scratch[1]:
+    if not memory.header[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
     o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0)
     # `lav_newton_plan` computed the pattern
-    n = workspace_t(scratch[1], INDEX_LIMIT, scratch + SCRATCH_HEADER, workspace, 1, 0, 0, 0.0)
+    n = workspace_t(memory.header[1], INDEX_LIMIT, memory.newton, workspace, 1, 0, 0, 0.0)
     return run_newton_stages(&problem, &o, &n, s, lam, v)
 
 
@@ -179,23 +199,23 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef rows_t r
     cdef warm_t s
     cdef islands_t islands
-    cdef int64_t own
-    cdef int32_t result, marks
+    cdef memory_t memory
+    cdef arena_t a = make_arena(workspace, scratch)
+    cdef int32_t result
+    cdef view_t v
     bind_engine_arrays(size, real, index, keys, &e, used)
     bind_substep_problem(&e, &p, &r)
-    compute_velocity_weights(&p, p.d, workspace)
-    set_angular_joint_weights(&p, &r, workspace)
-    p.nu = workspace
+    v = view_t(p, NULL, &r, NULL)
     s.width = scratch[0]
+    bind_substep_memory(&v, scratch[1], &s, &memory, &a)
+    compute_velocity_weights(&p, p.d, memory.nu)
+    set_angular_joint_weights(&p, &r, memory.nu)
+    p.nu = memory.nu
     s.keeps_start = not all_stages                      # Sweeps follow, which begin from the start.
     s.trace = trace
     s.relative = 0.0
-    own = warm_workspace_size(&p, s.width) + p.n_rows
-    marks = SCRATCH_HEADER + scratch[1]
-    bind_warm_workspace(&s, workspace + p.n_rows, scratch + marks, &p, &r)
-    find_substep_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
-    own += 3 * <int64_t>p.n_blocks
-    result = solve_newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
+    find_substep_islands(&p, &r, &s, memory.islands, memory.reference, &islands)
+    result = solve_newton_substep(&p, &r, &s, tol, all_stages, &memory, take_doubles(&a, 0), e.impulse, e.dv)
     if p.n_rows > 0 and (all_stages or result != UNDECIDED):
         measure_as_engine(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps

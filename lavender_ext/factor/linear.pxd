@@ -23,6 +23,7 @@ The fallback is a factorisation by the caller. There is one: SuperLU of SciPy (`
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.arena cimport arena_t
 from lavender_ext.factor.factors cimport block_matrix_t, interrupt_t, pivots_t, sparse_t
 
 
@@ -100,21 +101,11 @@ cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const
     f.kind, f.n, f.lptr, f.lidx, f.matrix, f.diagonal = TREE, n, lptr, lidx, values, diagonal
 
 
-cdef inline int64_t block_pattern_index_size(int64_t n, int64_t s, int64_t blocks, int64_t below) noexcept nogil:
-    """Return the number of int32 that `analyse_blocks` needs if N has `blocks` blocks and L `below` off-diagonal blocks."""
-    return 2 * (2 * blocks + 2 * (n + 1)) + n * s + 5 * (n + 1) + below + 1 + s * below + 1
-
-
-cdef inline int64_t block_factor_index_size(int64_t n, int64_t s) noexcept nogil:
-    """Return the number of int32 that `bind_block_factor` assigns."""
-    return 2 * n * s + 3 * n
-
-
 cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil
 cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
-                           const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil
-cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil
-cdef void bind_block_factor(block_matrix_t* f, bint lu, int32_t wide, int32_t* index, double* real) noexcept nogil
+                           const int32_t* parent, const int32_t* lptr, arena_t* a) noexcept nogil
+cdef void bind_block_factor_indices(block_matrix_t* f, arena_t* a) noexcept nogil
+cdef void bind_block_factor_values(block_matrix_t* f, bint lu, int32_t wide, arena_t* a) noexcept nogil
 cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil
 cdef void solve_linear_system(linear_t* f, double* x) noexcept nogil
 cdef void solve_transposed_linear_system(const linear_t* f, double* x) noexcept nogil

@@ -7,6 +7,7 @@ import numpy as np
 
 from lavender_ext.factor.symbolic import analyse as analyse_pattern
 
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport factor_tree_matrix
 from lavender_ext.core.tree_solve cimport solve_tree_factor
@@ -41,29 +42,37 @@ cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil:
     return panel_offset(n, k) + <int64_t>(n - k) * (n - k)
 
 
+cdef inline int64_t* take_offsets(arena_t* a, int64_t count) noexcept nogil:
+    """Take `count` int64 of an arena whose integers are aligned to 8 bytes."""
+    take_integers(a, a.n_index % 2)
+    return <int64_t*>take_integers(a, 2 * count)
+
+
 cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
-                           const int32_t* parent, const int32_t* lptr, int32_t* index) noexcept nogil:
-    """Set the pattern of f in index (`block_pattern_index_size`, a multiple of 8 bytes); return the multiply-adds of L L^T.
+                           const int32_t* parent, const int32_t* lptr, arena_t* a) noexcept nogil:
+    """Take the arrays for the pattern of f, and unless the arena only counts, set it; return the multiply-adds of L L^T.
 
     nptr and nind are the blocks of N. `compute_block_elimination_tree` returns parent (n), the elimination tree, and
-    lptr (n + 1), the columns of L.
+    lptr (n + 1), the columns of L. The arena's integers are aligned to 8 bytes.
     """
     cdef int32_t blocks = nptr[n], i, j, k, q, count
     cdef int64_t place, ld
     cdef double work
     cdef supernodal_t* p = &f.factor
-    cdef int64_t* lower_offset = <int64_t*>index
-    cdef int64_t* upper_offset = lower_offset + blocks
-    cdef int64_t* value_offset = upper_offset + blocks
-    cdef int64_t* panel_upper_offset = value_offset + n + 1
-    cdef int32_t* supernode_of = <int32_t*>(panel_upper_offset + n + 1)
-    cdef int32_t* first = supernode_of + n * s
-    cdef int32_t* row_ptr = first + n + 1
-    cdef int32_t* group = row_ptr + n + 1
-    cdef int32_t* starts = group + n + 1
-    cdef int32_t* mark = starts + n + 1
-    cdef int32_t* lind = mark + n + 1
-    cdef int32_t* row_indices = lind + lptr[n] + 1
+    cdef int64_t* lower_offset = take_offsets(a, blocks)
+    cdef int64_t* upper_offset = take_offsets(a, blocks)
+    cdef int64_t* value_offset = take_offsets(a, n + 1)
+    cdef int64_t* panel_upper_offset = take_offsets(a, n + 1)
+    cdef int32_t* supernode_of = take_integers(a, <int64_t>n * s)
+    cdef int32_t* first = take_integers(a, n + 1)
+    cdef int32_t* row_ptr = take_integers(a, n + 1)
+    cdef int32_t* group = take_integers(a, n + 1)
+    cdef int32_t* starts = take_integers(a, n + 1)
+    cdef int32_t* mark = take_integers(a, n + 1)
+    cdef int32_t* lind = take_integers(a, lptr[n] + 1)
+    cdef int32_t* row_indices = take_integers(a, s * <int64_t>lptr[n] + 1)
+    if a.index == NULL:
+        return 0.0
     list_factor_rows_by_column(n, nptr, nind, parent, mark, lptr, starts, lind)
     count = find_supernodes(n, lptr, lind, NULL, group)
     for i in range(n + 1):
@@ -95,32 +104,24 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
     return work
 
 
-cdef int64_t block_factor_size(const block_matrix_t* f, bint lu) noexcept nogil:
-    """Return the number of doubles that `bind_block_factor` assigns; `lu`: the matrix may be factored as L U."""
-    cdef const supernodal_t* p = &f.factor
-    cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s + p.value_offset[p.supernodes]
-    if lu:
-        values += <int64_t>f.nptr[f.n] * f.s * f.s + p.upper_offset[p.supernodes]
-    return values + supernodal_scratch_size(p, lu)
+cdef void bind_block_factor_indices(block_matrix_t* f, arena_t* a) noexcept nogil:
+    """Take the integers of a factorisation, after `analyse_blocks`."""
+    cdef supernodal_t* p = &f.factor
+    p.swap, p.local_row = take_integers(a, p.n), take_integers(a, p.n)
+    p.head, p.link, p.next_row = take_integers(a, f.n), take_integers(a, f.n), take_integers(a, f.n)
 
 
-cdef void bind_block_factor(block_matrix_t* f, bint lu, int32_t wide, int32_t* index, double* real) noexcept nogil:
-    """Bind the values of N and of its factor, after `analyse_blocks`; neither array needs initial values."""
+cdef void bind_block_factor_values(block_matrix_t* f, bint lu, int32_t wide, arena_t* a) noexcept nogil:
+    """Take the values of N and of its factor, after `analyse_blocks`; `lu`: the matrix may be factored as L U."""
     cdef supernodal_t* p = &f.factor
     cdef int64_t values = <int64_t>f.nptr[f.n] * f.s * f.s
     p.wide = wide
     p.interrupt = NULL
-    p.swap, p.local_row, p.head = index, index + p.n, index + 2 * p.n
-    p.link, p.next_row = p.head + f.n, p.head + 2 * f.n
-    f.nval = real
-    real += values
-    f.mval = real
-    real += values if lu else 0
-    p.values = real
-    real += p.value_offset[p.supernodes]
-    p.upper = real
-    real += p.upper_offset[p.supernodes] if lu else 0
-    p.scratch = real
+    f.nval = take_doubles(a, values)
+    f.mval = take_doubles(a, values if lu else 0)
+    p.values = take_doubles(a, p.value_offset[p.supernodes])
+    p.upper = take_doubles(a, p.upper_offset[p.supernodes] if lu else 0)
+    p.scratch = take_doubles(a, supernodal_scratch_size(p, lu))
 
 
 # -- factor ------------------------------------------------------------------------------------------------------

@@ -1,49 +1,28 @@
 """Build the elimination order and the panel K of Newton's method over bodies, in workspace that the caller provides.
 
-`order_bodies` needs `index_workspace_size`. The pattern of the factor then needs `factor_index_size`, its values
-`body_workspace_size`, with six columns for each body. A caller that allocates after the ordering may bind fewer columns.
+`order_bodies` needs `bind_pattern`. The sizes of the factor's pattern and of its values follow from the order. A caller that
+allocates after the ordering may bind fewer than six columns for each body.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memset
 
+from lavender_ext.core.arena cimport arena_t, take_integers
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
-from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t, view_t
+from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t
 from lavender_ext.factor.graph cimport order_bodies_and_list_block_rows, pattern_workspace_size
-from lavender_ext.factor.linear cimport (BLOCKS, NO_FACTOR, bind_block_factor, block_factor_index_size, block_factor_size,
-                                         block_pattern_index_size)
+from lavender_ext.factor.linear cimport BLOCKS, NO_FACTOR
 from lavender_ext.factor.symbolic cimport compute_block_elimination_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport compute_panel, factor_inertia
-from lavender_ext.newton.run cimport (bind_index_workspace, bind_real_workspace, method_index_size, method_real_size,
-                                      newton_t)
-from lavender_ext.newton.scaling cimport is_problem_supported, scaled_t
+from lavender_ext.newton.run cimport newton_t
+from lavender_ext.newton.scaling cimport scaled_t
 from lavender_ext.newton.system cimport BODIES
-
-
-cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the number of int32 for `order_bodies` if every row were an element; 0 if the method does not apply."""
-    cdef int64_t k = p.n_rows, n = r.n_bodies
-    if n == 0 or k == 0 or not is_problem_supported(p):
-        return 0
-    return order_index_size(n, k) + method_index_size(k) + 1
-
-
-cdef inline int64_t factor_index_size(int64_t n, int64_t blocks, int64_t below) noexcept nogil:
-    """Return the number of int32 for the factor of n bodies. N has `blocks` blocks, and L has `below` off-diagonal blocks."""
-    return block_pattern_index_size(n, 6, blocks, below) + block_factor_index_size(n, 6)
-
-
-cdef inline int64_t order_index_size(int64_t n, int64_t k) noexcept nogil:
-    """Return the number of int32 of `index_workspace_size` that the elimination order of n bodies and k elements uses."""
-    # Scratch of the elimination order, four vectors over the bodies, the pattern of N, and the elements.
-    return pattern_workspace_size(n, k) + 4 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 
 
 cdef struct pattern_t:
     int32_t n                   # bodies
     int32_t k                   # elements
-    int32_t* scratch            # `pattern_workspace_size`
+    int32_t* scratch            # `pattern_workspace_size` of graph.pxd
     int32_t* parent
     int32_t* mark
     int32_t* nptr
@@ -56,26 +35,15 @@ cdef struct pattern_t:
     int32_t* swapped
 
 
-cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_t n, int64_t k) noexcept nogil:
-    """Bind the pattern of n bodies and k elements to `index` (aligned to 8 bytes); return the first unused int32."""
+cdef inline void bind_pattern(pattern_t* a, int64_t n, int64_t k, arena_t* arena) noexcept nogil:
+    """Take the arrays for the elimination order of n bodies and k elements; the arena's integers are aligned to 8 bytes."""
     a.n, a.k = <int32_t>n, <int32_t>k
-    a.scratch = index
-    a.parent = index + pattern_workspace_size(n, k)
-    a.mark = a.parent + n + 1
-    a.nptr = a.mark + n + 1
-    a.lptr = a.nptr + n + 1
-    a.nind = a.lptr + n + 1
-    a.group = a.nind + n + k + 1
-    a.body = a.group + k + 1
-    a.node = a.body + 2 * k
-    a.slot = a.node + 2 * k
-    a.swapped = a.slot + 3 * k
-    return index + order_index_size(n, k)
-
-
-cdef inline void bind_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Bind the integers of s and a to `index` (`index_workspace_size` int32)."""
-    bind_index_workspace(s, p.n_rows, bind_pattern_workspace(a, index, r.n_bodies, p.n_rows))
+    a.scratch = take_integers(arena, pattern_workspace_size(n, k))
+    a.parent, a.mark, a.nptr, a.lptr = (take_integers(arena, n + 1), take_integers(arena, n + 1), take_integers(arena, n + 1),
+                                        take_integers(arena, n + 1))
+    a.nind, a.group = take_integers(arena, n + k + 1), take_integers(arena, k + 1)
+    a.body, a.node, a.slot = take_integers(arena, 2 * k), take_integers(arena, 2 * k), take_integers(arena, 3 * k)
+    a.swapped = take_integers(arena, k)
 
 
 cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
@@ -107,12 +75,6 @@ cdef inline int64_t order_elements(const scaled_t* s, pattern_t* a, const rows_t
 cdef inline bint needs_lu(const newton_t* s, const blocks_t* p) noexcept nogil:
     """Return whether N may lack symmetry: under Coulomb's law with friction."""
     return p.law == COULOMB and s.sc.e.n < s.sc.e.m
-
-
-cdef inline int64_t body_workspace_size(const newton_t* s, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the number of doubles that `bind_body_workspace` assigns, after `analyse_blocks`."""
-    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + method_real_size(p.n_rows, s.sc.small) + 6 * <int64_t>r.n_bodies
-            + block_factor_size(&s.linear.blocks, needs_lu(s, p)))
 
 
 cdef inline int32_t group_elements_by_bodies(elements_t* e, int32_t* group) noexcept nogil:
@@ -173,35 +135,12 @@ cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, 
                 row[c % 6 + (0 if c // 6 == body[2 * i] else 6)] = y[q] / sqrt(p.d[j])
 
 
-cdef inline void bind_panel_and_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
-                             bint lu, int32_t wide, int32_t* index, double* y, double* real) noexcept nogil:
-    """Bind the panel (rows, 12), with these columns of each body, and the factor after `analyse_blocks`.
-
-    index has `block_factor_index_size`, y n size, real `block_factor_size`.
-    """
+cdef inline void use_panel(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
+                           double* y) noexcept nogil:
+    """Use the panel (rows, 12) with these columns of each body; y (n size) is scratch. The factor is bound separately."""
     if s.sc.e.m:
         remove_fixed_rows_and_columns(&s.sc, a.swapped, column, size, panel)
     s.s.form, s.s.symmetric, s.s.y = BODIES, 1, y
     s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
     group_elements_by_bodies(&s.sc.e, a.group)
     s.linear.kind, s.linear.n, s.linear.factored = BLOCKS, s.linear.blocks.factor.n, NO_FACTOR
-    bind_block_factor(&s.linear.blocks, lu, wide, index, real)
-
-
-cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, const view_t* v, int32_t wide,
-                                     int32_t* index) noexcept nogil:
-    """Bind all values of s in real (`body_workspace_size`), and the factor's integers in index (`block_factor_index_size`)."""
-    cdef const blocks_t* p = &v.p
-    cdef const rows_t* r = v.r
-    cdef int32_t i
-    cdef int32_t column[6]
-    cdef double* panel
-    cdef double* x
-    memset(real, 0, method_real_size(p.n_rows, s.sc.small) * sizeof(double))
-    panel = bind_real_workspace(s, v, real)
-    x = panel + 12 * <int64_t>p.n_rows
-    for i in range(6):
-        column[i] = i
-    form_panel(p, r, x, panel)
-    x += 10 * <int64_t>r.n_bodies
-    bind_panel_and_factor(s, a, panel, column, 6, needs_lu(s, p), wide, index, x, x + 6 * <int64_t>r.n_bodies)

@@ -7,6 +7,7 @@ in between.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
+from lavender_ext.core.arena cimport arena_t, has_memory, take_doubles, take_integers
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.linear cimport linear_t
@@ -18,8 +19,7 @@ from lavender_ext.judge.measure cimport residual_above_floor, relative_floor_of_
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.newton.interior cimport interior_t
 from lavender_ext.newton.natural_map cimport compute_convex_residual
-from lavender_ext.newton.scaling cimport (bind_element_workspace, bind_scaling_workspace, scale_elements,
-                                          scaled_index_size, scaled_real_size, scaled_t)
+from lavender_ext.newton.scaling cimport bind_element_indices, bind_element_values, scale_elements, scaled_t
 from lavender_ext.newton.system cimport system_t, multiply_system_matrix
 
 
@@ -51,7 +51,7 @@ cdef enum:                      # counters
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
-    N_VECTORS = 30              # vectors (m) of `bind_vector_workspace`
+    N_VECTORS = 30              # vectors (m) of `bind_vectors`
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
 
@@ -257,44 +257,29 @@ cdef inline void set_problem(newton_t* n, const blocks_t* p, const csr_t* a, con
     n.problem.p, n.problem.a, n.problem.r, n.problem.g = p[0], a, r, g
 
 
-cdef inline int64_t judge_workspace_size(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
-    """Return the number of doubles that `bind_judge_workspace` assigns."""
-    cdef int64_t m = p.n_rows, own = 4 * m + best_workspace_size(m, <int64_t>p.n_blocks + 1)
-    if r != NULL:
-        return own + 12 * <int64_t>r.n_bodies
-    return own + (g.n + m if g != NULL else 0)
+cdef inline void bind_judge_arrays(newton_t* n, arena_t* a) noexcept nogil:
+    """Take the judge's arrays for the problem of `set_problem`."""
+    cdef const problem_t* o = &n.problem
+    cdef int64_t m = o.p.n_rows
+    cdef double* best
+    n.lam, n.certificate = take_doubles(a, m), take_doubles(a, m)
+    n.problem.w, n.problem.error = take_doubles(a, m), take_doubles(a, m)
+    best = take_doubles(a, best_workspace_size(m, <int64_t>o.p.n_blocks + 1))
+    n.problem.x = take_doubles(a, m + (12 * <int64_t>o.r.n_bodies if o.r != NULL else o.g.n if o.g != NULL else 0))
+    if has_memory(a):
+        bind_best(&n.island_best, &n.problem.p, best)
+        n.island_best.by_residual = 1                   # Only solved islands are combined.
 
 
-cdef inline double* bind_judge_workspace(newton_t* n, double* workspace) noexcept nogil:
-    """Assign the judge's arrays for the problem of `set_problem`; return the next place."""
+cdef inline void bind_indices(newton_t* n, arena_t* a) noexcept nogil:
+    """Take the integer arrays for the problem of `set_problem`."""
     cdef int64_t m = n.problem.p.n_rows
-    n.lam, n.certificate = workspace, workspace + m
-    n.problem.w, n.problem.error = workspace + 2 * m, workspace + 3 * m
-    n.problem.x = workspace + 4 * m + best_workspace_size(m, n.problem.p.n_blocks + 1)
-    bind_best(&n.island_best, &n.problem.p, workspace + 4 * m)
-    n.island_best.by_residual = 1                       # Only solved islands are combined.
-    return workspace + judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g)
+    bind_element_indices(&n.sc, m, a)
+    n.active.bound, n.linear.swap, n.s.free = take_integers(a, m), take_integers(a, m), take_integers(a, m)
 
 
-cdef inline int64_t method_index_size(int64_t m) noexcept nogil:
-    """Return the number of int32 that `bind_index_workspace` assigns for m rows."""
-    return scaled_index_size(m) + 3 * m
-
-
-cdef inline void bind_index_workspace(newton_t* n, int64_t m, int32_t* index) noexcept nogil:
-    """Assign the integer arrays."""
-    bind_element_workspace(&n.sc, m, index)
-    index += scaled_index_size(m)
-    n.active.bound, n.linear.swap, n.s.free = index, index + m, index + 2 * m
-
-
-cdef inline int64_t method_real_size(int64_t m, int64_t small) noexcept nogil:
-    """Return the number of doubles that `bind_real_workspace` assigns for m rows and `small` entries of small matrices."""
-    return scaled_real_size(m) + N_VECTORS * m + 5 * small
-
-
-cdef inline void bind_vector_workspace(newton_t* n, double* workspace, int64_t m) noexcept nogil:
-    """Assign the vectors (N_VECTORS m)."""
+cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
+    """Take the vectors (m)."""
     cdef double** at[N_VECTORS]
     cdef int32_t i
     at[0], at[1], at[2], at[3] = &n.best_z, &n.saved_z, &n.earlier_z, &n.direction
@@ -306,27 +291,33 @@ cdef inline void bind_vector_workspace(newton_t* n, double* workspace, int64_t m
     at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
     at[28], at[29] = &n.s.t, &n.s.q
     for i in range(N_VECTORS):
-        at[i][0] = workspace + i * m
+        at[i][0] = take_doubles(a, m)
 
 
-cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* workspace) noexcept nogil:
-    """Scale the elements of `index_unfixed_elements` and assign vectors and small matrices in zeros; return the next place.
+cdef inline void bind_values(newton_t* n, int64_t small, arena_t* a) noexcept nogil:
+    """Take the judge's arrays, and in zeros the elements, the vectors, and small matrices of `small` entries in all.
 
-    The caller then sets `form`, `symmetric` and the fields of the form.
+    The caller then calls `scale_problem` and sets `form`, `symmetric` and the fields of the form.
     """
-    cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
-    cdef double* x = workspace + scaled_real_size(rows)
-    bind_scaling_workspace(&n.sc, rows, workspace)
+    cdef int64_t m = n.problem.p.n_rows, first
+    bind_judge_arrays(n, a)
+    first = a.n_real
+    bind_element_values(&n.sc, m, a)
+    bind_vectors(n, m, a)
+    n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = (take_doubles(a, small), take_doubles(a, small), take_doubles(a, small),
+                                                take_doubles(a, small), take_doubles(a, small))
+    if has_memory(a):
+        memset(a.real + first, 0, (a.n_real - first) * sizeof(double))
+
+
+cdef inline void scale_problem(newton_t* n, const view_t* v) noexcept nogil:
+    """Scale the elements that `index_unfixed_elements` found, and reset the system."""
     scale_elements(&n.sc, v, n.problem.w, n.problem.x)
-    bind_vector_workspace(n, x, rows)
-    x += N_VECTORS * rows
-    n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = x, x + small, x + 2 * small, x + 3 * small, x + 4 * small
     if n.sc.e.n == n.sc.e.m:                            # Bounded rows alone.
         n.s.bt = NULL
     n.s.e, n.s.linear = &n.sc.e, &n.linear
     n.s.others = NULL
     n.s.augmented = n.s.factorisations = 0
-    return x + 5 * small
 
 
 # -- the stack of phases -----------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block_types cimport (
     blocks_t, friction_components_t, get_friction_components, is_round_cone_contact, has_independent_rows,
 )
@@ -113,39 +114,26 @@ cdef inline bint is_fixed(const view_t* v, int32_t i, int32_t j, double* at) noe
     return True
 
 
-cdef inline int64_t scaled_index_size(int64_t m) noexcept nogil:
-    return 7 * m + 3
-
-
-cdef inline int64_t scaled_real_size(int64_t m) noexcept nogil:
-    return (8 + CONE_SCALING_SIZE) * m
-
-
-cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
-    """Bind the integer arrays for up to m rows to `index` (`scaled_index_size` int32)."""
-    s.keep = index
-    s.block = index + m
-    s.e.ptr = index + 2 * m
-    s.e.wptr = index + 3 * m + 1
-    s.e.part = index + 4 * m + 2
-    s.e.first = index + 5 * m + 3
-    s.e.size = index + 6 * m + 3
+cdef inline void bind_element_indices(scaled_t* s, int64_t m, arena_t* a) noexcept nogil:
+    """Take the integer arrays for up to m rows."""
+    s.keep, s.block = take_integers(a, m), take_integers(a, m)
+    s.e.ptr, s.e.wptr, s.e.part = take_integers(a, m + 1), take_integers(a, m + 1), take_integers(a, m + 1)
+    s.e.first, s.e.size = take_integers(a, m), take_integers(a, m)
     s.e.node = s.e.slot = s.e.group = NULL              # Only over bodies.
     s.e.n_groups = 0
     s.e.panel = NULL
     s.e.s = 1
 
 
-cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) noexcept nogil:
-    """Bind the arrays of doubles for up to m rows to `real` (`scaled_real_size` doubles)."""
-    s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
-    s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
-    s.e.reach = real + 7 * m
-    s.e.scaling = real + 8 * m
+cdef inline void bind_element_values(scaled_t* s, int64_t m, arena_t* a) noexcept nogil:
+    """Take the arrays of doubles for up to m rows."""
+    s.fixed, s.scale, s.speed = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.e.theta, s.e.g, s.e.lower, s.e.upper = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.e.reach, s.e.scaling = take_doubles(a, m), take_doubles(a, CONE_SCALING_SIZE * m)
 
 
 cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept nogil:
-    """Find the rows that are not fixed and their elements; the arrays are bound by `bind_element_workspace`."""
+    """Find the rows that are not fixed and their elements; the arrays are bound by `bind_element_indices`."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal
     cdef int32_t* ptr = <int32_t*>s.e.ptr
@@ -209,7 +197,7 @@ cdef inline bint write_fixed_impulses(scaled_t* s, const view_t* v) noexcept nog
 
 
 cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
-    """Compute the values of the elements, bound by `bind_scaling_workspace`; w (rows) and scratch (velocities) are lost."""
+    """Compute the values of the elements, bound by `bind_element_values`; w (rows) and scratch (velocities) are lost."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, q, h, g
     cdef double x

@@ -11,6 +11,7 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport get_data_pointer, allocate_zeros
 from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
@@ -18,20 +19,16 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide
 from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, PythonCalls, analyse_blocks, analyse_dense,
-                                         block_factor_index_size, block_factor_size, block_pattern_index_size)
-from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, bind_panel_and_factor, bind_pattern_workspace,
-                                         body_workspace_size, factor_index_size, form_panel, form_velocity_panel,
-                                         index_workspace_size, order_bodies, order_elements,
-                                         order_index_size, pattern_t)
+                                         bind_block_factor_indices, bind_block_factor_values)
+from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, needs_lu, order_bodies, order_elements,
+                                         pattern_t, use_panel)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
-from lavender_ext.newton.run cimport (N_COUNTED, bind_index_workspace, bind_judge_workspace, bind_real_workspace,
-                                      convex_residual, judge_workspace_size,
-                                      method_index_size, method_real_size, newton_t, set_problem, set_reference,
-                                      write_certificate, write_impulse)
+from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, convex_residual, newton_t, scale_problem,
+                                      set_problem, set_reference, write_certificate, write_impulse)
 from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_problem_supported
 from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
                                         multiply_cone_duals, compute_all_normal_shifts)
@@ -100,73 +97,126 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
     return how
 
 
+cdef inline void bind_dense_rows(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
+    """Take H and the matrix (m, m), and L L^T or L H."""
+    n.s.h, n.linear.matrix = take_doubles(a, m * m), take_doubles(a, m * m)
+    n.linear.lower = n.s.multiplied = take_doubles(a, m * m)
+
+
+cdef inline void use_dense_rows(newton_t* n, int32_t wide) noexcept nogil:
+    """Use the dense H."""
+    analyse_dense(&n.linear, n.sc.e.m)
+    n.linear.wide, n.linear.factored, n.s.form = wide, NO_FACTOR, DENSE
+
+
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Write the workspace sizes for the largest case: no row is fixed, and all contacts have six rows with friction."""
+    cdef newton_t n
     cdef int64_t m = v.p.n_rows
-    r.n_index = head() + method_index_size(m)
-    r.n_real = judge_workspace_size(&v.p, NULL, NULL) + method_real_size(m, 6 * m) + 2 * m * m + dense_workspace_size(m, True) + 8
+    cdef arena_t a = make_arena(NULL, NULL)
+    set_problem(&n, &v.p, v.a, NULL, NULL)
+    take_integers(&a, head())
+    bind_indices(&n, &a)
+    bind_values(&n, 6 * m, &a)
+    bind_dense_rows(&n, m, &a)
+    r.n_index, r.n_real = a.n_index, a.n_real
     return is_problem_supported(&v.p)
-
-
-cdef inline void bind_dense_system(newton_t* n, int32_t wide, const double* h, double* matrix, double* lower) noexcept nogil:
-    """Bind H and the matrix (m, m), and L L^T (`dense_workspace_size`)."""
-    analyse_dense(&n.linear, n.sc.e.m)
-    n.linear.wide, n.linear.matrix, n.linear.lower = wide, matrix, lower
-    n.linear.factored = NO_FACTOR
-    n.s.form, n.s.h, n.s.multiplied = DENSE, h, lower
 
 
 cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
-    cdef int64_t m = v.p.n_rows
     cdef workspace_t need
-    cdef double* x
+    cdef arena_t a = make_arena(r.real, r.index)
     rows_workspace_size(v, o, &need)
     if not require_workspace(r, need.n_index, need.n_real):
         return NEEDS_WORKSPACE
     memset(n, 0, sizeof(newton_t))
     set_problem(n, &v.p, v.a, NULL, NULL)
-    x = bind_judge_workspace(n, r.real)
-    bind_index_workspace(n, m, r.index + head())
+    take_integers(&a, head())
+    bind_indices(n, &a)
     index_unfixed_elements(&n.sc, v)
-    memset(x, 0, method_real_size(m, n.sc.small) * sizeof(double))
-    x = bind_real_workspace(n, v, x)
-    bind_dense_system(n, o.wide, x, x + m * m, x + 2 * m * m)
-    n.s.symmetric = form_scaled_matrix(&n.sc, v.a, <int32_t>m, n.linear.swap, x)
+    bind_values(n, n.sc.small, &a)
+    scale_problem(n, v)
+    bind_dense_rows(n, n.sc.e.m, &a)
+    use_dense_rows(n, o.wide)
+    n.s.symmetric = form_scaled_matrix(&n.sc, v.a, v.p.n_rows, n.linear.swap, <double*>n.s.h)
     return begin(n, o, lam)
+
+
+cdef inline void bind_body_indices(state_t* s, const view_t* v, arena_t* a) noexcept nogil:
+    """Take the state, and the integers of the elimination order if every row were an element."""
+    take_integers(a, head())
+    set_problem(&s.n, &v.p, NULL, v.r, NULL)
+    bind_pattern(&s.a, v.r.n_bodies, v.p.n_rows, a)
+    bind_indices(&s.n, a)
 
 
 cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Write the integers of the elimination order; `start` computes the sizes for the factor."""
-    cdef int64_t size = index_workspace_size(&v.p, v.r)
-    r.n_index, r.n_real = head() + size, 0
-    return size > 0
+    cdef state_t s
+    cdef arena_t a = make_arena(NULL, NULL)
+    if v.p.n_rows > 0 and v.r.n_bodies > 0 and is_problem_supported(&v.p):
+        bind_body_indices(&s, v, &a)
+    r.n_index, r.n_real = a.n_index, 0
+    return a.n_index > 0
+
+
+cdef inline void bind_body_values(newton_t* n, const view_t* v, int32_t wide, double** panel, double** y, double** root,
+                                  arena_t* a) noexcept nogil:
+    """Take all values after the analysis: the panel (rows, 12), y (6 n_bodies) and root (10 n_bodies), and the factor."""
+    bind_values(n, n.sc.small, a)
+    panel[0], root[0] = take_doubles(a, 12 * <int64_t>v.p.n_rows), take_doubles(a, 10 * <int64_t>v.r.n_bodies)
+    y[0] = take_doubles(a, 6 * <int64_t>v.r.n_bodies)
+    bind_block_factor_values(&n.linear.blocks, needs_lu(n, &v.p), wide, a)
+
+
+cdef inline int32_t analyse_bodies(state_t* s, const view_t* v, workspace_t* r) noexcept nogil:
+    """Order the bodies and analyse the pattern of the factor; return MORE, NEEDS_WORKSPACE or UNFIT."""
+    cdef pattern_t* p = &s.a
+    cdef newton_t* n = &s.n
+    cdef arena_t a = make_arena(NULL, r.index), counted
+    cdef workspace_t need
+    bodies_workspace_size(v, NULL, &need)
+    if not require_workspace(r, need.n_index, 0):
+        return NEEDS_WORKSPACE
+    memset(n, 0, sizeof(newton_t))
+    bind_body_indices(s, v, &a)
+    index_unfixed_elements(&n.sc, v)
+    if 6 * order_elements(&n.sc, p, v.r) > 2147483647:
+        return UNFIT
+    counted = arena_t(NULL, NULL, 0, a.n_index)
+    n.linear.blocks.n, n.linear.blocks.factor.n = p.n, 6 * p.n
+    analyse_blocks(&n.linear.blocks, p.n, 6, p.nptr, p.nind, p.parent, p.lptr, &counted)
+    bind_block_factor_indices(&n.linear.blocks, &counted)
+    if not require_workspace(r, counted.n_index, 0):
+        return NEEDS_WORKSPACE
+    r.work = n.linear.cost = analyse_blocks(&n.linear.blocks, p.n, 6, p.nptr, p.nind, p.parent, p.lptr, &a)
+    bind_block_factor_indices(&n.linear.blocks, &a)
+    r.is_bound = 1
+    return MORE
 
 
 cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
-    cdef newton_t* n = state_of(r)
-    cdef pattern_t* a = &(<state_t*>r.index).a
-    cdef int64_t below, first = head() + index_workspace_size(&v.p, v.r), needed
-    cdef int32_t* index = r.index + first + first % 2       # a multiple of 8 bytes
-    if not r.is_bound:
-        if not require_workspace(r, first, 0):
-            return NEEDS_WORKSPACE
-        memset(n, 0, sizeof(newton_t))
-        bind_bodies(n, a, r.index + head(), &v.p, v.r)
-        index_unfixed_elements(&n.sc, v)
-        below = order_elements(&n.sc, a, v.r)
-        if 6 * below > 2147483647:
-            return UNFIT
-        needed = first + 1 + factor_index_size(a.n, a.nptr[a.n], below)
-        if not require_workspace(r, needed, 0):
-            return NEEDS_WORKSPACE
-        r.work = n.linear.cost = analyse_blocks(&n.linear.blocks, a.n, 6, a.nptr, a.nind, a.parent, a.lptr, index)
-        r.is_bound = 1
-    if not require_workspace(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, &v.p, v.r)):
-        return NEEDS_WORKSPACE
+    cdef state_t* s = <state_t*>r.index
+    cdef newton_t* n = &s.n
+    cdef arena_t counted = make_arena(NULL, NULL), a = make_arena(r.real, r.index)
+    cdef int32_t i, how = MORE if r.is_bound else analyse_bodies(s, v, r)
+    cdef int32_t column[6]
+    cdef double* panel
+    cdef double* root
+    cdef double* y
+    if how != MORE:
+        return how
     set_problem(n, &v.p, NULL, v.r, NULL)
-    index += block_pattern_index_size(a.n, 6, a.nptr[a.n], a.lptr[a.n])
-    bind_body_workspace(n, a, bind_judge_workspace(n, r.real), v, o.wide, index)
+    bind_body_values(n, v, 0, &panel, &y, &root, &counted)
+    if not require_workspace(r, r.n_index, counted.n_real):
+        return NEEDS_WORKSPACE
+    bind_body_values(n, v, o.wide, &panel, &y, &root, &a)
+    scale_problem(n, v)
+    for i in range(6):
+        column[i] = i
+    form_panel(&v.p, v.r, root, panel)
+    use_panel(n, &s.a, panel, column, 6, y)
     return begin(n, o, lam)
 
 
@@ -220,16 +270,22 @@ cdef class Layout:
         cdef pattern_t* a = &self.a
         cdef int64_t k = body.shape[0], below
         cdef int32_t i
-        self.index = np.empty(order_index_size(n, k) + 2, np.int32)
-        bind_pattern_workspace(a, <int32_t*>get_data_pointer(self.index), n, k)
+        cdef arena_t counted = make_arena(NULL, NULL), arena
+        bind_pattern(a, n, k, &counted)
+        self.index = np.empty(counted.n_index + 2, np.int32)
+        arena = make_arena(NULL, <int32_t*>get_data_pointer(self.index))
+        bind_pattern(a, n, k, &arena)
         if k:
             memcpy(a.body, &body[0, 0], 2 * k * sizeof(int32_t))
         with nogil:
             below = order_bodies(a)
         if s * below >= 2**31:
             raise OverflowError("the factor has 2^31 rows of blocks or more")
-        self.pattern = np.empty(block_pattern_index_size(n, s, a.nptr[n], below), np.int32)
-        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, <int32_t*>get_data_pointer(self.pattern))
+        counted = make_arena(NULL, NULL)
+        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, &counted)
+        self.pattern = np.empty(counted.n_index, np.int32)
+        arena = make_arena(NULL, <int32_t*>get_data_pointer(self.pattern))
+        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, &arena)
         self.n, self.s, self.supernodes = n, s, self.blocks.factor.supernodes
         for i in range(n):
             self.work += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
@@ -257,6 +313,7 @@ cdef class Solve(Method):
     matrix : Data or None
         A in compressed rows; None: over the bodies of `data`, or over the bodies that `graph.find_bodies_of_velocities` finds.
     """
+    cdef state_t state
     cdef newton_t* n
     cdef external_t calls
     cdef PythonCalls python
@@ -271,19 +328,22 @@ cdef class Solve(Method):
         cdef newton_t* n
         cdef view_t v = data.get_pointers() if matrix is None else view_t(data.blocks, &matrix.csr, NULL, NULL)
         cdef int64_t rows = data.blocks.n_rows, k
+        cdef arena_t a = make_arena(NULL, NULL)
         self.data, self.view, self.own = data, data.get_pointers(), method_t(NULL, NULL, step_newton_system)
-        self.index = np.zeros(head() + method_index_size(rows) + 1, np.int32)
-        self.space.index = <int32_t*>get_data_pointer(self.index)
-        n = self.n = state_of(&self.space)
+        n = self.n = &self.state.n
+        self.space.index = <int32_t*>&self.state
         set_problem(n, &self.view.p, self.view.a, self.view.r, self.view.g)
         set_reference(&n.problem, data.reference_energy, data.reference_velocity)
-        judge = allocate_zeros(judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g))
-        self.held = [matrix, judge]
-        bind_judge_workspace(n, <double*>get_data_pointer(judge))
-        bind_index_workspace(n, rows, self.space.index + head())
+        bind_indices(n, &a)
+        self.index = np.zeros(a.n_index, np.int32)
+        a = make_arena(NULL, <int32_t*>get_data_pointer(self.index))
+        bind_indices(n, &a)
         index_unfixed_elements(&n.sc, &v)
-        self.real = allocate_zeros(method_real_size(rows, n.sc.small))
-        bind_real_workspace(n, &v, <double*>get_data_pointer(self.real))
+        bind_values(n, n.sc.small, &a)
+        self.held, self.real = [matrix], allocate_zeros(a.n_real)
+        a = make_arena(<double*>get_data_pointer(self.real), NULL)
+        bind_values(n, n.sc.small, &a)
+        scale_problem(n, &v)
         m = self.m = n.sc.e.m
         k = n.sc.e.n
         self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)
@@ -321,8 +381,9 @@ cdef class Solve(Method):
         cdef double[::1] whole = np.empty(self.m * self.m + 1)
         cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
         self.held += [h, whole, lower]
-        self.n.s.symmetric = symmetric
-        bind_dense_system(self.n, has_wide() if wide else 0, &h[0, 0] if self.m else NULL, &whole[0], &lower[0])
+        self.n.s.symmetric, self.n.s.h = symmetric, &h[0, 0] if self.m else NULL
+        self.n.linear.matrix, self.n.linear.lower, self.n.s.multiplied = &whole[0], &lower[0], &lower[0]
+        use_dense_rows(self.n, has_wide() if wide else 0)
 
     def use_sparse_matrix(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
         """Use H in compressed rows. Its linear system `linear` has the pattern of the graph (to, other) of elements.
@@ -370,15 +431,18 @@ cdef class Solve(Method):
         """Use K of `jacobian`, which is overwritten, with these columns of each body; lu: N may have to be factored as L U."""
         cdef block_matrix_t* f = &self.n.linear.blocks
         cdef pattern_t a = layout.a
-        cdef int32_t factored = a.n * layout.s
+        cdef arena_t memory = make_arena(NULL, NULL)
         f[0] = layout.blocks
-        own = np.empty(block_factor_index_size(a.n, layout.s) + len(self.ptr) + 1, np.int32)
-        a.group = <int32_t*>get_data_pointer(own) + block_factor_index_size(a.n, layout.s)
-        values = np.empty(factored + block_factor_size(f, lu) + 1)
-        self.held += [panel, layout, own, values]
-        bind_panel_and_factor(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, lu, has_wide() if wide else 0,
-                    <int32_t*>get_data_pointer(own), <double*>get_data_pointer(values),
-                    <double*>get_data_pointer(values) + factored)
+        bind_block_factor_indices(f, &memory)
+        bind_block_factor_values(f, lu, 0, &memory)
+        own, y = np.empty(memory.n_index + len(self.ptr) + 1, np.int32), np.empty(a.n * layout.s + 1)
+        values = np.empty(memory.n_real + 1)
+        self.held += [panel, layout, own, y, values]
+        memory = make_arena(<double*>get_data_pointer(values), <int32_t*>get_data_pointer(own))
+        bind_block_factor_indices(f, &memory)
+        bind_block_factor_values(f, lu, has_wide() if wide else 0, &memory)
+        a.group = take_integers(&memory, 0)
+        use_panel(self.n, &a, <double*>get_data_pointer(panel), &columns[0], layout.s, <double*>get_data_pointer(y))
         f.factor.interrupt = &self.python.interrupt
 
     # -- start and step ----------------------------------------------------------------------------

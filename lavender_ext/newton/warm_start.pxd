@@ -11,6 +11,7 @@ restored and the result is UNDECIDED.
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport rows_t
 
@@ -50,21 +51,12 @@ cdef struct warm_t:
     int32_t n_traced
 
 
-cdef inline int64_t warm_workspace_size(const blocks_t* p, int32_t width) noexcept nogil:
-    """Return the number of doubles that `bind_warm_workspace` assigns."""
-    return (4 + <int64_t>width) * p.n_rows + 2 * <int64_t>p.n_blocks
-
-
-cdef inline void bind_warm_workspace(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Assign the arrays in real (`warm_workspace_size`) and index (n_bodies + 2 joints)."""
-    s.start = real
-    s.slack = real + p.n_rows
-    s.error = s.slack + p.n_rows
-    s.by_island = s.error + p.n_rows
-    s.given = s.by_island + 2 * <int64_t>p.n_blocks
-    s.band = s.given + p.n_rows
-    s.last_joint = index
-    s.previous_joint = index + r.n_bodies
+cdef inline void bind_warm_start(warm_t* s, const blocks_t* p, const rows_t* r, arena_t* a) noexcept nogil:
+    """Take the arrays; s.width is set, unless only the integers are used."""
+    cdef int64_t m = p.n_rows
+    s.start, s.slack, s.error, s.given = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.by_island, s.band = take_doubles(a, 2 * <int64_t>p.n_blocks), take_doubles(a, s.width * m)
+    s.last_joint, s.previous_joint = take_integers(a, r.n_bodies), take_integers(a, 2 * <int64_t>r.n_joints)
 
 
 cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil

@@ -4,6 +4,7 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
 from lavender_ext.core.block cimport compute_row_error
 from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_independent_rows
 from lavender_ext.core.problem cimport Data
@@ -19,7 +20,7 @@ from lavender_ext.judge.slack cimport compute_body_slack
 from lavender_ext.judge.tally cimport make_empty_tally, add_row_error, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEP_CHECK, JUDGED, MAX_BAND_WIDTH, MAX_TRACED_SCORES,
                                              MAX_WARM_ROWS, MAX_WARM_SWEEPS, MIN_SWEEPS_TO_GIVE_UP, SOLVED, SWEPT,
-                                             UNDECIDED, bind_warm_workspace, warm_t, warm_workspace_size)
+                                             UNDECIDED, bind_warm_start, warm_t)
 from lavender_ext.sweep.pgs cimport sweep_bodies_in_sequence
 
 
@@ -260,14 +261,20 @@ def solve_from_guess(Data data, double[::1] impulse, double tol):
     """
     cdef int32_t m = data.blocks.n_rows, result
     cdef warm_t s
+    cdef arena_t a = make_arena(NULL, NULL)
+    cdef double* v
     if m == 0 or not data.factored:
         return 0, 0, 0
-    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
+    s.width = 0
+    bind_warm_start(&s, &data.blocks, &data.rows, &a)
+    cdef int32_t[::1] index = np.empty(a.n_index + 1, np.int32)
     s.width = compute_joint_bandwidth(&data.blocks, &data.rows, &index[0])
-    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + warm_workspace_size(&data.blocks, s.width))
+    cdef double[::1] real = np.empty(a.n_real + <int64_t>s.width * m + 6 * data.rows.n_bodies)
+    a = make_arena(&real[0], &index[0])
+    bind_warm_start(&s, &data.blocks, &data.rows, &a)
+    v = take_doubles(&a, 6 * <int64_t>data.rows.n_bodies)
     s.trace = NULL
     s.keeps_start = 0
-    bind_warm_workspace(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
-        result = solve_from_warm_start(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
+        result = solve_from_warm_start(&data.blocks, &data.rows, &s, tol, &impulse[0], v, 0)
     return result, s.sweeps, s.factorisations

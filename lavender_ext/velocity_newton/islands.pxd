@@ -3,8 +3,9 @@
 Panels that share a column, directly or through other panels, form an island. The velocities of one island do not move
 the rows of another.
 """
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction
 from lavender_ext.core.roots cimport find_root
@@ -177,19 +178,33 @@ cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t
     return True
 
 
-cdef inline ssize_t structure_workspace_size(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
-    """Return the number of int32 that `find_islands_and_factor_patterns` uses with `per` entries in each row of L."""
-    cdef ssize_t n = g.n, panels = g.n_panels
-    return (3 * n + (n if n > panels else panels) + 6 * panels + 5 * <ssize_t>p.n_rows + g.pcol[panels] + p.n_blocks + 8
-            + pattern_index_size(n, g.pcol[panels], per))
+cdef struct structure_t:        # memory of `find_islands_and_factor_patterns`
+    int32_t* root               # (n) scratch
+    int32_t* label              # (max(n, n_panels)) scratch
+    int32_t* over_rows          # (n_panels)
+    int32_t* pattern            # `pattern_index_size` of sparse.pxd
 
 
-cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
-                        requirements_t* need) noexcept nogil:
-    """Find the islands of a problem and the pattern of L of each; w (`structure_workspace_size`) is their memory."""
-    cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
+cdef inline void bind_structure(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, structure_t* s,
+                                arena_t* a) noexcept nogil:
+    """Take the integers of islands, blocks and rows, and of a pattern with `per` entries in each row of L."""
+    cdef int64_t n = g.n, panels = g.n_panels, m = p.n_rows
+    s.root, s.label = take_integers(a, n), take_integers(a, max(n, panels))
+    f.linear.swap = s.root                              # `find_islands` does not need it any more.
+    f.iptr, f.cptr, f.run, f.pblock = (take_integers(a, panels + 1), take_integers(a, panels + 1), take_integers(a, 2 * panels),
+                                       take_integers(a, panels + 1))
+    f.icols, f.local, f.vptr = take_integers(a, n), take_integers(a, n), take_integers(a, p.n_blocks + 1)
+    f.row_list, f.places, f.columns = take_integers(a, m), take_integers(a, m), take_integers(a, m)
+    f.picked_columns, f.panel_of_column = take_integers(a, m), take_integers(a, m)
+    f.transpose_offset = take_integers(a, g.pcol[panels])
+    f.over_rows = s.over_rows = take_integers(a, panels)
+    s.pattern = take_integers(a, pattern_index_size(n, g.pcol[panels], per))
+
+
+cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per,
+                                                  structure_t* memory, requirements_t* need) noexcept nogil:
+    """Find the islands of a problem and the pattern of L of each, in the memory of `bind_structure`."""
     cdef int32_t i, size
-    cdef int32_t* over_rows
     cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
@@ -197,26 +212,8 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     f.p.law = f.law
     f.softness = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
     f.g = g
-    f.iptr = w + at
-    f.cptr = w + at + panels + 1
-    f.run = w + at + 2 * panels + 2
-    f.pblock = w + at + 4 * panels + 2
-    at += 5 * panels + 3
-    f.icols = w + at
-    f.local = w + at + n
-    f.vptr = w + at + 2 * n
-    at += 2 * n + p.n_blocks + 1
-    f.row_list = w + at
-    f.places, f.columns = f.row_list + p.n_rows, f.row_list + 2 * <ssize_t>p.n_rows
-    f.picked_columns, f.panel_of_column = f.columns + p.n_rows, f.columns + 2 * <ssize_t>p.n_rows
-    f.transpose_offset = f.panel_of_column + p.n_rows
-    at += 5 * <ssize_t>p.n_rows + g.pcol[panels]
-    over_rows = w + at
-    f.over_rows = over_rows
-    at += panels
     index_panels(f, need)
-    find_islands(f, w, w + n, need)
-    f.linear.swap = w                                     # The memory that `find_islands` used as scratch is free again.
+    find_islands(f, memory.root, memory.label, need)
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
@@ -227,15 +224,14 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     need.values = need.work = need.row_matrix_values = need.unused_entries = 0.0
     need.exceeds_pattern = need.rows = 0
     for i in range(f.n_islands):
-        over_rows[i] = choose_row_form(f, i, need)
-        f.sparse = f.sparse or not over_rows[i]
+        memory.over_rows[i] = choose_row_form(f, i, need)
+        f.sparse = f.sparse or not memory.over_rows[i]
     if not f.sparse:
         return
-    need.exceeds_pattern = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
-    f.lptr = w + at
-    f.lidx = w + at + f.cptr[f.n_islands] + 1
+    need.exceeds_pattern = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, memory.pattern) < 0
+    f.lptr, f.lidx = memory.pattern, memory.pattern + f.cptr[f.n_islands] + 1
     for i in range(0 if need.exceeds_pattern else f.n_islands):
-        if over_rows[i]:
+        if memory.over_rows[i]:
             continue
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
@@ -248,52 +244,20 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
         need.values = max(need.values, values)
 
 
-cdef inline ssize_t count_real_workspace(const flow_t* f, const requirements_t* need) noexcept nogil:
-    """Return the number of doubles that `bind_real_workspace` assigns."""
-    cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
-    return (4 * max(<ssize_t>f.g.n, <ssize_t>f.p.n_rows) + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks]
-            + 2 * values + 2 * size + need.panel_values + need.panel_columns + need.panel_rows + 1
-            + <ssize_t>need.row_matrix_values + 2 * need.rows)
-
-
-cdef inline void bind_real_workspace(flow_t* f, const requirements_t* need, double* x) noexcept nogil:
-    """Assign the arrays of the iterate, of V and of N in x (`count_real_workspace`)."""
-    cdef ssize_t m = f.p.n_rows, n = max(<ssize_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
-    cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
-    f.y = x
-    f.u = x + n
-    f.grad = x + 2 * n
-    f.step = x + 3 * n
-    x += 4 * n
-    f.theta = x
-    f.rho = x + m
-    f.s = x + 2 * m
-    f.q = x + 3 * m
-    f.phi = x + 4 * m
-    f.center = x + 5 * m
-    f.lam = x + 6 * m
-    f.trial = x + 7 * m
-    f.best = x + 8 * m
-    f.island_best = x + 9 * m
-    f.w = x + 10 * m
-    f.e = x + 11 * m
-    f.inv_theta = x + 12 * m
-    f.paused_start = x + 13 * m
-    f.sqrt_theta = x + 14 * m
-    x += 15 * m
-    f.v = x
-    f.factored_v = x + nv
-    x += 2 * nv
-    f.normal = x
-    f.factor = x + values
-    x += 2 * values
-    f.linear.scale = x
-    f.local_rhs = x + size
-    f.weighted_y = x + 2 * size
-    f.line = x + 2 * size + need.panel_values
-    x += 2 * size + need.panel_values + need.panel_columns + need.panel_rows + 1
-    f.sum = x
-    f.y_transpose = x + 2 * need.rows
+cdef inline void bind_iterate(flow_t* f, const requirements_t* need, arena_t* a) noexcept nogil:
+    """Take the arrays of the iterate, of V and of N."""
+    cdef int64_t m = f.p.n_rows, n = max(<int64_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
+    cdef int64_t size = max(need.island_columns, need.rows), values = <int64_t>need.values
+    f.y, f.u, f.grad, f.step = take_doubles(a, n), take_doubles(a, n), take_doubles(a, n), take_doubles(a, n)
+    f.theta, f.rho, f.s, f.q = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    f.phi, f.center, f.lam, f.trial = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    f.best, f.island_best, f.w, f.e = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    f.inv_theta, f.paused_start, f.sqrt_theta = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    f.v, f.factored_v = take_doubles(a, nv), take_doubles(a, nv)
+    f.normal, f.factor = take_doubles(a, values), take_doubles(a, values)
+    f.linear.scale, f.local_rhs, f.weighted_y = take_doubles(a, size), take_doubles(a, size), take_doubles(a, need.panel_values)
+    f.line = take_doubles(a, need.panel_columns + need.panel_rows + 1)
+    f.sum, f.y_transpose = take_doubles(a, 2 * need.rows), take_doubles(a, <int64_t>need.row_matrix_values)
     f.a = NULL
 
 

@@ -5,11 +5,12 @@ multiply-adds of N and of its factor, of all islands.
 """
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_integers
 from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, require_workspace, options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
-from lavender_ext.velocity_newton.islands cimport (bind_real_workspace, find_islands_and_factor_patterns, count_real_workspace,
-                                                   requirements_t, set_required_residual, structure_workspace_size)
+from lavender_ext.velocity_newton.islands cimport (bind_iterate, bind_structure, find_islands_and_factor_patterns, requirements_t,
+                                                   set_required_residual, structure_t)
 from lavender_ext.velocity_newton.newton cimport solve_islands
 from lavender_ext.velocity_newton.sparse cimport initial_entries_per_row
 
@@ -20,10 +21,19 @@ cdef struct state_t:            # at the beginning of the integer workspace
     int32_t done                # steps so far
 
 
+cdef inline void bind_analysis(state_t* s, const view_t* v, int32_t tries, structure_t* memory, arena_t* a) noexcept nogil:
+    """Take the state, and the integers for a pattern of L that doubles with each of `tries`."""
+    take_integers(a, sizeof(state_t) // sizeof(int32_t))
+    bind_structure(&s.f, &v.p, v.g, initial_entries_per_row(v.g.n) << tries, memory, a)
+
+
 cdef inline int32_t islands_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Write the size of the integer workspace for the smallest pattern; the real size follows from the pattern."""
-    r.n_index = sizeof(state_t) // sizeof(int32_t) + structure_workspace_size(&v.p, v.g, initial_entries_per_row(v.g.n) << r.tries)
-    r.n_real = 0
+    cdef state_t s
+    cdef structure_t memory
+    cdef arena_t a = make_arena(NULL, NULL)
+    bind_analysis(&s, v, r.tries, &memory, &a)
+    r.n_index, r.n_real = a.n_index, 0
     return 1
 
 
@@ -42,21 +52,27 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
     cdef requirements_t* need = &s.need
     cdef int32_t per
     cdef workspace_t smallest = r[0]
+    cdef structure_t memory
+    cdef arena_t a, counted = make_arena(NULL, NULL)
     while not r.is_bound:
         islands_workspace_size(v, o, &smallest)
         if not require_workspace(r, smallest.n_index, 0):
             return NEEDS_WORKSPACE
         per = initial_entries_per_row(v.g.n) << r.tries
-        find_islands_and_factor_patterns(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
+        a = make_arena(NULL, r.index)
+        bind_analysis(s, v, r.tries, &memory, &a)
+        find_islands_and_factor_patterns(&s.f, &v.p, v.g, per, &memory, need)
         r.is_bound = not need.exceeds_pattern
         r.work, r.islands = need.work, s.f.n_islands
         if (need.exceeds_pattern and exceeds_limits(o, need, <double>per * v.g.n, v.g.n)
                 or r.is_bound and max(need.values, need.row_matrix_values) > o.most):
             return UNFIT
         smallest.tries = r.tries = r.tries + (1 - r.is_bound)  # Retry with twice the entries per row.
-    if not require_workspace(r, r.n_index, count_real_workspace(&s.f, need)):
+    bind_iterate(&s.f, need, &counted)
+    if not require_workspace(r, r.n_index, counted.n_real):
         return NEEDS_WORKSPACE
-    bind_real_workspace(&s.f, need, r.real)
+    a = make_arena(r.real, NULL)
+    bind_iterate(&s.f, need, &a)
     s.f.wide = o.wide
     set_required_residual(&s.f, o.tol, 0, o.e0, o.v0)
     s.done = 0
