@@ -137,6 +137,7 @@ def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
 
     from lavender import suite
     from lavender.report.cases import is_path
+    from lavender.report.text import format_residual
 
     if item.in_memory is not None or is_path(item.source):
         return None
@@ -145,10 +146,10 @@ def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
         return None
     unique = reference.compare == "impulse"
     exact = reference.impulse if unique else item.problem.slack(reference.impulse)
-    distances = [
-        f"{row.solver} {np.abs((row.solution.impulse if unique else row.solution.slack) - exact).max():.1e}"
-        for row in comparison
-        if row.solution is not None
-    ]
+    distances = []
+    for row in comparison:
+        if row.solution is not None:
+            found = row.solution.impulse if unique else row.solution.slack
+            distances.append(f"{row.solver} {format_residual(np.abs(found - exact).max())}")
     what = "impulses [N s]" if unique else "slacks [m/s]"
     return f"distance of the {what} from the exact solution ({reference.source}): {', '.join(distances)}"

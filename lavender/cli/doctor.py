@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from typing import Any
 
 import click
 
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
-from lavender.cli.options import ErrorReporter, print_escaped
+from lavender.cli.options import ErrorReporter, escape_markup, make_console, print_escaped
 
 
 @click.command()
@@ -36,18 +37,37 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(results, indent=2, ensure_ascii=True))
     else:
-        for key, value in results.items():
-            if key not in ("self_test", "same_bits"):
-                text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
-                click.echo(f"{key:<14}{text}")
-        wrong = {name: result for name, result in results["self_test"].items() if result != "same"}
-        click.echo(
-            f"{'self-test':<14}{len(results['self_test']) - len(wrong)} of {len(results['self_test'])} give their bits"
-        )
-        for name, result in wrong.items():
-            click.echo(f"{'':<14}{name}: {result}")
+        _print_facts(results)
     if not results["same_bits"]:
         raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _print_facts(results: dict[str, Any]) -> None:
+    """Print the facts about an installation in two columns, which fit into the terminal."""
+    backends, self_test = results["backends"], results["self_test"]
+    missing = [name for name, text in backends.items() if text.startswith("needs ")]
+    wrong = {name: result for name, result in self_test.items() if result != "same"}
+    shown = {
+        **{
+            key: value
+            for key, value in results.items()
+            if key not in ("self_test", "same_bits", "memory_bytes")
+        },
+        "memory": f"{results['memory_bytes'] / 2**30:.1f} GiB",
+        "load": "" if results["load"] is None else f"{results['load']:.1f}",
+        "backends": "; ".join(f"{name}: {text}" for name, text in backends.items() if name not in missing),
+        "not installed": f"{', '.join(missing)} (`lavender solvers NAME` prints the command that installs one)",
+        "self-test": f"{len(self_test) - len(wrong)} of {len(self_test)} give their bits",
+        **{f"  {name}": result for name, result in wrong.items()},
+    }
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    for key, value in shown.items():
+        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        if text:
+            table.add_row(key, escape_markup(text))
+    make_console().print(table, highlight=False)
 
 
 def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:

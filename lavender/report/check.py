@@ -30,7 +30,9 @@ from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
+from lavender.report.records import format_tolerance
 from lavender.report.table import Table
+from lavender.report.text import format_residual, format_significant_digits
 from lavender.report.worker import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
@@ -169,7 +171,7 @@ class CrossCheck:
                 f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
                 _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.velocity),
                 _format_number(r.distance), _format_number(r.allowed), _format_number(r.objective),
-                "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
+                "" if r.time is None else format_significant_digits(1e3 * r.time), r.note,
             )
             for r in self.rows
         ]  # fmt: skip
@@ -184,8 +186,9 @@ class CrossCheck:
     def description(self) -> str:
         """Name and law of the problem, tolerance and reference."""
         name = self.problem.name or f"{self.problem.m} rows"
+        tol = format_tolerance(self.tol) if self.tol else "0"
         reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
-        return f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}"
+        return f"{name} ({self.problem.law}), tol {tol}, {reference}, {self.reference_note}"
 
     def __str__(self) -> str:
         widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
@@ -197,7 +200,7 @@ class CrossCheck:
 
 def _format_number(x: float | None) -> str:
     """Format a number, or nothing."""
-    return "" if x is None else f"{x:.1e}"
+    return "" if x is None else format_residual(x)
 
 
 def cross_check(
@@ -310,7 +313,11 @@ def _solve_reference(
             f"as Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
         )
     if not (problem.has_singular_program or problem.is_symmetric):
-        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
+        return (
+            None,
+            None,
+            f"A is not symmetric (by {format_residual(problem.asymmetry)}), so the problem is not a QP",
+        )
     if not (problem.has_singular_program or problem.is_semidefinite):
         return (
             None,
@@ -340,9 +347,9 @@ def _solve_reference(
         r = solution.residual
         needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
         if r.relative <= needed:
-            note = f"relative {r.relative:.1e}"
+            note = f"relative {format_residual(r.relative)}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
-        failed.append(f"{name}: relative {r.relative:.1e} above {needed:.1e}")
+        failed.append(f"{name}: relative {format_residual(r.relative)} above {format_residual(needed)}")
     return None, None, "; ".join(failed)
 
 
@@ -383,7 +390,7 @@ def compare_with_reference(
     elif solution.status is Status.INFEASIBLE:
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
     elif r.nothing_to_do and r.verdict != WRONG:
-        units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
+        units = f"{format_residual(r.velocity)} m/s, {format_residual(r.energy)} sqrt(J)"
         verdict, note = NOTHING_TO_DO, f"{units}; {note}".rstrip("; ")
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED

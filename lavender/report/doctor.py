@@ -100,6 +100,9 @@ def collect_installation_facts() -> dict[str, Any]:
         "load": get_load_average(),
         "extension": Path(str(serial.__file__)).name,
         "backends": {name: reason or get_backend_versions(name) for name, reason in backends.items()},
+        "plug_ins": {
+            name: get_versions([s.distribution], base=()) for name, s in specs().items() if s.distribution
+        },
         "self_test": parts,
         "same_bits": all(x == "same" for x in parts.values()),
         "seconds": round(perf_counter() - start_time, 2),

@@ -60,7 +60,11 @@ class Plan:
         return {name: _to_jsonable(value) for name, value in values.items()}
 
     def __str__(self) -> str:
-        lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
+        lines = [
+            f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:g}".replace(
+                "e-0", "e-"
+            )
+        ]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
         if self.in_turn:  # It is empty for programs with a singular P, which only backends solve.
@@ -71,7 +75,7 @@ class Plan:
         for stage in self.stages:
             limit = "to its end"
             if stage.iterations < 1e9:
-                limit = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
+                limit = f"up to {max(1.0, float(f'{stage.iterations:.3g}')):.0f} iterations"
             lines.append(f"  {stage.solver:<27}{limit:<26}{stage.why}")
         if not self.in_turn:
             return "\n".join([*lines, "then a linear program for a certificate that there is no solution"])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -26,12 +27,20 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert {k: found["build"][k] for k in facts if k != "clock"} == {k: facts[k] for k in facts if k != "clock"}
 
 
+def test_doctor_in_a_terminal_of_80_columns_fits_and_names_the_backends(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = CliRunner().invoke(cli, ["doctor"]).output.splitlines()
+    assert max(map(len, lines)) <= 80
+    (backends,) = [line for line in lines if line.startswith("backends")]
+    assert "clarabel: clarabel " in backends or "osqp: osqp " in backends
+
+
 def test_another_bit_is_told_and_is_status_1(monkeypatch):
     name = next(iter(doctor.HASHES))
     monkeypatch.setitem(doctor.HASHES, name, "0" * 16)
     done = CliRunner().invoke(cli, ["doctor"])
     assert done.exit_code == 1
-    assert f"{name}: {'0' * 16} expected" in done.output
+    assert re.search(rf"^ *{name} +{'0' * 16} expected", done.output, re.MULTILINE)
     assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} give their bits" in done.output
 
 
