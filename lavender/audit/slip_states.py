@@ -23,6 +23,7 @@ from lavender.audit.slip import (
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.io import mujoco as adapter
+from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.recorder import read_states, without_sleep
 from lavender.problem import Problem
 
@@ -56,7 +57,7 @@ def explain_slip_of_states(
     InputError
         No geom has one of the names.
     """
-    mj = adapter.import_mujoco()
+    mj = import_mujoco()
     model = without_sleep(mj, model)
     entries = [contacts] if isinstance(contacts, str) else list(contacts or ())
     geoms = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) or str(i) for i in range(model.ngeom)]

@@ -34,6 +34,7 @@ from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
+from lavender.io.mujoco_memory import CHANGED_ADVICE
 from lavender.io.recorder import can_sleep
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_block_kinds
@@ -297,7 +298,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             if is_active(data):
                 try:
-                    matrix = compute_discrete_matrix(mj, model, data, single.CHANGED_ADVICE)
+                    matrix = compute_discrete_matrix(mj, model, data, CHANGED_ADVICE)
                 except CapabilityError as error:
                     raise CapabilityError(f"state {i}: {error}") from None
                 matrices[i] = matrix.lower

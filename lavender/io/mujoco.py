@@ -49,21 +49,22 @@ the error of `impulse`.
 from __future__ import annotations
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
+from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
+from lavender.io.mujoco_memory import CHANGED_ADVICE, OTHER_MODEL_ADVICE, read_step
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
-from lavender.problem.generalized import Generalized
+from lavender.problem.generalized import MIN_TREE_ORDERING_VELOCITIES, Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
+from lavender_ext.core.generalized import Operator
 from lavender_ext.io import mujoco_rows
+from lavender_ext.io.mujoco_step import Step
 
 COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
 # Largest accepted difference of a product with J from MuJoCo's stored result, relative to the size of its terms.
@@ -72,22 +73,13 @@ SUM_TOLERANCE = 2.0**-40
 # The velocity before the step is recovered from the velocities of bodies only if each joint's axis has at least this
 # fraction that is independent of the joints before it in the same body [-].
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
-# [bytes] Lower bounds of the memory that MuJoCo allocates for a row, a contact, and an entry of efc_J with its column.
-ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 DIVERGED_TEXT = (
     "qacc holds numbers that are not finite: the simulation has diverged, or the data was changed. Use data of an "
     "earlier step"
 )
-CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
 FLOAT32_GAP = 1e-5  # [-] Largest relative difference of M qacc_smooth and qfrc_smooth of data in float32.
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
-OTHER_MODEL_ADVICE = (
-    "The model was changed, or MjData belongs to another model: give a model and data made from it"
-)
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
-NO_CONTACT = SimpleNamespace(
-    dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
-)
 _CODES = (
     "mjCNSTR_EQUALITY",
     "mjCNSTR_FRICTION_DOF",
@@ -98,21 +90,6 @@ _CODES = (
     "mjCNSTR_CONTACT_PYRAMIDAL",
     "mjCNSTR_CONTACT_ELLIPTIC",
 )
-
-
-class _ModelCache:
-    """Cached counts and views of the arrays of a model. The contents of the arrays are read again at every call."""
-
-    def __init__(self, mj: Any, model: Any) -> None:
-        self.mj, self.n = mj, int(model.nv)
-        self.type_counts = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
-        self.tree = model.body_parentid, model.dof_bodyid
-        self.mass = model.M_rowadr, model.M_rownnz, model.M_colind
-        # Operator of this model's first problem. Later problems share its index arrays if their patterns are equal.
-        self.first_operator: Any = None
-
-
-_MODELS: WeakKeyDictionary[Any, _ModelCache] = WeakKeyDictionary()
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
@@ -145,43 +122,41 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         or, after `mj_step`, joints of one body have dependent axes. It is not raised if MuJoCo's solver stopped before
         convergence: the problem does not depend on the answer.
     """
-    seen, m, contacts, smooth = _check_model(model, data)
-    opt, like = model.opt, seen.first_operator
-    dt = _get_timestep(opt)
-    mass, change = _read_mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
-    cones, scale, key = _make_blocks(seen, data, contacts, dt)
-    jac = _read_jacobian(seen, model, data, m, scale)
-    rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.compute_problem_numbers(
-        *jac, scale, dt, _get_velocity_before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D,
-        data.efc_force,
-        _get_expected_velocity(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
-    )  # fmt: skip
+    step = read_step(model, data)
+    kept = step.cache
+    like, dt = kept.first_operator, _get_timestep(step)
+    mass, change = _read_mass(step, data, NO_TRIANGLE if like is None else like.mass[:2])
+    blocks, scale, key = _make_blocks(step, data)
+    jac = _read_jacobian(step, data, scale)
+    rhs, compliance, v_free, is_usual, gap, gaps = mujoco_rows.compute_problem_numbers(
+        step, jac, scale, _get_velocity_before(step), MAX_SAFE_ENTRY
+    )
     _check_jacobian(*gaps)
     if not gap <= COMPLIANCE_TOLERANCE:
-        compliance, is_finite = _compute_compliance(data) * scale * scale, False
-    names = Names(
-        cones.n_blocks, lambda: _make_block_names(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m)
-    )
-    general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
+        compliance, is_usual = _compute_compliance(data) * scale * scale, False
+    general = None
+    if is_usual and kept.is_plain and mass[0] is like.mass[0]:
+        general = Generalized.from_operator(Operator(*jac, *mass, like), v_free, MAX_SAFE_ENTRY)
+    if general is None:
+        general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
+        is_usual = is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
     if like is None:
-        seen.first_operator = general.operator
+        kept.first_operator = general.operator
+        kept.is_plain = general.order is None and step.n < MIN_TREE_ORDERING_VELOCITIES
     if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
         rhs = mark_read_only(rhs - dt * general.velocity_of(change))
         general = general.with_jacobian(v_free=v_free + dt * change)
-    build = (
-        Problem._from_engine_arrays
-        if is_finite and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
-        else Problem
-    )
+    m = step.m
+    build = Problem._from_engine_arrays if is_usual else Problem
     return build(
         b=rhs,
-        cones=cones,
+        cones=Cones._from_blocks(blocks),
         generalized=general,
         compliance=compliance,
         friction="cone",
         key=key,
-        names=names,
-        name=f"{name} (noslip)" if opt.noslip_iterations > 0 else name,
+        names=Names(blocks.n_blocks, lambda: _make_block_names(kept.mj, model, blocks.ints[2 * m + 1 :], m)),
+        name=f"{name} (noslip)" if step.has_noslip else name,
         copy=False,
     )
 
@@ -193,7 +168,7 @@ def impulse(model: Any, data: Any) -> FloatArray:
     With `noslip_iterations`, it is not a solution of the problem.
     """
     scale = scaling(model, data)
-    force = _get_timestep(model.opt) * data.efc_force
+    force = _get_timestep(read_step(model, data)) * data.efc_force
     return np.divide(force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
@@ -203,78 +178,31 @@ def scaling(model: Any, data: Any) -> FloatArray:
     The factor is friction[j] / friction[0] on tangents of an elliptic cone and 1 on all other rows. Impulses are
     MuJoCo's divided by the factor.
     """
-    seen, _, contacts, _ = _check_model(model, data)
-    scale: FloatArray = _make_blocks(seen, data, contacts, _get_timestep(model.opt))[1]
+    step = read_step(model, data)
+    _get_timestep(step)
+    scale: FloatArray = _make_blocks(step, data)[1]
     return scale
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """Return MuJoCo's `qacc` (nv,) for impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
-    seen, m, _, smooth = _check_model(model, data)
-    lam = as_array("impulse", impulse, (m,), unit="N s")
-    force = jacobian(model, data).T @ (scaling(model, data) * lam) / _get_timestep(model.opt)
-    if is_active(data):
-        matrix = compute_discrete_matrix(seen.mj, model, data, CHANGED_ADVICE)
+    step = read_step(model, data)
+    lam = as_array("impulse", impulse, (step.m,), unit="N s")
+    force = jacobian(model, data).T @ (scaling(model, data) * lam) / step.dt
+    smooth, mj = data.qacc_smooth, step.cache.mj
+    if step.is_discrete:
+        matrix = compute_discrete_matrix(mj, model, data, CHANGED_ADVICE)
         return smooth + matrix.solve(force) + (0.0 if matrix.change is None else matrix.change)
-    change = np.zeros((1, seen.n))
-    seen.mj.mj_solveM(model, data, change, force[None, :])
+    change = np.zeros((1, step.n))
+    mj.mj_solveM(model, data, change, force[None, :])
     return np.array(smooth, float) + change[0]
 
 
 def jacobian(model: Any, data: Any) -> sp.csr_array:
     """Return J (m, nv) of all constraints, whether MuJoCo stores it densely or sparsely."""
-    seen, m, _, _ = _check_model(model, data)
-    indptr, indices, values = _read_jacobian(seen, model, data, m, np.ones(m))
-    return sp.csr_array((values, indices, indptr), shape=(m, seen.n))
-
-
-def _check_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
-    """Check a model and its data; return the model's cache, the numbers of rows and contacts, and a0 (nv,)."""
-    try:
-        seen = _MODELS.get(model)
-    except TypeError:  # The object does not support weak references, so it is not a model.
-        seen = None
-    mj = import_mujoco() if seen is None else seen.mj
-    if (seen is None and not isinstance(model, mj.MjModel)) or not isinstance(data, mj.MjData):
-        raise InputError(
-            f"got a {type(model).__name__} and a {type(data).__name__}; a mujoco.MjModel and its mujoco.MjData "
-            "are needed"
-        )
-    if seen is None:
-        seen = _MODELS[model] = _ModelCache(mj, model)
-    smooth = data.qacc_smooth
-    if len(smooth) != seen.n:
-        raise InputError(
-            f"the MjData has {len(smooth)} degrees of freedom and the model {seen.n}; both must belong "
-            "together: create the data with mujoco.MjData(model)"
-        )
-    m, contacts, entries = data.nefc, data.ncon, data.nJ
-    needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
-    if min(m, contacts, entries) < 0 or needed > data.parena:  # The arrays would exceed the allocated memory.
-        raise InputError(
-            f"nefc is {m}, ncon is {contacts} and nJ is {entries}, which do not fit into the {data.parena} "
-            f"bytes that this MjData has allocated. {CHANGED_ADVICE}"
-        )
-    return seen, m, contacts, smooth
-
-
-def import_mujoco() -> Any:
-    """Return the module mujoco.
-
-    Raises
-    ------
-    InputError
-        MuJoCo is not installed, or is too old.
-    """
-    try:
-        import mujoco
-    except ImportError:
-        raise InputError(
-            "mujoco cannot be imported: pip install mujoco, which provides models and data"
-        ) from None
-    if not hasattr(mujoco.MjModel, "M_rowadr"):
-        raise InputError(f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco")
-    return mujoco
+    step = read_step(model, data)
+    indptr, indices, values = _read_jacobian(step, data, np.ones(step.m))
+    return sp.csr_array((values, indices, indptr), shape=(step.m, step.n))
 
 
 @cache
@@ -282,37 +210,35 @@ def _get_type_codes(mj: Any) -> Any:
     return mark_read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
 
 
-def _get_timestep(opt: Any) -> float:
-    dt = float(opt.timestep)
+def _get_timestep(step: Step) -> float:
+    dt: float = step.dt
     if not 0.0 < dt < np.inf:
         raise InputError(f"opt.timestep is {dt} s; a step above 0 is needed")
     return dt
 
 
-def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> tuple[Any, Any]:
+def _read_mass(step: Step, data: Any, like: Any) -> tuple[Any, Any]:
     """Return the lower triangle of the step's matrix and the correction of a0 (nv,) or None; see `DiscreteMatrix`.
 
-    The index arrays of the operator `like` are reused if they are equal.
+    The index arrays `like` are reused if they are equal.
 
     Raises
     ------
     CapabilityError
         M a0 is not the smooth force: a0 and the problem were computed with a matrix other than M.
     """
-    if seen.n and not data.M[0]:  # M was not computed: its first diagonal entry would be positive.
+    if not step.has_mass:
         raise InputError(
             "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the "
             "simulation"
         )
-    result = mujoco_rows.extract_lower_triangle_of_mass(
-        *seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like
-    )
+    result = mujoco_rows.extract_lower_triangle_of_mass(step, MASS_TOLERANCE, like)
     if result is None:
         raise InputError(
             f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
         )
-    if is_active(data):
-        matrix = compute_discrete_matrix(seen.mj, model, data, CHANGED_ADVICE)
+    if step.is_discrete:
+        matrix = compute_discrete_matrix(step.cache.mj, step.model, data, CHANGED_ADVICE)
         return matrix.lower, matrix.change
     mass, gap = result
     if not gap <= MASS_TOLERANCE:
@@ -328,7 +254,7 @@ def _read_mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any)
     return mass, None
 
 
-def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
+def _read_jacobian(step: Step, data: Any, scale: FloatArray) -> Any:
     """Return (indptr, indices, data) of J, each row times `scale` (m,).
 
     Raises
@@ -336,34 +262,31 @@ def _read_jacobian(seen: _ModelCache, model: Any, data: Any, m: int, scale: Floa
     InputError
         The arrays of efc_J have the wrong size or indices out of range.
     """
-    values, n = data.efc_J, seen.n
-    values = values if values.ndim == 1 else np.ravel(values)
-    if not seen.mj.mj_isSparse(model):
-        if len(values) < m * n:
-            raise InputError(
-                f"efc_J holds {len(values)} numbers; {m} x {n} are needed if opt.jacobian is dense. {CHANGED_ADVICE}"
-            )
-        return mujoco_rows.scale_dense_rows(values, m, n, scale)
-    count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
-    columns = columns if columns.ndim == 1 else np.ravel(columns)
+    result = mujoco_rows.read_jacobian(step, scale)
+    if isinstance(result, tuple):
+        return result
+    m, n, values = step.m, step.n, np.ravel(data.efc_J)
+    if result == -1:
+        raise InputError(
+            f"efc_J holds {len(values)} numbers; {m} x {n} are needed if opt.jacobian is dense. {CHANGED_ADVICE}"
+        )
+    count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, np.ravel(data.efc_J_colind)
     if not len(count) == len(first) == m:
         raise InputError(
             f"efc_J_rownnz has {len(count)} entries and efc_J_rowadr {len(first)}; {m} are needed, one for "
             f"each constraint row. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
-    result = mujoco_rows.scale_sparse_rows(values, count, first, columns, scale, n)
-    if isinstance(result, int):  # The number of the first invalid row.
+    if result is not None:  # The number of the first invalid row.
         raise InputError(
             f"row {result} of efc_J has {count[result]} entries from position {first[result]}; positions "
             f"below {len(columns)} and columns below {n} are needed. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
-    if result is None:  # Some rows have unsorted or repeated columns.
-        indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
-        source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
-        jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
-        jac.sum_duplicates()
-        result = (jac.indptr.astype(np.int32), jac.indices.astype(np.int32), jac.data)
-    return result
+    # Some rows have unsorted or repeated columns.
+    indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
+    source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
+    jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
+    jac.sum_duplicates()
+    return jac.indptr.astype(np.int32), jac.indices.astype(np.int32), jac.data
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -387,11 +310,8 @@ def _compute_compliance(data: Any) -> FloatArray:
     return np.where(empty, 1.0 / inverse, r)
 
 
-def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
-    """Return the velocities (nv,) at the last forward pass.
-
-    After `mj_forward` these are qvel. After a step they are recovered from the velocities of bodies in `data.cvel`,
-    which MuJoCo computed before the step.
+def _get_velocity_before(step: Step) -> FloatArray | None:
+    """Return the velocities (nv,) at the last forward pass; None if they are qvel, as after `mj_forward`.
 
     Raises
     ------
@@ -400,34 +320,17 @@ def _get_velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
     CapabilityError
         The velocities cannot be recovered, because joints of one body have dependent axes or the data were changed.
     """
-    parent, bodies = seen.tree
-    axis, spatial, v = data.cdof, data.cvel, data.qvel
-    gap, size = mujoco_rows.compute_spatial_velocity_difference(parent, bodies, axis, spatial, v)
-    if gap < 0.0:
+    v = mujoco_rows.find_velocity_before(step, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION)
+    if v is None or not isinstance(v, int):
+        return v
+    if v == -1:
         raise InputError(
             f"dof_bodyid and body_parentid do not describe a tree of these bodies. {OTHER_MODEL_ADVICE}"
         )
-    if gap <= SUM_TOLERANCE * size or (
-        not np.any(spatial) and np.any(data.efc_vel)
-    ):  # In a copy of the data, cvel may be unset.
-        return v
-    v = mujoco_rows.recover_joint_velocity(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
-    if (
-        v is None
-        or not mujoco_rows.compute_spatial_velocity_difference(parent, bodies, axis, spatial, v)[0]
-        <= SUM_TOLERANCE * size
-    ):
-        raise CapabilityError(
-            "the velocity before the step cannot be computed from cvel and cdof: joints of one body have "
-            "dependent axes, or MjData was changed since its forward pass: run mj_forward"
-        )
-    return v
-
-
-def _get_expected_velocity(model: Any, data: Any, m: int) -> FloatArray:
-    """Return efc_vel (m,), which J v must equal; zeros, which disable the check, if it includes moving surfaces."""
-    speed: FloatArray = np.zeros(m) if getattr(model, "flg_surfacevel", False) else data.efc_vel
-    return speed
+    raise CapabilityError(
+        "the velocity before the step cannot be computed from cvel and cdof: joints of one body have "
+        "dependent axes, or MjData was changed since its forward pass: run mj_forward"
+    )
 
 
 def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> None:
@@ -454,8 +357,8 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
-    """Return the cones, the factor of each row and the key of each block.
+def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
+    """Return the blocks, the factor of each row and the key of each block.
 
     Raises
     ------
@@ -464,31 +367,27 @@ def _make_blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tupl
     InputError
         An index is out of range, or a friction loss or coefficient is not a bound.
     """
-    contact = data.contact if contacts else NO_CONTACT
-    type_counts = (*seen.type_counts, contacts, contacts, contacts)
-    types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _get_type_codes(seen.mj)
-    result = mujoco_rows.make_blocks_of_rows(
-        types, ids, codes, type_counts, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
-    )
+    codes = _get_type_codes(step.cache.mj)
+    result = mujoco_rows.make_blocks(step, codes)
     if isinstance(result, int):  # The number of the first invalid row.
-        kind, which, known = int(types[result]), int(ids[result]), codes.tolist()
+        kind, which, known = int(data.efc_type[result]), int(data.efc_id[result]), codes.tolist()
         if kind not in known:
             raise CapabilityError(
                 f"constraint row {result} is of type {kind}, which is not supported: remove this constraint "
                 "from the model"
             )
-        count = type_counts[known.index(kind)]
-        dim = f", of condim {dims[which]}" if known.index(kind) > 4 and 0 <= which < count else ""
+        code = known.index(kind)
+        count = step.type_counts[code]
+        dim = f", of condim {data.contact.dim[which]}" if code > 4 and 0 <= which < count else ""
         raise InputError(
-            f"constraint row {result} of {len(types)} is of type {kind} and belongs to number {which} of "
+            f"constraint row {result} of {step.m} is of type {kind} and belongs to number {which} of "
             f"{count}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
-    blocks, scale, key = result
-    if blocks is None:
+    if result[0] is None:
         raise InputError(
             f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
         )
-    return Cones._from_blocks(blocks), scale, key
+    return result
 
 
 def _make_block_names(

@@ -46,6 +46,7 @@ from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io import mujoco as adapter
 from lavender.io.engine_step import Claims, EngineStep
+from lavender.io.mujoco_memory import import_mujoco, read_step
 from lavender.io.stored import (
     ENGINE,
     STATES_FOLDER,
@@ -502,7 +503,7 @@ def record(
         The arguments are not a model and its data; `steps` or `every` is below 1; the control, precision or threshold
         is invalid; the folder holds a recording; MuJoCo raises an error (out of memory, an unsupported feature).
     """
-    mj = adapter._check_model(model, data)[0].mj
+    mj = read_step(model, data).cache.mj
     steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
     precision = check_choice("precision", precision, PRECISIONS)
     threshold = check_float("threshold", threshold, low=0.0)
@@ -644,7 +645,7 @@ def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
     InputError
         MuJoCo is not installed, or cannot read the file, or the file is a problem.
     """
-    mj, path = adapter.import_mujoco(), str(as_path(path))
+    mj, path = import_mujoco(), str(as_path(path))
     if Path(path).suffix.lower() in SUFFIXES:
         raise InputError(
             f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed: `lavender check` and "

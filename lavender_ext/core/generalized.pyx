@@ -138,8 +138,9 @@ cdef class Operator:
         return smallest
 
     def has_entry_above(self, double bound):
-        """Return whether any |J_ij|, |L_ij| or 1 / D_i is above `bound`."""
+        """Return whether any |J_ij|, |M_ij|, |L_ij| or 1 / D_i is above `bound` or NaN."""
         return (any_magnitude_above(self.g.jval, self.g.jptr[self.g.m], bound)
+                or any_magnitude_above(self.g.mval, self.g.mptr[self.g.n], bound)
                 or any_magnitude_above(self.g.inv_pivot, self.g.n, bound)
                 or any_magnitude_above(self.g.lval, self.g.lptr[self.g.n], bound))
 

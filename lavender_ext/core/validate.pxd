@@ -49,11 +49,11 @@ cdef inline int64_t find_invalid_magnitude(const double* x, int64_t n) noexcept 
 
 
 cdef inline bint any_magnitude_above(const double* x, int64_t n, double bound) noexcept nogil:
-    """Return whether any |x_i| is above `bound`. The loop has no branch, so that compilers vectorise it."""
+    """Return whether any |x_i| is above `bound` or NaN. The loop has no branch, so that compilers vectorise it."""
     cdef int64_t i
     cdef int exceeds = 0
     for i in range(n):
-        exceeds |= fabs(x[i]) > bound
+        exceeds |= not fabs(x[i]) <= bound
     return exceeds
 
 

@@ -4,20 +4,21 @@ Arrays have MuJoCo's layout: efc_type, efc_id (m), contact dim (c), friction (c,
 tangent rows of a contact with different coefficients f are scaled by f_j / f_0, so that mu = f_0 bounds them all:
 
     |(lambda_1 / f_0, ..., lambda_n / f_n)| <= lambda_n   <=>   |lambda'| <= f_0 lambda_n,   lambda'_j = lambda_j f_0 / f_j   (1)
+
+A `Step` holds the addresses of the arrays (mujoco_step.pyx).
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport (
-    DOUBLE, INT, as_double_pointer, make_read_only, as_int_pointer, ndarray, get_checked_data_pointer,
-)
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
 from lavender_ext.core.problem cimport Workspace, allocate_bytes
+from lavender_ext.io.mujoco_step cimport Step, step_t
 
 
 cpdef enum:
@@ -119,177 +120,6 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def make_blocks_of_rows(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double dt):
-    """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
-
-    blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
-    """
-    cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
-    cdef int32_t limits[CODES]
-    cdef Py_ssize_t step[3]
-    cdef const int32_t* of = as_int_pointer(type_, m)
-    cdef const int32_t* which = as_int_pointer(id_, m)
-    cdef const double* losses = as_double_pointer(loss, m)
-    cdef const char* dims = get_checked_data_pointer(dim, c, 1, INT, &step[0])
-    cdef const char* pair = get_checked_data_pointer(geom, c, 2, INT, &step[1])
-    cdef const char* rub = get_checked_data_pointer(friction, c, 5, DOUBLE, &step[2])
-    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
-    cdef blocks_t* p = &made.at
-    cdef int32_t* held = <int32_t*>p.kind + m
-    cdef double* scale = <double*>p.rolling + m
-    cdef double* x = scale + m
-    for k in range(CODES):
-        limits[k] = n_objects[k]
-    keys = new(m, U8)
-    memcpy(held, of, m * sizeof(int32_t))
-    memcpy(held + m, which, m * sizeof(int32_t))
-    memset(<double*>p.patch_radius, 0, 2 * m * sizeof(double))
-    for i in range(c):
-        memcpy(&held[2 * m + i], dims + i * step[0], sizeof(int32_t))
-        memcpy(&held[2 * m + c + 2 * i], pair + i * step[1], 2 * sizeof(int32_t))
-        memcpy(&x[5 * i], rub + i * step[2], 5 * sizeof(double))
-    k = lav_export_blocks(m, held, held + m, as_int_pointer(codes, CODES), limits, held + 2 * m, x, held + 2 * m + c, losses, dt,
-                          <int32_t*>p.ptr, <int32_t*>p.kind, <double*>p.lower, <double*>p.upper, <double*>p.mu, scale,
-                          <uint64_t*>(<ndarray>keys).data)
-    if k < 0:
-        return -1 - k
-    p.n_blocks = k
-    fits = made.validate()
-    write_contact_bounds(&made.at)
-    return made if fits else None, made.numbers[5 * m:6 * m], make_read_only(keys if k == m else keys[:k])
-
-
-def scale_dense_rows(values, int32_t m, int32_t n, scale):
-    """Return (indptr, indices, data) of J (m, n) with scaled rows, from its values row by row; further values are ignored."""
-    cdef int32_t i, j, at = 0
-    cdef double x
-    cdef const double* value = as_double_pointer(values, values.size)
-    cdef const double* factor = as_double_pointer(scale, m)
-    cdef int32_t* indptr
-    cdef int32_t* indices
-    cdef double* data
-    for i in range(m):
-        for j in range(n):
-            at += value[i * n + j] * factor[i] != 0.0
-    indptr_, indices_, data_ = new(m + 1, I4), new(at, I4), new(at)
-    indptr, indices, data = as_int_pointer(indptr_, m + 1), as_int_pointer(indices_, at), as_double_pointer(data_, at)
-    at = indptr[0] = 0
-    for i in range(m):
-        for j in range(n):
-            x = value[i * n + j] * factor[i]
-            if x != 0.0:
-                indices[at] = j
-                data[at] = x
-                at += 1
-        indptr[i + 1] = at
-    return indptr_, indices_, data_
-
-
-def scale_sparse_rows(values, count_, first_, columns, scale, int32_t n):
-    """Return (indptr, indices, data) of J with scaled rows, from rows of n columns that are given by first index and length.
-
-    The result is None if columns do not ascend, and a row's number if its indices are invalid (the first such row).
-    """
-    cdef int32_t i, m = <int32_t>len(scale), is_invalid
-    cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)
-    cdef double x, factor
-    cdef bint ascend = True
-    cdef const int32_t* count = as_int_pointer(count_, m)
-    cdef const int32_t* first = as_int_pointer(first_, m)
-    cdef const double* scales = as_double_pointer(scale, m)
-    cdef const int32_t* column = as_int_pointer(columns, columns.size)
-    cdef const double* value = as_double_pointer(values, values.size)
-    for i in range(m):
-        if not 0 <= count[i] <= workspace or not 0 <= first[i] <= workspace - count[i]:
-            return i
-        total += count[i]
-    indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
-    cdef int32_t* indptr = as_int_pointer(indptr_, m + 1)
-    cdef int32_t* indices = as_int_pointer(indices_, total)
-    cdef double* data = as_double_pointer(data_, total)
-    indptr[0] = 0
-    for i in range(m):
-        factor = scales[i]
-        begin = first[i]
-        end = begin + count[i]
-        is_invalid = 0
-        for q in range(begin, end):
-            is_invalid |= not 0 <= column[q] < n
-        if is_invalid:
-            return i
-        for q in range(begin + 1, end):
-            is_invalid |= column[q] <= column[q - 1]
-        ascend &= not is_invalid
-        for q in range(begin, end):
-            x = value[q] * factor
-            if x != 0.0:
-                indices[at] = column[q]
-                data[at] = x
-                at += 1
-        indptr[i + 1] = <int32_t>at
-    if not ascend:
-        return None
-    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
-
-
-def extract_lower_triangle_of_mass(first_, count_, columns, values, x, y, double bound, tuple like):
-    """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
-
-    The second number is max |M x - y| / max |y| instead, if that is at most `bound`. Rows are given by first index and length.
-    The result is None if they are not consecutive or their columns do not ascend to the diagonal entry. `like` is (indptr,
-    indices) of a lower triangle; these arrays are reused if the pattern is the same.
-    """
-    cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
-    cdef double gap = 0.0, big = 0.0
-    cdef Workspace scratch
-    cdef const int32_t* first = as_int_pointer(first_, n)
-    cdef const int32_t* source = as_int_pointer(columns, nnz)
-    cdef const int32_t* count
-    cdef const int32_t* at
-    cdef const int32_t* column
-    cdef int32_t* whole
-    cdef double* out
-    cdef double* made
-    cdef const double* v
-    cdef const double* right
-    if not n == len(count_) == len(x) == len(y) or nnz != len(values) or n == 0:
-        return None if n or nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
-    count, v, right = as_int_pointer(count_, n), as_double_pointer(x, n), as_double_pointer(y, n)
-    if not has_row_pattern(like, n, nnz, first, count, source):
-        like = new(n + 1, I4), np.array(columns, I4)
-        whole = as_int_pointer(like[0], n + 1)
-        whole[0] = 0
-        for i in range(n):
-            if first[i] != whole[i] or not 0 < count[i] <= nnz - whole[i]:
-                return None
-            whole[i + 1] = whole[i] + count[i]
-            last = -1
-            for q in range(whole[i], whole[i + 1]):
-                if not last < source[q] <= i:
-                    return None
-                last = source[q]
-            if last != i:
-                return None
-        if whole[n] != nnz:
-            return None
-        for made_ in like:
-            make_read_only(made_)
-    at, column = as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz)
-    copy, scratch = new(nnz), allocate_bytes(n * sizeof(double))
-    out, made = as_double_pointer(copy, nnz), <double*>scratch.at
-    memcpy(out, as_double_pointer(values, nnz), nnz * sizeof(double))
-    multiply_mass(n, at, column, out, v, False, made)
-    for i in range(n):
-        gap = update_max_abs(gap, made[i] - right[i])
-        big = update_max_abs(big, right[i])
-    if not gap <= bound * big:
-        big = 0.0
-        multiply_mass(n, at, column, out, v, True, made)
-        for i in range(n):
-            big = update_max_abs(big, made[i] + fabs(right[i]))
-    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
-
-
 cdef inline void multiply_mass(int32_t n, const int32_t* at, const int32_t* column, const double* data, const double* x,
                           bint sizes, double* y) noexcept nogil:
     """Compute y = M x from the lower triangle of M, or |M| |x| with `sizes`."""
@@ -307,41 +137,38 @@ cdef inline void multiply_mass(int32_t n, const int32_t* at, const int32_t* colu
         y[i] = own + (fabs(data[end]) if sizes else data[end]) * z
 
 
-cdef bint has_row_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
-    """Return whether (indptr, indices) is the pattern given by first index, length and columns of each row."""
+cdef bint has_row_pattern(tuple like, const step_t* p):
+    """Return whether (indptr, indices) is the pattern of MuJoCo's M."""
     cdef const int32_t* at
-    cdef int32_t i
+    cdef int32_t i, n = p.n, nnz = p.mass_entries
     if len(like[0]) != n + 1 or len(like[1]) != nnz:
         return False
     at = as_int_pointer(like[0], n + 1)
-    if (at[n] != nnz or memcmp(at, first, n * sizeof(int32_t))
-            or memcmp(as_int_pointer(like[1], nnz), columns, nnz * sizeof(int32_t))):
+    if (at[n] != nnz or memcmp(at, p.M_rowadr, n * sizeof(int32_t))
+            or memcmp(as_int_pointer(like[1], nnz), p.M_colind, nnz * sizeof(int32_t))):
         return False
     for i in range(n):
-        if at[i + 1] - at[i] != count[i]:
+        if at[i + 1] - at[i] != p.M_rownnz[i]:
             return False
     return True
 
 
-def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
+cdef (double, double) compare_spatial_velocities(const step_t* p, const double* v):
     """Compare the spatial velocities c (n, 6) with those that v (nv) gives; return the largest difference and the largest term.
 
-        c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
+        c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = cdof (nv, 6), c = cvel
 
     The difference is 0 if s is all zeros, as in a copy that does not fill it, and -1 if the arrays do not describe one tree.
     """
-    cdef Py_ssize_t i, j, k, n = len(v_), bodies = len(spatial)
+    cdef Py_ssize_t i, j, k, n = p.n, bodies = p.bodies
     cdef double term, z
     cdef double[6] big, gap, lost                       # One number per component; lost is 0, or NaN after a NaN.
-    if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
-        return -1.0, 0.0
     cdef Workspace scratch = allocate_bytes(6 * bodies * sizeof(double))
     cdef double* made = <double*>scratch.at
-    cdef const double* c = as_double_pointer(spatial, 6 * bodies)
-    cdef const double* s = as_double_pointer(axis, 6 * n)
-    cdef const double* v = as_double_pointer(v_, n)
-    cdef const int32_t* of = as_int_pointer(body, n)
-    cdef const int32_t* up = as_int_pointer(parent, bodies)
+    cdef const double* c = p.cvel
+    cdef const double* s = p.cdof
+    cdef const int32_t* of = p.dof_bodyid
+    cdef const int32_t* up = p.body_parentid
     cdef double* row
     cdef const double* before
     for i in range(bodies):
@@ -379,19 +206,19 @@ def compute_spatial_velocity_difference(parent, body, axis, spatial, v_):
     return (gap[0] + lost[0] if i < 6 * n else 0.0), big[0] + lost[0]
 
 
-def recover_joint_velocity(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
-                  const double[:, ::1] spatial, double alike):
-    """Recover v (nv) from the spatial velocities c of `compute_spatial_velocity_difference`; None if s does not determine it.
+cdef object recover_joint_velocity(const step_t* p, double alike):
+    """Recover v (nv) from the spatial velocities of `compare_spatial_velocities`; None if s does not determine it.
 
     Least squares are solved body by body with modified Gram-Schmidt. `alike` is the minimum fraction of an axis s_j that must
     be independent of the other axes of its body.
     """
-    cdef Py_ssize_t i, j = 0, k, r, count, n = body.shape[0]
+    cdef Py_ssize_t i, j = 0, k, r, count, n = p.n
     cdef double[36] q, upper
     cdef double[6] residual, x
     cdef double size, dot
+    cdef const int32_t* body = p.dof_bodyid
     velocities = new(n)
-    cdef double[::1] v = velocities
+    cdef double* v = as_double_pointer(velocities, n)
     while j < n:
         count = 1
         while j + count < n and body[j + count] == body[j]:
@@ -399,11 +226,11 @@ def recover_joint_velocity(const int32_t[::1] parent, const int32_t[::1] body, c
         if count > 6:
             return None
         for k in range(6):
-            residual[k] = spatial[body[j], k] - spatial[parent[body[j]], k]
+            residual[k] = p.cvel[6 * body[j] + k] - p.cvel[6 * p.body_parentid[body[j]] + k]
         for i in range(count):
             size = 0.0
             for k in range(6):
-                q[6 * i + k] = axis[j + i, k]
+                q[6 * i + k] = p.cdof[6 * (j + i) + k]
                 size += q[6 * i + k] * q[6 * i + k]
             for r in range(i):
                 dot = 0.0
@@ -435,8 +262,196 @@ def recover_joint_velocity(const int32_t[::1] parent, const int32_t[::1] body, c
     return velocities
 
 
-def compute_problem_numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_,
-                            double usual):
+cdef inline double max_ignoring_nan(double maximum, double x) noexcept nogil:
+    """Return the larger of `maximum` and |x|, ignoring a NaN x."""
+    x = fabs(x)
+    return x if x > maximum else maximum
+
+
+def make_blocks(Step step, codes):
+    """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
+
+    blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
+    """
+    cdef const step_t* s = &step.at
+    cdef int32_t m = <int32_t>s.m, c = <int32_t>s.contacts, k, i
+    cdef int32_t limits[CODES]
+    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
+    cdef blocks_t* p = &made.at
+    cdef int32_t* held = <int32_t*>p.kind + m
+    cdef double* scale = <double*>p.rolling + m
+    cdef double* x = scale + m
+    for k in range(CODES):
+        limits[k] = step.object_counts[k] if k < 5 else c
+    keys = new(m, U8)
+    if m:
+        memcpy(held, s.efc_type, m * sizeof(int32_t))
+        memcpy(held + m, s.efc_id, m * sizeof(int32_t))
+    memset(<double*>p.patch_radius, 0, 2 * m * sizeof(double))
+    for i in range(c):
+        memcpy(&held[2 * m + i], s.dim + i * s.stride, sizeof(int32_t))
+        memcpy(&held[2 * m + c + 2 * i], s.geom + i * s.stride, 2 * sizeof(int32_t))
+        memcpy(&x[5 * i], s.friction + i * s.stride, 5 * sizeof(double))
+    k = lav_export_blocks(m, held, held + m, as_int_pointer(codes, CODES), limits, held + 2 * m, x,
+                          held + 2 * m + c, s.efc_frictionloss, s.dt, <int32_t*>p.ptr, <int32_t*>p.kind,
+                          <double*>p.lower, <double*>p.upper, <double*>p.mu, scale, <uint64_t*>(<ndarray>keys).data)
+    if k < 0:
+        return -1 - k
+    p.n_blocks = k
+    fits = made.validate()
+    write_contact_bounds(&made.at)
+    return made if fits else None, made.numbers[5 * m:6 * m], make_read_only(keys if k == m else keys[:k])
+
+
+def read_jacobian(Step step, scale_):
+    """Return (indptr, indices, data) of J, each row times `scale_` (m,); a row's number if its indices are invalid.
+
+    The result is None if columns do not ascend, and -1 if efc_J has fewer entries than a dense J.
+    """
+    cdef const step_t* s = &step.at
+    cdef int32_t i, j, is_invalid, m = <int32_t>s.m, n = s.n
+    cdef int64_t q, begin, end, at = 0, total = 0
+    cdef double x, factor
+    cdef bint ascend = True
+    cdef const double* scale = as_double_pointer(scale_, m)
+    cdef const double* value = s.efc_J
+    cdef const int32_t* column = s.efc_J_colind
+    cdef const int32_t* count = s.efc_J_rownnz
+    cdef const int32_t* first = s.efc_J_rowadr
+    cdef int32_t* indptr
+    cdef int32_t* indices
+    cdef double* data
+    if step.is_sparse:
+        if m and (count == NULL or first == NULL or column == NULL):
+            return 0
+        for i in range(m):
+            if not 0 <= count[i] <= s.jac_entries or not 0 <= first[i] <= s.jac_entries - count[i]:
+                return i
+            total += count[i]
+    else:
+        if s.jac_entries < <int64_t>m * n:
+            return -1
+        for i in range(m):
+            for j in range(n):
+                total += value[i * n + j] * scale[i] != 0.0
+    indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
+    indptr, indices, data = as_int_pointer(indptr_, m + 1), as_int_pointer(indices_, total), as_double_pointer(data_, total)
+    indptr[0] = 0
+    for i in range(m):
+        factor = scale[i]
+        if not step.is_sparse:
+            for j in range(n):
+                x = value[i * n + j] * factor
+                if x != 0.0:
+                    indices[at] = j
+                    data[at] = x
+                    at += 1
+            indptr[i + 1] = <int32_t>at
+            continue
+        begin = first[i]
+        end = begin + count[i]
+        is_invalid = 0
+        for q in range(begin, end):
+            is_invalid |= not 0 <= column[q] < n
+        if is_invalid:
+            return i
+        for q in range(begin + 1, end):
+            is_invalid |= column[q] <= column[q - 1]
+        ascend &= not is_invalid
+        for q in range(begin, end):
+            x = value[q] * factor
+            if x != 0.0:
+                indices[at] = column[q]
+                data[at] = x
+                at += 1
+        indptr[i + 1] = <int32_t>at
+    if not ascend:
+        return None
+    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
+
+
+def extract_lower_triangle_of_mass(Step step, double bound, tuple like):
+    """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
+
+    x and y are qacc_smooth and qfrc_smooth. The second number is max |M x - y| / max |y| instead, if that is at most
+    `bound`. The result is None if rows of M are not consecutive or their columns do not ascend to the diagonal entry.
+    `like` is (indptr, indices) of a lower triangle; these arrays are reused if the pattern is the same.
+    """
+    cdef const step_t* p = &step.at
+    cdef int32_t i, q, last, n = p.n, nnz = p.mass_entries
+    cdef double gap = 0.0, big = 0.0
+    cdef Workspace scratch
+    cdef const int32_t* at
+    cdef const int32_t* column
+    cdef int32_t* whole
+    cdef double* out
+    cdef double* made
+    if n == 0:
+        return None if nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
+    if not has_row_pattern(like, p):
+        like = new(n + 1, I4), new(nnz, I4)
+        whole = as_int_pointer(like[0], n + 1)
+        memcpy(as_int_pointer(like[1], nnz), p.M_colind, nnz * sizeof(int32_t))
+        whole[0] = 0
+        for i in range(n):
+            if p.M_rowadr[i] != whole[i] or not 0 < p.M_rownnz[i] <= nnz - whole[i]:
+                return None
+            whole[i + 1] = whole[i] + p.M_rownnz[i]
+            last = -1
+            for q in range(whole[i], whole[i + 1]):
+                if not last < p.M_colind[q] <= i:
+                    return None
+                last = p.M_colind[q]
+            if last != i:
+                return None
+        if whole[n] != nnz:
+            return None
+        for made_ in like:
+            make_read_only(made_)
+    at, column = as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz)
+    copy, scratch = new(nnz), allocate_bytes(n * sizeof(double))
+    out, made = as_double_pointer(copy, nnz), <double*>scratch.at
+    memcpy(out, p.M, nnz * sizeof(double))
+    multiply_mass(n, at, column, out, p.qacc_smooth, False, made)
+    for i in range(n):
+        gap = update_max_abs(gap, made[i] - p.qfrc_smooth[i])
+        big = update_max_abs(big, p.qfrc_smooth[i])
+    if not gap <= bound * big:
+        big = 0.0
+        multiply_mass(n, at, column, out, p.qacc_smooth, True, made)
+        for i in range(n):
+            big = update_max_abs(big, made[i] + fabs(p.qfrc_smooth[i]))
+    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
+
+
+def find_velocity_before(Step step, double tolerance, double alike):
+    """Return the velocity (nv,) of the last forward pass; None if it is qvel.
+
+    After a step it is recovered from the velocities of bodies, which MuJoCo computes before the step. The result is -1 if
+    the body tree is invalid, and -2 if the velocities cannot be recovered: `alike` is the minimum fraction of a joint's
+    axis that must be independent of the axes before it in the same body; `tolerance` is the largest accepted difference of
+    a velocity, relative to the largest term.
+    """
+    cdef step_t* p = &step.at
+    cdef int64_t i = 0
+    gap, size = compare_spatial_velocities(p, p.qvel)
+    if gap < 0.0:
+        return -1
+    if gap <= tolerance * size:
+        return None
+    while i < 6 * p.bodies and p.cvel[i] == 0.0:
+        i += 1
+    if i == 6 * p.bodies:                           # In a copy of the data, cvel may be unset.
+        for i in range(p.m):
+            if p.efc_vel[i] != 0.0:
+                return None
+    v = recover_joint_velocity(p, alike)
+    if v is None or not compare_spatial_velocities(p, as_double_pointer(v, p.n))[0] <= tolerance * size:
+        return -2
+    return v
+
+
+def compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
     """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
@@ -449,23 +464,24 @@ def compute_problem_numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_,
     The size of terms is |J_i|_1 |x|_max for (1) and (2), max |J|^T |f| for (3). The fourth gap is NaN if a is not finite.
     Compliances up to `usual` count as usual.
     """
-    cdef int32_t i, j, m = <int32_t>len(aref_), n = <int32_t>len(v_)
+    cdef const step_t* p = &step.at
+    cdef int32_t i, j, m = <int32_t>p.m, n = p.n
     cdef Py_ssize_t q
-    cdef const int32_t* jptr = as_int_pointer(jptr_, m + 1)
-    cdef const int32_t* jidx = as_int_pointer(jidx_, jptr[m])
-    cdef const double* jval = as_double_pointer(jval_, jptr[m])
+    cdef const int32_t* jptr = as_int_pointer(jac[0], m + 1)
+    cdef const int32_t* jidx = as_int_pointer(jac[1], jptr[m])
+    cdef const double* jval = as_double_pointer(jac[2], jptr[m])
     cdef const double* scale = as_double_pointer(scale_, m)
-    cdef const double* v = as_double_pointer(v_, n)
-    cdef const double* smooth = as_double_pointer(smooth_, n)
-    cdef const double* aref = as_double_pointer(aref_, m)
-    cdef const double* r = as_double_pointer(r_, m)
-    cdef const double* inverse = as_double_pointer(inverse_, m)
-    cdef const double* force = as_double_pointer(force_, m)
-    cdef const double* vel = as_double_pointer(vel_, m)
-    cdef const double* b = as_double_pointer(b_, m)
-    cdef const double* push = as_double_pointer(push_, n)
-    cdef const double* a = as_double_pointer(a_, n)
-    cdef double c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
+    cdef const double* v = p.qvel if v_ is None else as_double_pointer(v_, n)
+    cdef const double* smooth = p.qacc_smooth
+    cdef const double* aref = p.efc_aref
+    cdef const double* r = p.efc_R
+    cdef const double* inverse = p.efc_D
+    cdef const double* force = p.efc_force
+    cdef const double* vel = p.efc_vel
+    cdef const double* b = p.efc_b
+    cdef const double* push = p.qfrc_constraint
+    cdef const double* a = p.qacc
+    cdef double dt = p.dt, c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
@@ -513,13 +529,9 @@ def compute_problem_numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_,
     for j in range(n):
         gap_3 = update_max_abs(gap_3, force_sum[j] - push[j])
         big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(push[j]))
+    if p.has_moving_surfaces:                           # efc_vel contains the velocities of surfaces, too.
+        stored_1 = 0.0
     return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_), sound and is_valid_magnitude(top_b), gap_0, (
         gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
-
-
-cdef inline double max_ignoring_nan(double maximum, double x) noexcept nogil:
-    """Return the larger of `maximum` and |x|, ignoring a NaN x."""
-    x = fabs(x)
-    return x if x > maximum else maximum

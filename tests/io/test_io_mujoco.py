@@ -12,6 +12,7 @@ from mujoco_scene import mj, scene, state
 
 import lavender as lv
 from lavender.io import mujoco as adapter
+from lavender.io import mujoco_memory
 
 # MuJoCo's solvers stop where the cost no longer falls; in float64 that is 1e-16 of it, and the residual of a
 # minimiser is the square root of what is left.
@@ -374,6 +375,32 @@ def test_of_a_model_only_what_cannot_change_is_kept_and_it_is_let_go():
     del model, data, whole
     gc.collect()
     assert alive() is None
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_from_mujoco_without_a_description_of_structs_reads_attributes(monkeypatch, cone, jacobian):
+    model, data = state(cone, condim=4, jacobian=jacobian)
+    assert mujoco_memory.find_offsets(mj) is not None
+    from_memory = lv.io.from_mujoco(model, data)
+    monkeypatch.setattr(mujoco_memory, "find_offsets", lambda _: None)
+    other = copy.copy(data)
+    assert lv.io.from_mujoco(model, other) == from_memory
+    assert np.array_equal(adapter.impulse(model, other), adapter.impulse(model, data))
+    other.nefc = 2**30
+    with pytest.raises(lv.InputError, match="do not fit into"):
+        lv.io.from_mujoco(model, other)
+
+
+def test_find_offsets_of_an_unknown_type_returns_none(monkeypatch):
+    monkeypatch.setattr(mujoco_memory, "TYPE_SIZES", {"int": 4})
+    assert mujoco_memory.find_offsets.__wrapped__(mj) is None
+
+
+def test_find_offsets_of_another_layout_returns_none(monkeypatch):
+    """Offsets that do not lead to the arrays of the attributes are not used."""
+    monkeypatch.setitem(mujoco_memory.TYPE_SIZES, "size_t", 16)
+    assert mujoco_memory.find_offsets.__wrapped__(mj) is None
 
 
 @pytest.mark.parametrize("name", ["nefc", "ncon", "nJ"])
