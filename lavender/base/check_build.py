@@ -2,7 +2,7 @@
 
 import importlib.util
 
-# The judge's module stands for all kernels, since every solve calls it.
+# Only the module of the judge is tested: every solve calls it.
 if importlib.util.find_spec("lavender_ext.judge.measure") is None:
     # Imported only for the message: it takes 4 % of the time of `import lavender`.
     from pathlib import Path

@@ -14,14 +14,13 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
-    check_int,
-    check_unmasked,
     get_common_precision,
     get_shape,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
-from lavender.problem.cones import Cones, get_block_kinds
+from lavender.problem.cones import Cones
+from lavender.problem.contact_rows import make_contacts, make_contacts_of_rows, make_joints
 from lavender.problem.data import Names, check_matrix
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
 from lavender.problem.friction import check_shape
@@ -165,7 +164,7 @@ class Builders(Operators):
         check_keywords("contact", more, ("mu", "patch_radius", "rolling", "tangents"))
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
-        cones = _make_contacts_of_rows("b", len(b), mu, tangents, patch_radius, rolling)
+        cones = make_contacts_of_rows("b", len(b), mu, tangents, patch_radius, rolling)
         return cls(b, cones, A, **more)
 
     @classmethod
@@ -321,8 +320,8 @@ class Builders(Operators):
         if tangents is None:
             tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
-        contacts = _make_contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
-        joints = _make_joints(rows, lower, upper)
+        contacts = make_contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
+        joints = make_joints(rows, lower, upper)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
@@ -407,7 +406,7 @@ class Builders(Operators):
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
         if cones is None:
-            cones = _make_contacts_of_rows("J", m, mu, tangents)
+            cones = make_contacts_of_rows("J", m, mu, tangents)
         if isinstance(cones, Cones) and cones.n_rows != m:
             hint = (
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
@@ -561,87 +560,3 @@ class Builders(Operators):
 def _make_program_names(n: int, m: int) -> list[str]:
     """Return default names of the unknowns and constraints of a quadratic program."""
     return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
-
-
-def _make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
-    """Build the joints' blocks with bounds of their rows (mj,) [N s]."""
-    low, high = (
-        as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
-        for name, x in (("lower", lower), ("upper", upper))
-    )
-    zeros = np.zeros(rows.n_joints)
-    return Cones(rows.joint_ptr, zeros.astype(np.int32), low, high, mu=zeros, patch_radius=zeros)
-
-
-def _make_contacts_of_rows(
-    name: str, m: int, mu: Any, tangents: Any, patch_radius: Any = None, rolling: Any = None
-) -> Cones:
-    """Build contacts with equal numbers of rows from m rows and a mu for each contact; `name` has the rows."""
-    check_unmasked("mu", mu)
-    angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
-    is_ellipse = len(get_shape("mu", mu)) > 1
-    own = None if tangents is None else check_int("tangents", tangents, high=2)
-    if is_ellipse and own in (None, 2):
-        return Cones.contacts(mu, 2, patch_radius, rolling=rolling)
-    if np.ndim(mu) == 0:
-        rows = 1 + angular_rows + (2 if own is None else own)
-        mu = np.full(m // rows if m % rows == 0 else 1, mu)
-    mu = as_array("mu", mu, (None,))
-    if (len(mu) == 0) != (m == 0) or (len(mu) and m % len(mu)):
-        raise InputError(
-            f"{name} has {m} rows, which is not a multiple of the {len(mu)} values of mu; every contact "
-            "needs the same number of rows"
-        )
-    count = m // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
-    if not 0 <= count <= 2 or (own is not None and len(mu) and count != own):
-        asked = "up to two tangent rows" if own is None else f"{own} tangent rows"
-        raise InputError(
-            f"{name} has {m} rows for {len(mu)} contacts; each contact needs a normal row, {asked}, a spin row if "
-            "patch_radius is given, and two rolling rows if rolling is given"
-        )
-    if own is None and count == 1 and m % 3 == 0 and angular_rows == 0:
-        raise InputError(
-            f"{name} has {m} rows and mu {len(mu)} values, so that these are {len(mu)} contacts with one tangent each, "
-            f"or {m // 3} contacts with two: give tangents=1, or {m // 3} values of mu"
-        )
-    if patch_radius is not None:
-        patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
-    elif count == 0 and np.any(mu > 0.0):
-        raise InputError(
-            f"mu has {len(mu)} values for {m} rows, so each contact has a normal row only and no row for "
-            "friction: give one mu for each contact, not for each row, or mu = 0"
-        )
-    return Cones.contacts(mu, count, patch_radius, rolling=rolling)
-
-
-def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
-    """Build contacts of 0 to 2 tangents (c,), with spin rows if a patch radius is given, rolling rows if mu_r is."""
-    has_spin, has_rolling, c = patch_radius is not None, rolling is not None, len(mu)
-    min_tangents, max_tangents = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
-    if min_tangents < 0 or max_tangents > 2:
-        raise InputError(
-            f"tangents holds numbers from {min_tangents} to {max_tangents}; 0, 1 or 2 is needed for each "
-            "contact"
-        )
-    if has_rolling and min_tangents < 2:
-        raise InputError(
-            f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling rows rotate about two "
-            "tangents: give tangents=2"
-        )
-    if min_tangents == 0 and not has_spin:
-        bad = np.flatnonzero((mu > 0.0) & (tangents == 0))
-        if len(bad):
-            raise InputError(
-                f"contact {bad[0]} has mu {mu[bad[0]]:g} but no friction row; friction needs tangents: give "
-                "tangents=2, or mu 0"
-            )
-    if min_tangents == max_tangents:
-        return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)
-    ptr = np.concatenate([[0], np.cumsum(1 + tangents + has_spin + 2 * has_rolling)]).astype(np.int32)
-    kind = get_block_kinds(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
-    infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(c)
-    cones = Cones(
-        ptr=ptr, kind=kind, lower=-infinite, upper=infinite, mu=mu,
-        patch_radius=zeros if patch_radius is None else patch_radius, rolling=zeros if rolling is None else rolling,
-    )  # fmt: skip
-    return cones.shaped("box") if shape == "box" else cones

@@ -36,7 +36,6 @@ from lavender.base.arrays import (
     check_int,
     check_nonnegative_magnitudes,
     check_not_nan,
-    get_shape,
     mark_read_only,
     resolve_index,
 )
@@ -45,14 +44,14 @@ from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
     SHAPES,
-    check_coefficients,
-    check_friction_combination,
+    SPIN_COEFFICIENT_LABEL,
     check_shape,
-    convert_box_coefficients,
     convert_ellipse_coefficients,
+    make_contact_blocks,
+    project_impulse,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, are_pointers_valid
+from lavender_ext.core.checks import FAULT_NAMES, are_pointers_valid
 
 __all__ = [
     "CONTACT",
@@ -71,8 +70,6 @@ __all__ = [
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
 CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
-# Messages name the product of mu and patch_radius so.
-SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"
 # For each kind of contact: its name, and its permitted rows, for messages.
 CONTACT_ROWS = {
     CONTACT: ("a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
@@ -294,42 +291,7 @@ class Cones:
         >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
         True
         """
-        if type(tangents) is not int or not 0 <= tangents <= 5:
-            tangents = check_int("tangents", tangents, 0, 5)
-        is_box = check_shape("shape", shape) == "box"
-        is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
-        if patch_radius is not None or rolling is not None or tangents != 2:
-            check_friction_combination(
-                mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair
-            )
-        ratio, pair_kind = None, 0
-        if is_box and tangents == 2:
-            pair_kind = CONTACT_BOX
-            mu, ratio = convert_box_coefficients(mu)
-        elif is_pair and not is_box:
-            mu, ratio = convert_ellipse_coefficients(mu)
-            pair_kind = 0 if ratio is None else CONTACT_ELLIPSE
-        size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else get_shape("mu", mu)[0]
-        k = size_of_mu if count is None else check_int("count", count)
-        if type(mu) is not float or not (mu == 0.0 or MIN_MAGNITUDE <= mu <= MAX_MAGNITUDE):
-            mu = check_coefficients("mu", mu, k)
-        if patch_radius is not None:
-            patch_radius = check_coefficients("patch_radius", patch_radius, k, "m")
-        if rolling is not None:
-            rolling = check_coefficients("rolling", rolling, k, "m")
-        if ratio is not None:
-            patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
-        blocks = kernels.make_contact_blocks(k, tangents, mu, patch_radius, rolling, pair_kind)
-        if blocks is None:
-            if patch_radius is not None:
-                check_nonnegative_magnitudes(
-                    SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m"
-                )
-            raise InputError(
-                f"{k} contacts have more than 2^31 - 1 rows, which 32-bit indices cannot number: split the "
-                "problem"
-            )
-        return cls._from_blocks(blocks)
+        return cls._from_blocks(make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape))
 
     @property
     def n_blocks(self) -> int:
@@ -365,11 +327,6 @@ class Cones:
     def has_rolling(self) -> bool:
         """Whether a contact has two rolling rows with a separate bound (CONTACT_ROLLING)."""
         return bool(self._blocks.has_rolling)
-
-    @property
-    def has_more_components(self) -> bool:
-        """Whether a contact has friction components other than tangents and spin."""
-        return self.has_rolling
 
     @property
     def is_box(self) -> npt.NDArray[np.bool_]:
@@ -636,43 +593,3 @@ def _simplify_kinds(kind: IntArray, size: IntArray) -> IntArray:
     """Return the kinds of blocks; a round cone of up to two tangents, or a box of one, becomes a CONTACT."""
     is_disk = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
     return mark_read_only(np.where(is_disk, CONTACT, kind).astype(np.int32)) if is_disk.any() else kind
-
-
-def project_impulse(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Project an impulse (m,) [N s] on the bounds, normal rows first.
-
-    Bounded rows and normals are clipped. Then each friction component is projected radially on its coefficient times
-    the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
-    """
-    if cones.has_ellipse:
-        return cones.stretch * project_impulse(cones.ellipses_replaced_by_disks, impulse / cones.stretch)
-    out = np.clip(impulse, cones.lower, cones.upper)
-    first, tangents = cones.ptr[:-1], cones.n_together
-
-    def bounds(blocks: Any, rows: Any) -> FloatArray:
-        bound: FloatArray = cones.friction_coefficient[rows] * out[first[blocks]]
-        return bound
-
-    # Project components of one row.
-    for blocks, rows in (
-        (np.flatnonzero(tangents == 1), first + 1),
-        (np.flatnonzero(cones.separate_rows >= 0), cones.separate_rows),
-    ):
-        bound = bounds(blocks, rows[blocks])
-        out[rows[blocks]] = np.clip(out[rows[blocks]], -bound, bound)
-    # Project components of two rows.
-    for blocks, rows in (
-        (np.flatnonzero(tangents == 2), first + 1),
-        (np.flatnonzero(cones.rolling_rows >= 0), cones.rolling_rows),
-    ):
-        pairs = rows[blocks][:, None] + np.arange(2)
-        bound, size = bounds(blocks, pairs[:, 0]), np.hypot(*out[pairs].T)
-        outside = size > bound
-        out[pairs[outside]] *= (bound[outside] / size[outside])[:, None]
-    # Project round cones.
-    for block in np.flatnonzero(tangents > 2).tolist():
-        tangent_rows = slice(first[block] + 1, first[block] + 1 + tangents[block])
-        radius, length = bounds(block, first[block] + 1), np.hypot.reduce(out[tangent_rows])
-        if length > radius:
-            out[tangent_rows] *= radius / length
-    return out

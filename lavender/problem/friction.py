@@ -1,4 +1,4 @@
-"""Check coefficients of friction, and convert them for disks, ellipses and boxes."""
+"""Build the blocks of contacts from coefficients of friction, and project impulses on the bounds of blocks."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_nonnegative_magnitudes
+from lavender.base.arrays import FloatArray, as_array, check_int, check_nonnegative_magnitudes, get_shape
 from lavender.base.errors import InputError, check_name
+from lavender_ext.core import blocks as kernels
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
+
+*_, BOX_KIND, _, ELLIPSE_KIND = kernels.KINDS
 
 # Shapes of the bound of two tangents: their norm is bounded, or each tangent separately.
 SHAPES = ("disk", "box")
@@ -15,6 +19,8 @@ SHAPES = ("disk", "box")
 # Impulses of that size vanish by rounding when they are added to impulses along the second tangent. An ellipse with a
 # smaller ratio of its coefficients is rejected.
 MIN_COEFFICIENT_RATIO = 2.0**-60
+# Messages name the product of mu and patch_radius so.
+SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"
 
 
 def check_shape(name: str, shape: Any) -> str:
@@ -87,3 +93,69 @@ def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None
     first, second = pairs[:, 0], pairs[:, 1]
     ratio = np.divide(second, first, out=np.ones(len(first)), where=first > 0.0)
     return first.copy(), ratio if (ratio != 1.0).any() else None
+
+
+def make_contact_blocks(
+    mu: Any, tangents: int, patch_radius: Any, rolling: Any, count: int | None, shape: str
+) -> kernels.Blocks:
+    """Build the blocks of k contacts with the same rows; `Cones.contacts` describes the arguments."""
+    if type(tangents) is not int or not 0 <= tangents <= 5:
+        tangents = check_int("tangents", tangents, 0, 5)
+    is_box = check_shape("shape", shape) == "box"
+    is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
+    if patch_radius is not None or rolling is not None or tangents != 2:
+        check_friction_combination(
+            mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair
+        )
+    ratio, pair_kind = None, 0
+    if is_box and tangents == 2:
+        pair_kind = BOX_KIND
+        mu, ratio = convert_box_coefficients(mu)
+    elif is_pair and not is_box:
+        mu, ratio = convert_ellipse_coefficients(mu)
+        pair_kind = 0 if ratio is None else ELLIPSE_KIND
+    size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else get_shape("mu", mu)[0]
+    k = size_of_mu if count is None else check_int("count", count)
+    if type(mu) is not float or not (mu == 0.0 or MIN_MAGNITUDE <= mu <= MAX_MAGNITUDE):
+        mu = check_coefficients("mu", mu, k)
+    if patch_radius is not None:
+        patch_radius = check_coefficients("patch_radius", patch_radius, k, "m")
+    if rolling is not None:
+        rolling = check_coefficients("rolling", rolling, k, "m")
+    if ratio is not None:
+        patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
+    blocks = kernels.make_contact_blocks(k, tangents, mu, patch_radius, rolling, pair_kind)
+    if blocks is None:
+        if patch_radius is not None:
+            spin = np.broadcast_to(mu, (k,)) * patch_radius
+            check_nonnegative_magnitudes(SPIN_COEFFICIENT_LABEL, spin, "m")
+        raise InputError(
+            f"{k} contacts have more than 2^31 - 1 rows, which 32-bit indices cannot number: split the problem"
+        )
+    return blocks
+
+
+def project_impulse(cones: Any, impulse: FloatArray) -> FloatArray:
+    """Project an impulse (m,) [N s] on the bounds of `Cones`, normal rows first.
+
+    Bounded rows and normals are clipped. Then each friction component is projected radially on its coefficient times
+    the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
+    """
+    if cones.has_ellipse:
+        return cones.stretch * project_impulse(cones.ellipses_replaced_by_disks, impulse / cones.stretch)
+    out: FloatArray = np.clip(impulse, cones.lower, cones.upper)
+    first, tangents = cones.ptr[:-1], cones.n_together
+    groups = [(tangents == width, first + 1, width) for width in range(1, int(tangents.max(initial=0)) + 1)]
+    groups += [
+        (cones.separate_rows >= 0, cones.separate_rows, 1),
+        (cones.rolling_rows >= 0, cones.rolling_rows, 2),
+    ]
+    for has_component, first_row, width in groups:
+        rows = first_row[has_component][:, None] + np.arange(width)
+        bound = (cones.friction_coefficient[rows[:, 0]] * out[first[has_component]])[:, None]
+        if width == 1:
+            out[rows] = np.clip(out[rows], -bound, bound)
+        else:
+            size = np.hypot.reduce(out[rows], axis=1)[:, None]
+            out[rows] *= np.divide(bound, size, out=np.ones_like(size), where=size > bound)
+    return out

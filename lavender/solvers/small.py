@@ -94,7 +94,7 @@ def get_small_call(problem: Problem) -> Any:
 def _make_call(problem: Problem) -> Small | None:
     """Build the compiled call, or None for round cones, rolling friction, large islands and empty rows."""
     cones, count, label, bounded = problem.cones, 1, None, call_uses_pivots(problem)
-    if cones.has_round or cones.has_more_components:
+    if cones.has_round or cones.has_rolling:
         return None
     if problem.m > SMALL_ROWS:
         if bounded:

@@ -118,7 +118,7 @@ def is_accepted_by_library(problem: lv.Problem, solver: str) -> bool:
         return False
     if solver in ("direct", "lemke"):
         return not np.any(c.is_contact & (np.diff(c.ptr) > 1))
-    return solver != "newton" or form == 3 or not (c.has_round or c.has_more_components)
+    return solver != "newton" or form == 3 or not (c.has_round or c.has_rolling)
 
 
 def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
