@@ -39,6 +39,8 @@ from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
 ERRORS = ("raise", "status")
 BODY_FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")
 BODY_PAIRS = ("joint_body", "contact_body")
+#: Offsets and sizes of a world, as the kernels number them.
+WORLD = np.dtype([(name, np.int64) for name in sorted(PLACE, key=PLACE.__getitem__)])
 
 
 class Batch(Sequence[Problem]):
@@ -146,28 +148,22 @@ class Batch(Sequence[Problem]):
             raise InputError(f"J has shape {jac.shape}; (n, m, nv) is needed, or with row_ptr (rows, nv)")
         self._n, self.friction = n, friction
         self.precision = get_common_precision(*(np.asarray(x) for x in (jac, mass, free)))
-        # Offsets and sizes of each world: a row for each world, the columns by the names in PLACE.
-        self.at = at = np.zeros((n, len(PLACE)), np.int64)
-        at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
-        at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
+        self.at = at = np.zeros(n, WORLD)
+        at["rows"], at["velocities"], at["row"], at["velocity"] = sizes, nvs, rows[:-1], velocities[:-1]
         self._set_cones(cones)
         self._pattern = check_shared_lower_triangles(pattern, nvs, mass) if pattern else None
-        if capacity is not None and mass.ndim == 2 and not pattern:
-            mass = np.broadcast_to(mass, (n, *mass.shape))
-        shapes = (None, None) if capacity is None else ((capacity, nv), (nv, nv))
-        jac, at[:, PLACE["jac"]], self._jac_row = _flatten_matrices("J", jac, n, shapes[0], sizes * nvs)
-        if self._pattern is None:
-            mass, at[:, PLACE["mass"]], self._mass_row = _flatten_matrices("M", mass, n, shapes[1], nvs * nvs)
-        else:
-            entries = len(self._pattern[1])
-            (mass, at[:, PLACE["mass"]]), self._mass_row = _flatten_vectors("M", mass, n, entries, None), 0
-        free, at[:, PLACE["free"]] = _flatten_vectors(
-            "v_free", free, n, nv if capacity is not None else None, nvs
-        )
-        goal, at[:, PLACE["target"]] = _flatten_vectors("target", target, n, capacity, sizes)
-        soft, at[:, PLACE["soft"]] = _flatten_vectors(
-            "compliance", 0.0 if compliance is None else compliance, n, capacity, sizes
-        )
+        shapes: Sequence[Any] = 4 * (None,)
+        if capacity is not None:
+            shapes = (capacity, nv), (nv, nv), (nv,), (capacity,)
+        jac_shape, mass_shape, velocity_shape, row_shape = shapes
+        if self._pattern is not None:
+            mass_shape = (len(self._pattern[1]),)
+        jac, at["jac"], self._jac_row = _flatten("J", jac, n, jac_shape, sizes * nvs)
+        mass, at["mass"], self._mass_row = _flatten("M", mass, n, mass_shape, nvs * nvs)
+        free, at["free"], _ = _flatten("v_free", free, n, velocity_shape, nvs)
+        goal, at["target"], _ = _flatten("target", target, n, row_shape, sizes)
+        compliance = 0.0 if compliance is None else compliance
+        soft, at["soft"], _ = _flatten("compliance", compliance, n, row_shape, sizes)
         self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
 
     # -- other constructors ----------------------------------------------------------------------------
@@ -197,9 +193,8 @@ class Batch(Sequence[Problem]):
         n, m = rhs.shape
         batch = cls._make_empty(n, m, friction, get_common_precision(matrix, rhs))
         batch._set_cones(cones)
-        at = batch.at
-        flat, at[:, PLACE["jac"]], batch._jac_row = _flatten_matrices("A", matrix, n, (m, m), None)
-        goal, at[:, PLACE["target"]] = _flatten_vectors("b", rhs, n, m, None)
+        flat, batch.at["jac"], batch._jac_row = _flatten("A", matrix, n, (m, m), None)
+        goal, batch.at["target"], _ = _flatten("b", rhs, n, (m,), None)
         batch._arrays = flat, None, None, goal, None, batch._flatten_mu(mu)
         return batch
 
@@ -247,11 +242,11 @@ class Batch(Sequence[Problem]):
         if n:
             first = batch[0]
             batch.shape, batch.precision = (n, first.m), first.precision
-            batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = first.m, first.m * np.arange(n)
             nv = 6 * first.rows.n_bodies if first.rows is not None else 0
             batch.velocity_shape = (n, nv)
-            batch.at[:, PLACE["velocities"]], batch.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
-            batch.at[:, PLACE["blocks"]] = first.cones.n_blocks
+            batch.at["rows"], batch.at["row"] = first.m, first.m * np.arange(n)
+            batch.at["velocities"], batch.at["velocity"] = nv, nv * np.arange(n)
+            batch.at["blocks"] = first.cones.n_blocks
         return batch
 
     @classmethod
@@ -261,8 +256,8 @@ class Batch(Sequence[Problem]):
         friction = check_choice("friction", friction, FRICTION_LAWS)
         batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
         batch.shape, batch.velocity_shape = (n, m), (n, 0)
-        batch.at = np.zeros((n, len(PLACE)), np.int64)
-        batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = m, m * np.arange(n)
+        batch.at = np.zeros(n, WORLD)
+        batch.at["rows"], batch.at["row"] = m, m * np.arange(n)
         return batch
 
     # Function that returns the names of a world's blocks.
@@ -278,7 +273,7 @@ class Batch(Sequence[Problem]):
 
     def _set_cones(self, cones: Any) -> None:
         """Store the cones of all worlds or of each world, and the offsets of each world's blocks and rows in them."""
-        at, sizes = self.at, self.at[:, PLACE["rows"]]
+        at, sizes = self.at, self.at["rows"]
         if not isinstance(cones, Cones):
             cones = _concatenate_cones(cones, len(self))
         self.cones = cones
@@ -287,7 +282,7 @@ class Batch(Sequence[Problem]):
                 "Coulomb's law is not supported for a round cone of more than two tangents: give friction='cone'"
             )
         if len(self) and (sizes == cones.n_rows).all():
-            at[:, PLACE["blocks"]] = cones.n_blocks
+            at["blocks"] = cones.n_blocks
             return
         self._has_shared_cones = False
         first = _compute_offsets(sizes)
@@ -309,20 +304,19 @@ class Batch(Sequence[Problem]):
                 f"the blocks of the cones do not begin and end with the {sizes[bad[0]]} rows of world "
                 f"{bad[0]}; every block must belong to one world: give a list with one Cones for each world"
             )
-        at[:, PLACE["block"]], at[:, PLACE["blocks"]], at[:, PLACE["cone_row"]] = block, last - block, first
+        at["block"], at["blocks"], at["cone_row"] = block, last - block, first
 
     def _flatten_mu(self, mu: Any) -> np.ndarray | None:
         """Return mu of all worlds as a flat array."""
         if mu is None:
             return None
-        block_counts = self.at[:, PLACE["blocks"]]
-        n_blocks = self.cones.n_blocks if self._has_shared_cones else None
-        flat, self.at[:, PLACE["mu"]] = _flatten_vectors("mu", mu, len(self), n_blocks, block_counts)
+        shape = (self.cones.n_blocks,) if self._has_shared_cones else None
+        flat, self.at["mu"], _ = _flatten("mu", mu, len(self), shape, self.at["blocks"])
         return flat
 
     def _get_cones_of_world(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Return the blocks of world i, with mu (k,) if it is given."""
-        block, k = (int(self.at[i, PLACE[name]]) for name in ("block", "blocks"))
+        block, k = self.at[i]["block"], self.at[i]["blocks"]
         if self._has_shared_cones and mu is None:
             return self.cones
         cones = self.cones._select_blocks(np.arange(block, block + k))  # pyright: ignore[reportArgumentType]
@@ -342,7 +336,7 @@ class Batch(Sequence[Problem]):
     @property
     def row_counts(self) -> np.ndarray:
         """Number of rows of each world (n,)."""
-        return self.at[:, PLACE["rows"]].copy()
+        return self.at["rows"].copy()
 
     def __len__(self) -> int:
         return self._n
@@ -358,7 +352,8 @@ class Batch(Sequence[Problem]):
             return [self[j] for j in i]
         if self._bodies is not None:
             return self._make_body_problem(i, *self._bodies)
-        jac, mass, free, target, compliance, mu = (self._get_array_of_world(i, which) for which in range(6))
+        world = dict(zip(WORLD.names, self.at[i].item(), strict=True))  # type: ignore[arg-type]
+        jac, mass, free, target, compliance, mu = (self._get_array_of_world(world, k) for k in range(6))
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
         if mass is None:
             return Problem(target, cones, jac, friction=self.friction, precision=self.precision)
@@ -381,12 +376,10 @@ class Batch(Sequence[Problem]):
             )
         return problem
 
-    def _get_array_of_world(self, i: int, which: int) -> Any:
-        """Return an array of world i (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
-        offsets = self.at[i]
-        m, nv, k = (int(offsets[PLACE[name]]) for name in ("rows", "velocities", "blocks"))
-        array = self._arrays[which]
-        first = int(offsets[PLACE[("jac", "mass", "free", "target", "soft", "mu")[which]]])
+    def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:
+        """Return an array of a world (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
+        array, m, nv, k = self._arrays[which], world["rows"], world["velocities"], world["blocks"]
+        first = world[("jac", "mass", "free", "target", "soft", "mu")[which]]
         if array is None:
             return None
         if which == 1 and self._pattern is not None:
@@ -398,27 +391,24 @@ class Batch(Sequence[Problem]):
             nv = m  # In a batch of matrices, the first array is A (m, m) instead of J (m, nv).
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
-            size = array.itemsize
-            return (
-                np.lib.stride_tricks.as_strided(
-                    array[first:], (rows, nv), ((stride or nv) * size, size), writeable=False
-                )
-                if rows * nv
-                else np.zeros((rows, nv), array.dtype)
-            )
+            if not rows * nv:
+                return np.zeros((rows, nv), array.dtype)
+            strides = (stride or nv) * array.itemsize, array.itemsize
+            return np.lib.stride_tricks.as_strided(array[first:], (rows, nv), strides, writeable=False)
         return array[first : first + (nv, m, m, k)[which - 2]]
 
     def rows_of(self, i: int) -> slice:
         """Return the slice of world i in a flat array of all impulses."""
-        first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
-        return slice(first, first + m)
+        first = int(self.at[i]["row"])
+        return slice(first, first + int(self.at[i]["rows"]))
 
     def start(self, i: int) -> FloatArray:
         """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
         if self._arrays is None:
             return self[i].start()
-        first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
-        return clip_zero_to_bounds(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
+        first = int(self.at[i]["cone_row"])
+        rows = slice(first, first + int(self.at[i]["rows"]))
+        return clip_zero_to_bounds(self.cones.lower[rows], self.cones.upper[rows])
 
     def flatten_impulses(self, name: str, value: Any) -> FloatArray:
         """Convert impulses [N s] of the batch's shape to a new flat array; numbers need not be finite."""
@@ -427,7 +417,7 @@ class Batch(Sequence[Problem]):
 
     def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
-        worlds = Worlds(self.at, impulse, velocity, cold)
+        worlds = Worlds(convert_table_for_kernel(self.at), impulse, velocity, cold)
         if self._bodies is not None and (body_arrays := self._get_body_arrays()):
             worlds.set_from_bodies(*body_arrays)
         elif self._arrays is None or self.cones.has_ellipse:
@@ -490,6 +480,11 @@ class Batch(Sequence[Problem]):
 # -- conversion of arguments --------------------------------------------------------------------------
 
 
+def convert_table_for_kernel(at: np.ndarray) -> np.ndarray:
+    """Return a table of worlds (n,) as the kernels read it, (n, fields) int64, without a copy."""
+    return at.view(np.int64).reshape(len(at), len(PLACE))
+
+
 def _are_int32_indices(x: np.ndarray) -> bool:
     """Return whether all entries are integers of 32 bits."""
     return x.dtype.kind == "i" and (x.itemsize <= 4 or bool(((x >= -(2**31)) & (x < 2**31)).all()))
@@ -497,9 +492,7 @@ def _are_int32_indices(x: np.ndarray) -> bool:
 
 def _compute_offsets(sizes: Any) -> np.ndarray:
     """Compute the offsets of consecutive parts from their sizes."""
-    return (
-        np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64) if len(sizes) else np.zeros(0, np.int64)
-    )
+    return np.cumsum(sizes, dtype=np.int64) - sizes
 
 
 def _check_world_pointers(name: str, value: Any) -> np.ndarray:
@@ -550,65 +543,43 @@ def check_row_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray
     return count
 
 
-def _make_flat_memory_view(x: np.ndarray) -> np.ndarray:
-    """Return a flat view of the memory that an array spans; strides must be multiples, 0 or more, of the item size."""
-    if not x.size:
-        return np.zeros(0, x.dtype)
-    length = 1 + sum((n - 1) * s // x.itemsize for n, s in zip(x.shape, x.strides, strict=True))
-    return np.lib.stride_tricks.as_strided(x, (length,), (x.itemsize,), writeable=False)
-
-
-def _is_readable_in_place(x: np.ndarray) -> bool:
-    """Return whether each world is stored row by row in aligned memory."""
-    has_item_strides = all(s >= 0 and s % x.itemsize == 0 for s in x.strides)
-    return has_item_strides and x.flags.aligned and (x.shape[-1] < 2 or x.strides[-1] == x.itemsize)
-
-
-def _flatten_matrices(
-    name: str, x: np.ndarray, n: int, shape: tuple[int, int] | None, sizes: Any
+def _flatten(
+    name: str, value: Any, n: int, shape: tuple[int, ...] | None, sizes: Any
 ) -> tuple[np.ndarray, Any, int]:
-    """Return matrices of n worlds as a flat array, their offsets, and the stride of their rows.
+    """Return the numbers of n worlds as a flat array, the offset of each world in it, and the stride of its rows.
 
     Parameters
     ----------
-    shape : (int, int) or None
-        Shape of every matrix. If None, the matrices are concatenated, have the numbers of entries `sizes` (n,) and the
-        stride 0, which means that their rows are contiguous.
-    """
-    if shape is None:
-        return *_flatten_ragged(name, x, sizes), 0
-    if x.shape != (n, *shape):
-        raise InputError(f"{name} has shape {x.shape}; {(n, *shape)} is needed")
-    if not _is_readable_in_place(x) or (shape[0] > 1 and x.strides[1] < shape[1] * x.itemsize):
-        x = np.ascontiguousarray(x)
-    row_stride = x.strides[1] // x.itemsize if shape[0] > 1 else shape[1]
-    return _make_flat_memory_view(x), np.arange(n) * (x.strides[0] // x.itemsize), row_stride
-
-
-def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Return vectors of n worlds as a flat array, and their offsets; a scalar or a single vector serves all worlds.
-
-    `size` is the size of every vector, or None if the vectors are concatenated and have the sizes `sizes` (n,).
+    name : str
+    value : array
+        An array of `shape` for each world, in place of which one array serves all worlds; a number, except for
+        matrices.
+    shape : tuple of int or None
+        If None, the arrays of the worlds are concatenated, have the numbers of entries `sizes` (n,), and the stride 0,
+        which means that rows are contiguous.
     """
     x = as_float_array(name, value)
-    if x.ndim == 0:
-        return np.full(int(np.max(sizes, initial=0)), float(x)), 0
-    if size is None:
-        return _flatten_ragged(name, x, sizes)
-    if x.shape == (size,):
-        return np.ascontiguousarray(x), 0
-    if x.shape != (n, size):
-        raise InputError(f"{name} has shape {x.shape}; {(n, size)} or ({size},) is needed")
-    x = x if _is_readable_in_place(x) else np.ascontiguousarray(x)
-    return _make_flat_memory_view(x), np.arange(n) * (x.strides[0] // x.itemsize)
-
-
-def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Return the concatenated numbers of all worlds as a flat array, and the offset of each world in it."""
-    total = int(np.sum(sizes))
-    if x.size != total:
-        raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")
-    return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes)
+    if x.ndim == 0 and name not in ("J", "M"):
+        return np.full(int(np.max(sizes, initial=0)), float(x)), 0, 0
+    if shape is None:
+        total = int(np.sum(sizes))
+        if x.size != total:
+            raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")
+        return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes), 0
+    if x.shape == shape:
+        x = np.broadcast_to(x, (n, *shape))
+    if x.shape != (n, *shape):
+        raise InputError(f"{name} has shape {x.shape}; {(n, *shape)} or {shape} is needed")
+    size, is_matrix = x.itemsize, len(shape) == 2 and shape[0] > 1
+    # Arrays are read in place if each world is stored row by row in aligned memory.
+    has_item_strides = all(stride >= 0 and stride % size == 0 for stride in x.strides) and x.flags.aligned
+    has_contiguous_rows = x.shape[-1] < 2 or x.strides[-1] == size
+    if not (has_item_strides and has_contiguous_rows) or (is_matrix and x.strides[1] < shape[1] * size):
+        x = np.ascontiguousarray(x)
+    # A flat view of the memory that the array spans.
+    length = 1 + sum((k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True))
+    flat = np.lib.stride_tricks.as_strided(x, (length if x.size else 0,), (size,), writeable=False)
+    return flat, np.arange(n) * (x.strides[0] // size), x.strides[1] // size if is_matrix else shape[-1]
 
 
 def _concatenate_cones(cones: Any, n: int) -> Cones:

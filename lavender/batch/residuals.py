@@ -26,7 +26,7 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import run_on_threads
-from lavender.batch.data import ERRORS, Batch
+from lavender.batch.data import ERRORS, WORLD, Batch, convert_table_for_kernel
 from lavender.judge.residuals import (
     DEFAULT_THRESHOLD,
     MAX_REST_VELOCITY,
@@ -38,9 +38,19 @@ from lavender.judge.residuals import (
 )
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_problem_data
+from lavender_ext.batch.many import CODE, NUMBER, Worker, Worlds, list_problem_data
 
 NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
+
+
+class _Column:
+    """Property of `WorldResults`: a number of the judge for each world."""
+
+    def __init__(self, name: str, doc: str) -> None:
+        self.name, self.__doc__ = name, doc
+
+    def __get__(self, results: Any, owner: type) -> FloatArray:
+        return self if results is None else results._export(results._get_column(self.name))  # type: ignore[return-value]
 
 
 class WorldResults:
@@ -67,48 +77,27 @@ class WorldResults:
         self._invalid_starts: dict[int, LavenderError] = {}
         if isinstance(problems, Batch):
             at = problems.at
-            self._sizes, self._first = at[:, PLACE["rows"]], at[:, PLACE["row"]]
+            self._sizes, self._first = at["rows"], at["row"]
             self._impulse = np.zeros(int(np.prod(problems.shape))) if cold else starts
             self._velocity: FloatArray | None = np.zeros(int(np.prod(problems.velocity_shape)))
             self._worlds: Worlds = problems.make_kernel_worlds(self._impulse, self._velocity, cold)
             return
         self._data, self._sizes = list_problem_data(problems, Problem)
-        at = np.zeros((len(problems), len(PLACE)), np.int64)
+        at = np.zeros(len(problems), WORLD)
         self._first = np.cumsum(self._sizes) - self._sizes
-        at[:, PLACE["rows"]], at[:, PLACE["row"]] = self._sizes, self._first
+        at["rows"], at["row"] = self._sizes, self._first
         self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
-        self._worlds = Worlds(at, self._impulse, np.zeros(0), cold)
+        self._worlds = Worlds(convert_table_for_kernel(at), self._impulse, np.zeros(0), cold)
         self._worlds.set_from_problems(problems, self._data, starts)
 
-    @property
-    def relative(self) -> FloatArray:
-        """Relative residual (n,) [-]; NaN for an invalid world."""
-        return self._export(self._get_column("relative"))
-
-    @property
-    def energy(self) -> FloatArray:
-        """Energy norm of the error (n,) [sqrt J]."""
-        return self._export(self._get_column("energy"))
-
-    @property
-    def velocity_error(self) -> FloatArray:
-        """Velocity error of the worst row (n,) [m/s]."""
-        return self._export(self._get_column("speed"))
-
-    @property
-    def velocity_at_zero(self) -> FloatArray:
-        """Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."""
-        return self._export(self._get_column("reference_speed"))
-
-    @property
-    def impulse_error(self) -> FloatArray:
-        """Impulse error of the worst row (n,) [N s]."""
-        return self._export(self._get_column("push"))
-
-    @property
-    def roundoff_floor(self) -> FloatArray:
-        """Relative residual that rounding alone can cause (n,) [-]."""
-        return self._export(self._get_column("roundoff_floor"))
+    relative = _Column("relative", "Relative residual (n,) [-]; NaN for an invalid world.")
+    energy = _Column("energy", "Energy norm of the error (n,) [sqrt J].")
+    velocity_error = _Column("speed", "Velocity error of the worst row (n,) [m/s].")
+    velocity_at_zero = _Column(
+        "reference_speed", "Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."
+    )
+    impulse_error = _Column("push", "Impulse error of the worst row (n,) [N s].")
+    roundoff_floor = _Column("roundoff_floor", "Relative residual that rounding alone can cause (n,) [-].")
 
     @property
     def worst_row(self) -> np.ndarray:

@@ -30,7 +30,7 @@ from lavender.solving.loop import MIN_TIME_LIMIT
 from lavender.solving.prepared import Prepared, check_accepted, check_arguments
 from lavender.solving.solve import solve
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity, check_velocity_tolerance
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
+from lavender_ext.batch.many import CODE, NUMBER, Worker
 from lavender_ext.judge.measure import all_finite
 
 if TYPE_CHECKING:
@@ -207,15 +207,13 @@ class Solutions(WorldResults, Sequence[Solution]):
         problem = solution.residual._problem
         if self._velocity is not None and self._velocity.size and problem.matrix is None:
             v = problem.velocity(solution.impulse).ravel()
-            first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
+            first = self.problems.at[i]["velocity"]  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
     def _estimate_late_judging_cost(self) -> float:
         """Estimate the cost [ns] of the results if no world is started before the deadline."""
         if isinstance(self.problems, Batch):
-            rows, columns = (
-                self.problems.at[:, PLACE[name]].astype(float) for name in ("rows", "velocities")
-            )
+            rows, columns = (self.problems.at[name].astype(float) for name in ("rows", "velocities"))
             # Number of entries in a row of J, or of A for a matrix.
             entries = np.where(columns > 0.0, columns, rows)
             products = float(np.sum(rows * (2.0 * entries + 4.0)))
@@ -233,8 +231,8 @@ class Solutions(WorldResults, Sequence[Solution]):
             self._impulse[self._get_rows(i)] = np.nan
             self._worlds.counts[i], self._worlds.worst[i] = 0, -1
             if isinstance(self.problems, Batch) and self._velocity is not None and self._velocity.size:
-                first, n = (int(self.problems.at[i, PLACE[name]]) for name in ("velocity", "velocities"))
-                self._velocity[first : first + n] = np.nan
+                world = self.problems.at[i]
+                self._velocity[world["velocity"] : world["velocity"] + world["velocities"]] = np.nan
 
     @overload
     def __getitem__(self, i: int) -> Solution: ...
@@ -469,36 +467,35 @@ def _convert_starts(
     invalid : dict of int to LavenderError
         Errors of starts that are not finite, which are replaced by the zero impulse.
     """
-    invalid = dict[int, LavenderError]()
-
-    def is_valid(i: int, start: FloatArray) -> bool:
-        if all_finite(start):
-            return True
-        bad = np.flatnonzero(~np.isfinite(start))[0]
-        invalid[i] = InputError(
-            f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
-        )
-        if errors == "raise":
-            raise invalid[i]
-        return False
-
+    starts: Any
+    parts: Iterable[tuple[int, Any]] = ()
     if isinstance(worlds, Batch):
         if impulses is not None:
             raise InputError(
                 "impulses= needs a list of problems; a batch takes impulse=, one array for all worlds"
             )
-        if impulse is None:
-            return None, invalid
-        flat = worlds.flatten_impulses("impulse", impulse)
-        if not all_finite(flat):
-            for i in range(len(worlds)):
-                rows = worlds.rows_of(i)
-                if not is_valid(i, flat[rows]):
-                    flat[rows] = 0.0
-        return flat, invalid
-    if impulse is not None:
-        raise InputError(
-            "impulse= needs a batch; a list of problems takes impulses=, one for each problem or None"
+        starts = None if impulse is None else worlds.flatten_impulses("impulse", impulse)
+        if starts is not None and not all_finite(starts):
+            parts = ((i, starts[worlds.rows_of(i)]) for i in range(len(worlds)))
+    else:
+        if impulse is not None:
+            raise InputError(
+                "impulse= needs a batch; a list of problems takes impulses=, one for each problem or None"
+            )
+        starts = (
+            [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
         )
-    starts = [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
-    return [x if x is None or is_valid(i, x) else None for i, x in enumerate(starts)], invalid
+        parts = enumerate(starts)
+    invalid = dict[int, LavenderError]()
+    for i, start in parts:
+        if start is not None and not all_finite(start):
+            bad = np.flatnonzero(~np.isfinite(start))[0]
+            message = f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
+            invalid[i] = InputError(message)
+            if errors == "raise":
+                raise invalid[i]
+            if isinstance(worlds, Batch):
+                start[:] = 0.0
+            else:
+                starts[i] = None
+    return starts, invalid
