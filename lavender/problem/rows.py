@@ -82,9 +82,9 @@ class Rows:
     Raises
     ------
     InputError
-        The shapes disagree; a body does not exist; a row joins a body to itself, or two static bodies; an inverse mass
-        is negative; an inertia is not positive semidefinite; a normal or tangent is not a unit vector; a tangent is
-        not orthogonal to its normal.
+        The shapes disagree; a body does not exist; a body is joined to itself, or a contact has two static bodies; an
+        inverse mass is negative; an inertia is not positive semidefinite; a normal or tangent is not a unit vector; a
+        tangent is not orthogonal to its normal.
 
     Examples
     --------
@@ -306,6 +306,12 @@ class Rows:
         j = np.concatenate([diagonal, block + np.tile(np.arange(3), 3 * n)])
         x = np.concatenate([np.repeat(self.inv_mass, 3), self.inv_inertia.ravel()])
         return sp.csr_array((x, (i, j)), shape=(6 * n, 6 * n))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Rows of {self.n_bodies} bodies, {self.n_joints} joints with {len(self.jac)} rows, "
+            f"{self.n_contacts} contacts>"
+        )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Rows):

@@ -397,7 +397,8 @@ class Sweeps(Iterations):
         return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
 
 
-STEPS = {
+#: Class of the step of each solver; the other solvers have `Iterations`.
+STEP_CLASSES = {
     "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
     "newton on the relaxation": RelaxedNewton,
 }  # fmt: skip
@@ -889,7 +890,7 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Ste
 
 def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
-    step = STEPS.get(name, Iterations)(name, log)
+    step = STEP_CLASSES.get(name, Iterations)(name, log)
     if isinstance(step, RelaxedNewton):
         step.like = tree.states["newton"]
     if isinstance(step, Newton):
