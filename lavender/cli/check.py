@@ -78,6 +78,7 @@ def check(
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.report.check import cross_check
+    from lavender.report.records import format_tolerance
     from lavender.report.terminal import print_table
     from lavender.solving.limits import check_time_limit
 
@@ -89,6 +90,7 @@ def check(
             )
     contradicted = unsolved = unaccepted = solutions = above = unmet = 0
     errors = ErrorReporter(partial(print_escaped, style="yellow"))
+    reason = ""
     judges_stored = precision is not None or is_option_set(context, "threshold")
     report.select_solver_names([*(solvers or ()), reference])
     check_float("tol", tol, low=0.0)
@@ -102,6 +104,9 @@ def check(
             stored = item.judge_stored_answer(precision, threshold)
             print_escaped(item.name, style="bold")
             print_escaped(comparison.description)
+            if comparison.reference is None and comparison.reference_note != reason:
+                reason = comparison.reference_note  # Problems that follow usually have the same.
+                print_escaped(f"no reference: {reason}")
             print_table(make_console(), comparison.table, optional=NARROW_CHECK_OMITS)
             if (exact := _describe_distances(item, comparison)) is not None:
                 print_escaped(exact)
@@ -126,8 +131,8 @@ def check(
             "leave them out, or give files with solutions"
         )
     if solutions:
-        shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
-        print_escaped(f"stored solutions: {shares}")
+        shares = f"{above} of {solutions} above their floor, {unmet} also more than"
+        print_escaped(f"stored solutions: {shares} {format_tolerance(threshold)} m/s off")
     errors.exit(contradicted or unsolved or unaccepted or (judges_stored and unmet))
 
 

@@ -11,6 +11,7 @@ from lavender.base.exits import EXIT_UNMET
 from lavender.cli.options import (
     FILE,
     FOLDER,
+    exit_after_interrupt,
     precision_option,
     print_escaped,
     recording_options,
@@ -32,7 +33,8 @@ def record(
 ) -> None:
     """Simulate a MuJoCo model and write its constraint problems.
 
-    MODEL.xml is an MJCF file. `lavender report OUT` measures solvers on the problems.
+    MODEL.xml is an MJCF file. `lavender report OUT` measures solvers on the problems. Steps from different --states are
+    independent problems. After Ctrl-C, the folder has the steps until then.
 
     Exit code 1: a step could not be recorded.
     """
@@ -41,5 +43,7 @@ def record(
     reject_unused_recording_options(context, True)
     recorded = record_file(model, out, steps, precision=precision or "float64", **options)
     print_escaped(str(recorded))
+    if recorded.is_interrupted:
+        exit_after_interrupt()
     if recorded.left_out:
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -21,6 +21,7 @@ from lavender.cli.options import (
     RECORDING_NAMES,
     ListType,
     MultiValueCommand,
+    exit_after_interrupt,
     make_console,
     plan_options,
     print_escaped,
@@ -230,7 +231,10 @@ def _record_model(
     if not reuse or not settings_file.is_file() or settings_file.read_text(encoding="utf-8") != settings:
         # Without the settings file, a recording that is interrupted now will not be reused.
         settings_file.unlink(missing_ok=True)
-        print_escaped(str(record_file(path, folder, **recording, replace=True)))
+        recorded = record_file(path, folder, **recording, replace=True)
+        print_escaped(str(recorded))
+        if recorded.is_interrupted:
+            exit_after_interrupt()
         write_text(settings_file, settings)
     return str(folder)
 

@@ -420,7 +420,11 @@ class Recording:
         Number of MuJoCo's answers with an error above the round-off floor and a velocity error above `threshold`.
     threshold : float, m/s
     worst : str
-        Verdict, velocity error and row of the worst answer.
+        Velocity error, row, step and verdict of the worst answer.
+    n_starts : int
+        Number of start states of the recorded steps; 0 if the recording is one simulation.
+    is_interrupted : bool
+        Whether Ctrl-C ended the recording early.
     """
 
     folder: Path
@@ -431,18 +435,24 @@ class Recording:
     stopped: int = 0
     threshold: float = DEFAULT_THRESHOLD
     worst: str = ""
+    n_starts: int = 0
+    is_interrupted: bool = False
 
     def __str__(self) -> str:
-        unconstrained = f", {self.without} steps without constraints" if self.without else ""
-        failed = f", {len(self.left_out)} left out: {self.left_out[0]}" if self.left_out else ""
-        written = f"{len(self.files)} problems in {self.folder}{unconstrained}{failed}"
-        if not self.above_floor:
-            return written
-        worst = f"; the worst {self.worst}" if self.stopped else ""
-        return (
-            f"{written}\nMuJoCo's own answers: {self.above_floor} above their floor, {self.stopped} more than "
-            f"{self.threshold:g} m/s off{worst}"
-        )
+        lines = [f"{len(self.files)} problems in {self.folder}"]
+        if self.n_starts:
+            lines.append(
+                f"from {self.n_starts} start states; steps from different states are independent problems"
+            )
+        if self.without:
+            lines.append(f"{self.without} steps without constraints")
+        if self.left_out:
+            lines.append(f"{len(self.left_out)} left out: {self.left_out[0]}")
+        if self.above_floor:
+            threshold = f"{self.threshold:g}".replace("e-0", "e-")
+            counts = f"{self.above_floor} above their floor, {self.stopped} more than {threshold} m/s off"
+            lines.append(f"MuJoCo's own answers: {counts}")
+        return "\n".join(lines + ([f"worst: {self.worst}"] if self.stopped else []))
 
 
 def record(
@@ -463,10 +473,11 @@ def record(
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each
     file: file, step, rows, the iterations of the engine's solver and of noslip (in all islands; null if MuJoCo has more
-    islands than it counts, 20), the time of both [s], and the judge's result: residual, velocity error [m/s], worst
-    row, round-off floor of the precision, and verdict. A step in which MuJoCo's solver stopped before convergence is
-    written with that verdict. A step that cannot be exported has no file; its line holds the reason as `left_out`,
-    which is reported with every measurement of the other steps.
+    islands than it counts, 20), the time of both [s], the number of the start state (if `states` are given), and the
+    judge's result: residual, velocity error [m/s], worst row, round-off floor of the precision, and verdict. After
+    Ctrl-C, the lines and the result describe the steps until then. A step in which MuJoCo's solver stopped before
+    convergence is written with that verdict. A step that cannot be exported has no file; its line holds the reason as
+    `left_out`, which is reported with every measurement of the other steps.
 
     Parameters
     ----------
@@ -485,7 +496,7 @@ def record(
         Seed of "random".
     states : path of an .npz, "keyframes", or arrays, optional
         Start states (`read_states`): the steps are divided evenly among them. The first step from a state uses
-        its controls, if it has any. Default: `data` as it is.
+        its controls, if it has any. Steps from different states are independent problems. Default: `data` as it is.
     replace : bool
         Whether to remove the problem files of another recording from the folder; if false, such files raise an error.
     precision : {"float64", "float32"}
@@ -511,29 +522,37 @@ def record(
     starts = None if states is None else read_states(mj, model, states).select_evenly(steps)
     records: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
-    without = 0
-    width = len(str(steps))
+    without, is_interrupted = 0, False
+    width, file = len(str(steps)), Path()
     with lock_step_folder(folder, replace) as folder:
-        for step in iterate_steps(mj, model, data, steps, every, control_at, starts):
-            file = folder / f"step_{step:0{width}d}.npz"
-            try:
-                result = _solve_step(mj, model, data, f"step {step}", precision, threshold)
-            except LavenderError as error:
-                left_out.append({"file": file.name, "step": step, "left_out": str(error)})
-                continue
-            if result is None:
-                without += 1
-                continue
-            problem, impulse, facts = result
-            write_npz(problem, file, impulse=impulse)
-            records.append({"file": file.name, "step": step, **facts})
+        try:
+            for step, start in iterate_steps(mj, model, data, steps, every, control_at, starts):
+                file = folder / f"step_{step:0{width}d}.npz"
+                line = {"file": file.name, "step": step} | ({} if starts is None else {"start": start})
+                try:
+                    result = _solve_step(mj, model, data, f"step {step}", precision, threshold)
+                except LavenderError as error:
+                    left_out.append({**line, "left_out": str(error)})
+                    continue
+                if result is None:
+                    without += 1
+                    continue
+                problem, impulse, facts = result
+                write_npz(problem, file, impulse=impulse)
+                records.append({**line, **facts})
+        except KeyboardInterrupt:
+            if not records:
+                raise
+            is_interrupted = True
+            if records[-1]["file"] != file.name:
+                file.unlink(missing_ok=True)  # A file without a line would belong to another recording.
         write_lines(folder, (*records, *left_out))
     above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
     worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
     short = ""
     if worst is not None:
-        verdict = UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}"
-        short = f"{verdict}, {worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
+        verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
+        short = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
     return Recording(
         folder=folder,
         files=tuple(line["file"] for line in records),
@@ -543,17 +562,21 @@ def record(
         stopped=len(above_threshold),
         threshold=threshold,
         worst=short,
+        n_starts=len({line["start"] for line in records if "start" in line}),
+        is_interrupted=is_interrupted,
     )
 
 
 def iterate_steps(
     mj: Any, model: Any, data: Any, steps: int, every: int, control_at: Callable[..., Any], starts: Any
-) -> Iterator[int]:
-    """Step a simulation; yield the number of every `every`-th step, with the constraints of the state after it.
+) -> Iterator[tuple[int, int]]:
+    """Step a simulation; yield the numbers of every `every`-th step and of its start state.
 
-    The steps are divided evenly among the start states; the first step from a state uses its controls, if it has any.
+    `data` then has the constraints of the state after the step. The steps are divided evenly among the start states.
+    The first step from a state uses its controls, if it has any.
     """
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
+    i = 0
     for step in range(steps):
         ctrl = control_at(data, step)
         if starts is not None and step in firsts:
@@ -569,7 +592,7 @@ def iterate_steps(
             mj.mj_forward(model, data)
         except mj.FatalError as error:
             raise InputError(f"step {step + 1}: MuJoCo raised an error, {error}") from None
-        yield step + 1
+        yield step + 1, i
 
 
 def _solve_step(

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -137,11 +138,13 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
                 "or a Problem is needed"
             )
         elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
-            steps = _rename_duplicate_sequence(list_steps_in_folder(source), items)
-            name, missing = steps[0].sequence, map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
+            for _, group in groupby(list_steps_in_folder(source), key=lambda item: item.sequence):
+                steps = list(group)
+                items += _rename_duplicate_sequence(steps, items) if steps[0].sequence else steps
+            name, folder_name = items[-1].sequence, Path(source).resolve().name
+            missing = map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
             items += [
-                *steps,
-                *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in missing),
+                replace(item, name=f"{name or folder_name}, {item.name}", sequence=name) for item in missing
             ]
         elif Path(source).is_dir():
             paths = _list_problem_files(Path(source))
@@ -200,7 +203,9 @@ def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
 
 
 def list_steps_in_folder(folder: str | Path) -> list[Item]:
-    """Return the problem files of a folder as the steps of one sequence, in the numeric order of their names.
+    """Return the problem files of a folder as the steps of a sequence, in the numeric order of their names.
+
+    Steps that were recorded from different start states are different sequences; a single step of a state is a case.
 
     Raises
     ------
@@ -219,9 +224,17 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
         )
     _check_one_recording(folder, paths)
     name = folder.resolve().name
+    starts = {str(line["file"]): line.get("start") for line in _read_engine_records(folder)}
+    groups: dict[str, list[Path]] = {}
+    for path in paths:
+        start = starts.get(path.name)
+        groups.setdefault(name if start is None else f"{name}, state {start}", []).append(path)
     return [
-        replace(_make_item_of_file(path), name=f"{name}[{i}]", sequence=name, step=i)
-        for i, path in enumerate(paths)
+        replace(_make_item_of_file(path), name=f"{group}[{i}]", sequence=group, step=i)
+        if len(members) > 1
+        else replace(_make_item_of_file(path), name=group)
+        for group, members in groups.items()
+        for i, path in enumerate(members)
     ]
 
 

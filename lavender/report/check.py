@@ -184,18 +184,18 @@ class CrossCheck:
 
     @property
     def description(self) -> str:
-        """Name and law of the problem, tolerance and reference."""
+        """Name and law of the problem, tolerance and, if there is one, reference with its residual."""
         name = self.problem.name or f"{self.problem.m} rows"
-        tol = format_tolerance(self.tol) if self.tol else "0"
-        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
-        return f"{name} ({self.problem.law}), tol {tol}, {reference}, {self.reference_note}"
+        reference = f", reference {self.reference}, {self.reference_note}" if self.reference else ""
+        return f"{name} ({self.problem.law}), cold, tol {format_tolerance(self.tol)}{reference}"
 
     def __str__(self) -> str:
         widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
         lines = [
             "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in self._cells
         ]
-        return "\n".join([self.description, *lines])
+        reason = [] if self.reference else [f"no reference: {self.reference_note}"]
+        return "\n".join([self.description, *reason, *lines])
 
 
 def _format_number(x: float | None) -> str:
@@ -310,7 +310,7 @@ def _solve_reference(
         return (
             None,
             None,
-            f"as Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
+            f"Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
         )
     if not (problem.has_singular_program or problem.is_symmetric):
         return (

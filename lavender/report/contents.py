@@ -13,6 +13,9 @@ from lavender.report.engine import EngineAnswers
 from lavender.report.ranking import choose_time_budgets, get_times, group_cases_by_structure
 from lavender.report.records import Records
 
+# Columns with equal values in all runs of a pass over a sequence.
+PASS_COLUMNS = ["solver", "mode", "tol", "max_iter", "start"]
+
 
 @dataclass(frozen=True, eq=False)
 class Contents:
@@ -47,14 +50,34 @@ class Contents:
 
     @cached_property
     def newest(self) -> pd.DataFrame:
-        """The newest run; if it was stopped, of the cases on which every solver was measured."""
+        """The newest run; if it was stopped, the part in which all cases have the same measurements."""
+        return self._select_finished_part()[0]
+
+    @cached_property
+    def unfinished(self) -> list[str]:
+        """Solvers of a stopped run that were not measured to the end on the shown cases."""
+        return self._select_finished_part()[1]
+
+    @property
+    def has_passes_only(self) -> bool:
+        """Whether a run was stopped in the first solver of its first sequence, so that solvers cannot be compared."""
+        return bool(len(self.newest) and self.newest["solver"].iloc[0] in self.unfinished)
+
+    def _select_finished_part(self) -> tuple[pd.DataFrame, list[str]]:
+        """Return `newest` and `unfinished`.
+
+        A stopped run has the cases on which every solver was measured. If it was stopped in its first sequence, it has
+        the solvers before the one that was measured then, or, without any, the passes before the last.
+        """
         frame = self.records.latest_frame
-        if not self.is_stopped:
-            return frame
-        run = list(self.records.runs.values())[-1]
-        wanted = set(run.plan.get("solvers", ()))
+        if not (self.is_stopped and len(frame)):
+            return frame, []
+        run, last = list(self.records.runs.values())[-1], frame.iloc[-1]
+        solvers = run.plan.get("solvers", ())
+        is_running = (frame["sequence"] == (last["sequence"] or None)) & (frame["solver"] == last["solver"])
+        finished = frame[~is_running]
         done: dict[str, set[str]] = {}
-        for case, solver in frame[["case", "solver"]].drop_duplicates().itertuples(index=False):
+        for case, solver in finished[["case", "solver"]].drop_duplicates().itertuples(index=False):
             done.setdefault(case, set()).add(solver)
         for skip in self.records.skips:
             if skip.run == run.run:
@@ -62,7 +85,12 @@ class Contents:
                 members = [n for n, i in self.records.cases.items() if i.sequence == skip.case]
                 for name in members if info is None else [skip.case]:
                     done.setdefault(name, set()).add(skip.solver)
-        return frame[frame["case"].isin([name for name, solvers in done.items() if solvers >= wanted])]
+        whole = finished[finished["case"].isin([name for name, some in done.items() if some >= set(solvers)])]
+        if len(whole) or not last["sequence"]:
+            return whole, []
+        passes = frame[(frame[PASS_COLUMNS] != last[PASS_COLUMNS]).any(axis=1)]
+        some = done.get(str(last["case"]), set())
+        return finished if len(finished) else passes, [name for name in solvers if name not in some]
 
     @cached_property
     def frame(self) -> pd.DataFrame:

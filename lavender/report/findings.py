@@ -84,7 +84,9 @@ class Report(Contents):
         if not len(self.frame):
             return Section("overview", "", "", self.frame.iloc[:, :0])
         wanted = ["solver", "cases", f"solved {target}", f"time {target} [s]"]
-        if len(self.structures) > 1 and not self.is_campaign:
+        if self.has_passes_only:
+            name, wanted = "sequences", ["target", "steps, cold", "time, cold [s]", "residual, cold [-]"]
+        elif len(self.structures) > 1 and not self.is_campaign:
             name, wanted = "structures", ["structure", target, f"time {target} [s]"]
         frame = self.sections[name].frame
         frame = frame[[c for c in wanted if c in frame]].rename(columns={f"time {target} [s]": "time [s]"})
@@ -95,7 +97,8 @@ class Report(Contents):
         """The tables by name, in their order; tables without rows are left out."""
         if not len(self.newest):
             return self._skipped
-        wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else SECTIONS
+        wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else tuple(SECTIONS)
+        wanted = ("sequences", "budgets", "claims", "failures") if self.has_passes_only else wanted
         made = [
             Section(name, title, note, make(self))
             for name, (title, note, make) in SECTIONS.items()

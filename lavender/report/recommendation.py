@@ -53,6 +53,10 @@ def recommend(report: Contents) -> tuple[Statement, ...]:
     if not len(report.frame):
         stopped = report.is_stopped and len(report.records)
         return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
+    if report.has_passes_only:
+        return (
+            Statement(f"Stopped: the tables have the finished passes of {report.frame['solver'].iloc[0]}."),
+        )
     single = report.frame["step"] < 0
     return tuple(
         _recommend_for(report, some) for some in (report.frame[single], report.frame[~single]) if len(some)
@@ -80,20 +84,25 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     runs = select_ranked_runs(frame)
     own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
     start = "warm from the previous step" if (own["start"] == "carried").any() else "cold"
-    misses = int(first["cases"] - first["solved"])
-    solved = f"{first['solved']} of " if misses else ""
+    missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
+    solved = f"{first['solved']} of " if missed or unreached else ""
     time = format_seconds(first["mean"]) + (" on average" if first["cases"] > 1 else "")
-    if misses:
-        time += f" (a miss counted as {format_seconds(report.limit)})"
+    if missed or unreached:
+        time += f" ({'each other' if unreached else 'a miss'} counted as {format_seconds(report.limit)})"
     elif first["worst"] > 3.0 * first["mean"]:
         time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
     use = f"Stopped: {solver} solves" if report.is_stopped else f"Use {solver}: it solves"
     sentences = [f"{use} {solved}{named} in {time}, {start}, {reached}."]
+    if report.unfinished:
+        sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
     ties = [f"{s} ({format_seconds(t)})" for s, t in ranking.loc[ranking["tie"], "mean"].iloc[1:].items()]
     if ties:
         sentences.append(f"As fast within the noise of the repetitions: {_shorten_list(ties)}.")
-    if misses:
-        sentences.append(_describe_misses(report, runs, cases, solver))
+    if missed:
+        sentences.append(f"It misses {_shorten_list(missed)}.")
+    if unreached:
+        steps = format_count(unreached, "step")
+        sentences.append(f"Not reached within the time of a pass (--sequence-time-limit): {steps}.")
     sentences += _describe_plug_ins(ranking, solver)
     loosest = own[own["tol"] == own["tol"].max()]
     call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
@@ -101,15 +110,24 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
 
 
-def _describe_misses(report: Contents, runs: pd.DataFrame, cases: Sequence[str], solver: str) -> str:
-    """Return the sentence on the cases that the recommended solver misses, each with its smallest residual."""
+def _list_unsolved_cases(
+    report: Contents, runs: pd.DataFrame, cases: Sequence[str], solver: str
+) -> tuple[list[str], int]:
+    """Return the cases that a solver misses, each with its smallest residual, and the number of steps not reached.
+
+    A step is not reached if the pass to the tolerance ended before it, and no pass to a larger tolerance missed it.
+    """
     own = runs[runs["solver"] == solver]
-    left = own.groupby("case", observed=True)["relative"].min().reindex(list(cases))
-    texts = [
-        f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})"
-        for case, x in left[~(left <= report.tolerance)].items()
-    ]
-    return f"It misses {_shorten_list(texts)}."
+    is_run = (own["tol"] <= report.tolerance) | (own["relative"] > own["tol"])
+    left = own[is_run].groupby("case", observed=True)["relative"].min().reindex(list(cases))
+    sequences = set(own["sequence"].astype(str)) - {""}
+    missed, unreached = [], 0
+    for case, x in left[~(left <= report.tolerance)].items():
+        if x != x and report.records.cases[str(case)].sequence in sequences:
+            unreached += 1
+        else:
+            missed.append(f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})")
+    return missed, unreached
 
 
 def _describe_plug_ins(ranking: pd.DataFrame, first: str) -> list[str]:

@@ -37,7 +37,9 @@ MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, includ
 
 
 def format_tolerance(tolerance: float) -> str:
-    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03."""
+    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03; 0 as 0."""
+    if tolerance == 0.0:
+        return "0"
     mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"

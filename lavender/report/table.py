@@ -1,6 +1,6 @@
 """Define tables of texts, which the terminal, pages and Markdown show.
 
-All times of a table have one unit, and all sizes of a column have one format.
+All times of a table have one unit, and all sizes of a table have one format.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ WORDS = frozenset({"case", "solver", "status", "structure", "target", "message",
 
 @dataclass(frozen=True)
 class Cell:
-    """A number that a table formats like its other times [s] (`time`), or like the column's other numbers (`size`)."""
+    """A number that a table formats like its other times [s] (`time`), or like its other numbers (`size`)."""
 
     value: float
     quantity: str
@@ -30,7 +30,7 @@ class Cell:
 
     @classmethod
     def size(cls, value: float) -> Cell:
-        """Create the cell of a number of any magnitude; the column chooses its format."""
+        """Create the cell of a number of any magnitude; the table chooses its format."""
         return cls(value, "size")
 
 
@@ -43,23 +43,17 @@ class Table:
     words: frozenset[str] = field(default=WORDS, repr=False)  # Heads of the columns that contain words.
 
     def __post_init__(self) -> None:
-        """Write all times in one unit, which the heads name, and the sizes of each column in one format."""
+        """Write all times in one unit, which the heads name, and all sizes in one format."""
         heads, rows = list(self.heads), [list(row) for row in self.rows]
-        times = [
-            (row, i, c)
-            for row in rows
-            for i, c in enumerate(row)
-            if isinstance(c, Cell) and c.quantity == "time"
-        ]
+        cells = [(row, i, c) for row in rows for i, c in enumerate(row) if isinstance(c, Cell)]
+        times, sizes = ([x for x in cells if x[2].quantity == name] for name in ("time", "size"))
         unit, texts = format_times_in_one_unit([cell.value for _, _, cell in times])
         for (row, i, _), text in zip(times, texts, strict=True):
             row[i] = text
         for i in {i for _, i, _ in times}:
             heads[i] = f"{heads[i]} [{unit}]"
-        for column in range(len(heads)):
-            sizes = [(row, cell.value) for row in rows if isinstance(cell := row[column], Cell)]
-            for (row, _), text in zip(sizes, format_sizes([x for _, x in sizes]), strict=True):
-                row[column] = text
+        for (row, i, _), text in zip(sizes, format_sizes([cell.value for _, _, cell in sizes]), strict=True):
+            row[i] = text
         object.__setattr__(self, "heads", heads)
         object.__setattr__(self, "rows", rows)
 

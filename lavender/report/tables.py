@@ -48,6 +48,11 @@ def count_solved(solved: int, cases: int) -> str:
     return "" if solved == cases else f" ({solved}/{cases})"
 
 
+def compute_quantiles(groups: Any, q: float | list[float]) -> Any:
+    """Compute quantiles of groups of residuals, interpolated linearly; inf if they lie between infinite residuals."""
+    return groups.quantile(q).fillna(math.inf)
+
+
 # -- tables ------------------------------------------------------------------------------------------------
 
 
@@ -200,7 +205,7 @@ def tabulate_budgets(report: Contents) -> Frame:
     """Tabulate the residual of each solver after fixed numbers of iterations: median and 90th percentile."""
     runs = select_starts(report.frame[report.frame["mode"] == "budget"])
     groups = runs.groupby(["solver", "max_iter"], observed=True)["relative"]
-    table = groups.quantile([0.5, SERVED_QUANTILE], interpolation="higher").unstack([1, 2]).sort_index(axis=1)
+    table = compute_quantiles(groups, [0.5, SERVED_QUANTILE]).unstack([1, 2]).sort_index(axis=1)
     names = {0.5: "median", SERVED_QUANTILE: "90 %"}
     table.columns = [f"{format_count(n, 'iteration')}, {names[q]} [-]" for n, q in table.columns]
     return table.rename_axis("solver").reset_index() if len(runs) else pd.DataFrame()
@@ -214,7 +219,8 @@ def tabulate_in_time(report: Contents) -> Frame:
         for t in report.time_budgets:
             done = some[some["time"] <= t].groupby(["solver", "case"], observed=True)["relative"].min()
             left = done.unstack().reindex(columns=cases).fillna(1.0)
-            score = left.quantile(SERVED_QUANTILE, axis=1, interpolation="higher").sort_values(kind="stable")
+            groups = left.stack().groupby("solver", observed=True)
+            score = compute_quantiles(groups, SERVED_QUANTILE).sort_values(kind="stable")
             score = score[(left <= SERVED_RESIDUAL).mean(axis=1).reindex(score.index) >= SERVED_QUANTILE]
             near = [str(s) for s in score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()]]
             near.sort(key=lambda s: s != PREFERRED_SOLVER)

@@ -120,8 +120,8 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
     lines: list[Text] = []
     for i, statement in enumerate(report.statements):
         lines.append(Text(statement.text, style="" if i else "bold"))
-        hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
-        code = statement.code if complete else (statement.call_line + hint,) * bool(statement.call_line)
+        is_cut = len(statement.code) > 1 and not complete
+        code = [statement.call_line, "# all lines: --tables"] if is_cut else statement.code
         lines += [Text(f"    {line}") for line in code]
     if report.busy_warning:
         lines.append(Text(report.busy_warning, style="yellow"))

@@ -21,7 +21,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import require_packages
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.judge.solution import Claim, Solution, Status, raise_if_interrupted
+from lavender.external.backends import explain_contradicted_claim
+from lavender.judge.solution import CONTRADICTED, Claim, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.report import machine
 from lavender.report.records import ERROR, CaseInfo, Record, format_tolerance, make_measurement_key
@@ -36,9 +37,9 @@ COLD_PROBLEM = (
     "problem = dataclasses.replace(problem, guess=None)"  # Line that removes a guess from a problem.
 )
 CARRIED_START = (
-    "before, impulse = problems[0], None",
+    "before, impulse = problems[0], problems[0].start()",
     "for problem in problems:",
-    "    start = problem.start() if impulse is None else lv.report.carry_impulses(before, impulse, problem)",
+    "    start = lv.report.carry_impulses(before, impulse, problem)",
 )
 
 
@@ -110,7 +111,7 @@ def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
 
     If `guessed` is true, some problems have a guess, and a line before a cold start removes it.
     """
-    short = format_tolerance(record.tol) if record.tol else "0"
+    short = format_tolerance(record.tol)
     text = f"tol={short if float(short) == record.tol else repr(record.tol)}"
     spec = registry.specs().get(record.solver)
     if record.mode == "budget" or (spec is not None and record.iterations > spec.max_iter):
@@ -289,7 +290,7 @@ def judge_outcome(problem: Problem, task: Task, outcome: Outcome | str) -> tuple
         return task.make_record(status=ERROR, message=outcome[:500]), None
     solution = make_solution(problem, task, outcome)
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return make_record(task, solution, outcome), impulse
+    return make_record(problem, task, solution, outcome), impulse
 
 
 def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
@@ -306,13 +307,16 @@ def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
     return finish(run)
 
 
-def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
+def make_record(problem: Problem, task: Task, s: Solution, outcome: Outcome) -> Record:
     """Return the record of a measurement; its last repeat returned the solution `s`."""
     r = s.residual
+    is_false = s.claim_check == CONTRADICTED
+    observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
     return task.make_record(
         status=s.status.name, relative=float(r.relative), energy=float(r.energy), velocity=float(r.velocity),
         roundoff_floor=float(r.roundoff_floor), worst_row=int(r.worst_row), worst_name=r.worst_name,
-        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check, status_conflict=s.status_conflict,
+        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+        status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
         claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations), work={k: int(v) for k, v in s.work.items()},
         form=s.solver.form, message=s.message[:500], times=outcome.times, setup_time=outcome.setup_time,
         solve_time=outcome.solve_time, calibration_time=outcome.calibration_time,

@@ -42,6 +42,11 @@ def test_check_ends_each_solver_at_its_time_limit(lavender):
     assert out.count("TIME_LIMIT") == 2
 
 
+def test_check_states_once_why_problems_have_no_reference(lavender):
+    code, out, _ = lavender("check", "granularF(n=3)", "granularF(n=4)", "--solvers", "newton")
+    assert code == 0 and out.count("no reference: Coulomb friction") == 1 and out.count("granularF(n=4) (coulomb)") == 1
+
+
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
     assert code == cli.EXIT_UNMET and "1 problems are not accepted by any of these solvers" in out

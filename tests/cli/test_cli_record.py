@@ -18,7 +18,7 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
     found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)
     assert found.above_floor > 10
     assert found.stopped == 0
-    assert str(found).endswith(f"{found.above_floor} above their floor, 0 more than 1e-06 m/s off")
+    assert str(found).endswith(f"{found.above_floor} above their floor, 0 more than 1e-6 m/s off")
     strict = lv.io.record(model, mj.MjData(model), tmp_path / "b", 30, threshold=0.0)
     assert (strict.above_floor, strict.stopped) == (found.above_floor, found.above_floor)
     lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
@@ -37,7 +37,7 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
         with pytest.raises(lv.InputError, match="threshold"):
             lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
     words = ("check", tmp_path / "a" / at["file"], "--solvers", "auto", "--threshold")
-    for threshold, status, told in (("1e-6", 0, "0 also more than 1e-06"), ("0", 1, "1 also more than 0")):
+    for threshold, status, told in (("1e-6", 0, "0 also more than 1e-6"), ("0", 1, "1 also more than 0")):
         code, out, _ = lavender(*words, threshold)
         assert code == status and f"1 of 1 above their floor, {told} m/s off" in " ".join(out.split())
 

@@ -38,9 +38,49 @@ def test_a_step_on_which_mujoco_stopped_before_convergence_is_kept_and_told_in_m
     worst = max(lines, key=lambda line: line["velocity"])
     assert worst["velocity"] > 1e-3
     assert 0 < found.stopped == sum(line["velocity"] > 1e-6 for line in lines) <= found.above_floor
-    where = f"{worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
-    said = {"wrong": "is wrong"}.get(worst["verdict"], "stopped before convergence")
-    assert str(found).endswith(f"the worst {said}, {where}")
+    where = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}"
+    verdict = {"wrong": "is wrong"}.get(worst["verdict"], "stopped before convergence")
+    assert str(found).splitlines()[-1] == f"worst: {where}: it {verdict}"
+
+
+def test_record_ctrl_c_keeps_the_steps_until_then(tmp_path):
+    def interrupt(model, data, step):
+        if step == 5:
+            raise KeyboardInterrupt
+
+    found = lv.io.record(*state(steps=1), tmp_path, 20, control=interrupt)
+    lines = [json.loads(line) for line in (tmp_path / "engine.jsonl").read_text().splitlines()]
+    assert found.is_interrupted and [line["file"] for line in lines] == list(found.files)
+    assert sorted(path.name for path in tmp_path.glob("*.npz")) == list(found.files) and len(lines) == 5
+    assert len(lv.report.resolve_sources(tmp_path)) == 5
+
+
+def test_record_ctrl_c_while_a_file_is_written_leaves_no_file_without_a_line(tmp_path, monkeypatch):
+    write = recorder.write_npz
+
+    def interrupt(problem, path, impulse):
+        write(problem, path, impulse=impulse)
+        if path.name == "step_03.npz":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(recorder, "write_npz", interrupt)
+    assert lv.io.record(*state(steps=1), tmp_path, 20).files == ("step_01.npz", "step_02.npz")
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+
+
+def test_steps_recorded_from_different_states_are_independent(tmp_path):
+    model, data = state(steps=20)
+    arrays = {"qpos": np.tile(data.qpos, (3, 1)), "qvel": np.tile(data.qvel, (3, 1))}
+    found = lv.io.record(model, data, tmp_path / "six", 6, states=arrays)
+    assert found.n_starts == 3 and "from 3 start states; steps from different states are independent" in str(found)
+    lines = [json.loads(line) for line in (tmp_path / "six" / "engine.jsonl").read_text().splitlines()]
+    assert [line["start"] for line in lines] == [0, 0, 1, 1, 2, 2]
+    items = lv.report.resolve_sources(tmp_path / "six")
+    assert [(i.sequence, i.step) for i in items[2:4]] == [("six, state 1", 0), ("six, state 1", 1)]
+    lv.io.record(model, data, tmp_path / "three", 3, states=arrays)
+    # A single step of each state is a single problem, which is solved cold.
+    items = lv.report.resolve_sources(tmp_path / "three", sequences=True)
+    assert [(i.name, i.sequence, i.step) for i in items] == [(f"three, state {k}", "", -1) for k in range(3)]
 
 
 def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypatch):

@@ -79,7 +79,7 @@ def test_a_named_reference_under_coulombs_law_is_refused_with_its_reason_and_err
     coulomb = random_contact_problem(2, tangents=2, spin=False)
     table = cross_check(coulomb, ["newton", "pgs"], "osqp", max_iter=20)
     assert table.reference is None and "osqp takes laws linear, lcp" in table.reference_note
-    assert "no reference, as Coulomb friction is not the optimality condition of a QP" in str(table)
+    assert "no reference: Coulomb friction is not the optimality condition of a QP" in str(table)
     for row in table:
         assert row.distance is None and row.allowed is None
         by_row = lv.residual(coulomb, row.solution.impulse).velocity_by_row
