@@ -40,7 +40,7 @@ class KaminoSetting(Setting):
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Values of the configuration's fields; "tolerance" stands for all three tolerances."""
+        """Values of the configuration's fields; "tolerance" means all three tolerances."""
         names = ((PADMM_TOLERANCES if name == "tolerance" else (name,), x) for name, x in self.options)
         return {field: x for fields, x in names for field in fields}
 
