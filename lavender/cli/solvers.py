@@ -43,8 +43,8 @@ def _get_capabilities(spec: SolverSpec) -> str:
     return ", ".join(word for field, word, _ in CAPABILITIES if getattr(spec, field))
 
 
-def _join_in_order(words: Sequence[str], present: frozenset[str]) -> str:
-    return " ".join(word for word in words if word in present)
+def _join_in_order(names: Sequence[str], present: frozenset[str]) -> str:
+    return " ".join(name for name in names if name in present)
 
 
 def _describe_solver(name: str) -> None:
