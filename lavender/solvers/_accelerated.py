@@ -10,7 +10,7 @@ from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
-from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_sweep_cost
+from lavender.solvers.costs import Cost, estimate_sweep_cost
 from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
@@ -42,7 +42,7 @@ class AcceleratedState(SweepState):
     """State of an accelerated sweep, with the memory of the acceleration."""
 
     def __init__(
-        self, problem: Problem, data: Any, order: Order, exact: bool, memory: int, convex: int, keeps: bool
+        self, problem: Problem, data: Any, order: Order, exact: bool, convex: int, memory: int, keeps: bool
     ) -> None:
         sweeps = accelerated.AcceleratedSweeps(data, *make_order_plan(order), exact, memory, convex, keeps)
         super().__init__(problem, data, order, sweeps, ACCELERATED_PATIENCE)
@@ -51,38 +51,23 @@ class AcceleratedState(SweepState):
 
 @dataclass(frozen=True)
 class Accelerated(Sweeping):
-    """Base class of accelerated sweeps. A `_memory` of 0 selects nncg, other values Anderson acceleration."""
+    """Base class of accelerated sweeps."""
 
     sweep: str | None = None
     convex: int | None = 0
 
-    @property
-    def _memory(self) -> int:
-        return 0
-
-    @property
-    def _keeps(self) -> bool:
-        return False
+    def _get_acceleration(self) -> tuple[int, bool]:
+        """Return the memory of Anderson acceleration, 0 for nncg, and whether nncg restarts only against the sweep."""
+        raise NotImplementedError
 
     def prepare(self, problem: Problem) -> AcceleratedState:
-        """Build the state: sweep order, memory, and the diagonal blocks of A if blocks are solved exactly."""
-        self._check(problem)
-        state: AcceleratedState = super().prepare(problem)
-        return state
+        """Build the state: sweep order, memory, and the diagonal blocks of A if blocks are solved exactly.
 
-    def _estimate_formation_cost(self, problem: Problem) -> float:
-        over_a = _max_entries(problem) is not None or not (
-            problem.rows is not None or is_sweep_over_jacobian_cheaper(problem)
-        )
-        return estimate_formation_cost(problem) if over_a else 0.0
-
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
-        setup = partial(self._estimate_setup_cost, problem)
-        return Cost(setup, lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
-
-    def _check(self, problem: Problem) -> None:
-        """Raise InputError if the options `sweep` and `convex` are not valid for the problem."""
+        Raises
+        ------
+        InputError
+            The options `sweep` and `convex` are not valid for the problem.
+        """
         if self.sweep is not None:
             check_name("sweep", self.sweep, SWEEP_NAMES)
         if self.sweep == "pgs" and problem.law == "cone":
@@ -92,6 +77,18 @@ class Accelerated(Sweeping):
             )
         if self.convex is not None and (not isinstance(self.convex, int) or self.convex < 0):
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
+        state: AcceleratedState = super().prepare(problem)
+        return state
+
+    def _sweeps_over_matrix(self, problem: Problem) -> bool:
+        if _max_entries(problem) is not None:
+            return True
+        return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
+
+    def cost(self, problem: Problem) -> Cost:
+        """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
+        setup = partial(self._estimate_setup_cost, problem)
+        return Cost(setup, lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
 
     def _build_state(
         self, problem: Problem, order: Order, before: AcceleratedState | None
@@ -102,7 +99,7 @@ class Accelerated(Sweeping):
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = AUTOMATIC if self.convex is None else self.convex
         convex = convex if problem.law == "coulomb" else 0
-        return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
+        return AcceleratedState(problem, data, order, exact, convex, *self._get_acceleration())
 
     def _add_work_to_claim(self, state: AcceleratedState, claim: Claim, restarts: int) -> Claim:
         """Add the counts of sweeps and restarts, and the name of the form, to a claim."""

@@ -28,9 +28,8 @@ class Anderson(Accelerated):
     def __post_init__(self) -> None:
         check_int("memory", self.memory, 1, MAX_MEMORY)
 
-    @property
-    def _memory(self) -> int:
-        return self.memory
+    def _get_acceleration(self) -> tuple[int, bool]:
+        return self.memory, False
 
 
 SPEC = replace(

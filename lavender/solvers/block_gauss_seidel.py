@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.costs import estimate_formation_cost
 from lavender.solvers.sweeping import (
     SWEEPS,
     Sweeping,
@@ -25,25 +24,18 @@ from lavender.solvers.sweeping import (
     choose_sweep_data,
     form_name,
     is_sweep_over_jacobian_cheaper,
-    make_order_plan,
 )
-from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _estimate_formation_cost(self, problem: Problem) -> float:
-        return (
-            estimate_formation_cost(problem)
-            if problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
-            else 0.0
-        )
+    def _sweeps_over_matrix(self, problem: Problem) -> bool:
+        return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
 
     def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        data = choose_sweep_data(problem)
-        return SweepState(problem, data, order, serial.Sweeps(data, *make_order_plan(order), exact=True))
+        return SweepState(problem, choose_sweep_data(problem), order, exact=True)
 
     def _add_work_to_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))

@@ -16,7 +16,7 @@ from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import compute_block_order
 from lavender.solvers.costs import Cost, estimate_row_sums_cost
-from lavender.solvers.sweeping import SWEEPS, SweepSolver, SweepState, make_order_plan
+from lavender.solvers.sweeping import SWEEPS, SweepSolver, SweepState
 from lavender_ext.sweep import serial
 
 
@@ -43,9 +43,7 @@ class Jacobi(SweepSolver):
     def prepare(self, problem: Problem) -> SweepState:
         data, order = problem.csr_data, compute_block_order(problem)
         omega = serial.jacobi_damping_of_matrix(data) if self.omega is None else self.omega
-        return SweepState(
-            problem, data, order, serial.Sweeps(data, *make_order_plan(order), serial.JACOBI, omega)
-        )
+        return SweepState(problem, data, order, method=serial.JACOBI, omega=omega)
 
 
 SPEC = replace(

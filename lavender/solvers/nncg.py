@@ -35,9 +35,8 @@ class NNCG(Accelerated):
     def __post_init__(self) -> None:
         check_name("restart", self.restart, RESTARTS)
 
-    @property
-    def _keeps(self) -> bool:
-        return self.restart == "against"
+    def _get_acceleration(self) -> tuple[int, bool]:
+        return 0, self.restart == "against"
 
 
 SPEC = replace(

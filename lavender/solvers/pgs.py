@@ -19,7 +19,6 @@ import numpy as np
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.costs import estimate_formation_cost
 from lavender.solvers.sweeping import (
     SWEEPS,
     Sweeping,
@@ -40,8 +39,8 @@ class PGS(Sweeping):
     def _add_work_to_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
-    def _estimate_formation_cost(self, problem: Problem) -> float:
-        return 0.0 if is_sweep_over_jacobian_cheaper(problem) else estimate_formation_cost(problem)
+    def _sweeps_over_matrix(self, problem: Problem) -> bool:
+        return not is_sweep_over_jacobian_cheaper(problem)
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if is_sweep_over_jacobian_cheaper(problem):
@@ -49,9 +48,8 @@ class PGS(Sweeping):
         data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
         # In the given order, pass no order to the kernel: it then skips two lookups per row. The bits do not change.
         row_by_row = data.single_rows and order.is_given
-        return SweepState(
-            problem, data, order, serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)
-        )
+        sweeps = serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)
+        return SweepState(problem, data, order, sweeps)
 
 
 SPEC = replace(

@@ -20,8 +20,7 @@ from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers import pgs
 from lavender.solvers.layout import Layout, copy_problem_in_block_order, is_reordered_copy_faster
-from lavender.solvers.sweeping import Sweeping, SweepState, make_order_plan
-from lavender_ext.sweep import serial
+from lavender.solvers.sweeping import Sweeping, SweepState
 
 
 class ImpulseState(SweepState):
@@ -36,17 +35,12 @@ class ImpulseState(SweepState):
 
     def __init__(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> None:
         layout, sweeps = (None, None) if earlier is None else (earlier.layout, earlier.sweeps)
-        self.layout = (
-            copy_problem_in_block_order(problem, order.blocks, layout)
-            if is_reordered_copy_faster(problem, order)
-            else None
-        )
-        data, swept = problem.data, order
-        if self.layout is not None:
+        data, swept, self.layout = problem.data, order, None
+        if is_reordered_copy_faster(problem, order):
+            self.layout = copy_problem_in_block_order(problem, order.blocks, layout)
             data = self.layout.data
             swept = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        sweeps = serial.Sweeps(data, *make_order_plan(swept), before=sweeps)
-        super().__init__(problem, data, swept, sweeps)
+        super().__init__(problem, data, swept, before=sweeps)
         self.plan = order
 
     @property
@@ -73,8 +67,8 @@ class ImpulseState(SweepState):
 class SequentialImpulses(Sweeping):
     """Matrix-free projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _estimate_formation_cost(self, problem: Problem) -> float:
-        return 0.0
+    def _sweeps_over_matrix(self, problem: Problem) -> bool:
+        return False
 
     def _build_state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
         return ImpulseState(problem, order, earlier)

@@ -12,7 +12,7 @@ from lavender.base.arrays import check_float
 from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.sweeping import SWEEPS, Sweeping, SweepState, make_order_plan
+from lavender.solvers.sweeping import SWEEPS, Sweeping, SweepState
 from lavender_ext.sweep import serial
 
 
@@ -36,10 +36,7 @@ class SOR(Sweeping):
             )
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
-        data = problem.csr_data
-        return SweepState(
-            problem, data, order, serial.Sweeps(data, *make_order_plan(order), serial.SOR, self.omega)
-        )
+        return SweepState(problem, problem.csr_data, order, method=serial.SOR, omega=self.omega)
 
 
 SPEC = replace(

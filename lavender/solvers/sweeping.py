@@ -43,7 +43,13 @@ class SweepState:
     """State of a run of sweeps. Its stopping test `watch` counts sweeps and stores the best checked iterate."""
 
     def __init__(
-        self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = SWEEP_PATIENCE
+        self,
+        problem: Problem,
+        data: Any,
+        order: Order,
+        sweeps: Any = None,
+        patience: int = SWEEP_PATIENCE,
+        **options: Any,
     ) -> None:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
@@ -53,8 +59,8 @@ class SweepState:
             get_zero_impulse_reference(problem)
         data.share_reference(problem.metric)  # Make residuals over `data` relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience)
-        # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
-        self.sweeps = serial.Sweeps(data, *make_order_plan(order)) if sweeps is None else sweeps
+        # lavender_ext.sweep.serial.Sweeps with these options; by default, relaxed updates of the blocks.
+        self.sweeps = serial.Sweeps(data, *make_order_plan(order), **options) if sweeps is None else sweeps
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -128,10 +134,12 @@ class Sweeping(SweepSolver):
         return Cost(partial(self._estimate_setup_cost, problem))
 
     def _estimate_setup_cost(self, problem: Problem) -> float:
-        return estimate_order_cost(problem, self.order) + self._estimate_formation_cost(problem)
+        formation = estimate_formation_cost(problem) if self._sweeps_over_matrix(problem) else 0.0
+        return estimate_order_cost(problem, self.order) + formation
 
-    def _estimate_formation_cost(self, problem: Problem) -> float:
-        return estimate_formation_cost(problem)
+    def _sweeps_over_matrix(self, problem: Problem) -> bool:
+        """Return whether the sweeps need A."""
+        return True
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
