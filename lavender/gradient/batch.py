@@ -11,7 +11,7 @@ from lavender.base.arrays import FloatArray, IntArray, check_sequence, resolve_i
 from lavender.base.errors import InputError
 from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
-from lavender.gradient.result import INPUTS, MATRICES, Gradient
+from lavender.gradient.result import INPUTS, MATRICES, Gradient, GradientArrays
 from lavender.gradient.system import MAX_KERNEL_ROWS
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
@@ -56,7 +56,7 @@ class _LazySequence(Sequence[Any]):
         return f"<{type(self).__name__} of {self._n} problems>"
 
 
-class Gradients(_LazySequence):
+class Gradients(_LazySequence, GradientArrays):
     """Gradients of many problems, computed by `Derivatives.vjp`: `[i]` is the `Gradient` of problem i.
 
     Attributes such as `b`, `mu` and `v_free` hold the concatenated gradients of all problems. Gradients by matrices
@@ -66,25 +66,6 @@ class Gradients(_LazySequence):
     def __init__(self, of: Derivatives, numbers: FloatArray, separate: dict[int, Gradient]) -> None:
         super().__init__(len(of), separate)
         self._of, self._numbers, self._is_complete = of, numbers, not separate
-
-    if TYPE_CHECKING:
-        b: FloatArray
-        target: FloatArray
-        v_free: FloatArray
-        lower: FloatArray
-        upper: FloatArray
-        mu: FloatArray
-        coefficients: FloatArray
-        patch_radius: FloatArray
-        rolling: FloatArray
-        compliance: FloatArray
-        jac: FloatArray
-        normal: FloatArray
-        tangent: FloatArray
-        arm_a: FloatArray
-        arm_b: FloatArray
-        inv_mass: FloatArray
-        inv_inertia: FloatArray
 
     def _make_item(self, i: int) -> Gradient:
         return Gradient(self._of._get(i), self._numbers[self._of._linears.result_slice(i)])

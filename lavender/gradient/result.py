@@ -59,7 +59,30 @@ class _Input:
         return value
 
 
-class Gradient:
+class GradientArrays:
+    """Types of the gradients that are arrays, which descriptors and `__getattr__` of derived classes compute."""
+
+    if TYPE_CHECKING:
+        b: FloatArray
+        target: FloatArray
+        v_free: FloatArray
+        lower: FloatArray
+        upper: FloatArray
+        mu: FloatArray
+        coefficients: FloatArray
+        patch_radius: FloatArray
+        rolling: FloatArray
+        compliance: FloatArray
+        jac: FloatArray
+        normal: FloatArray
+        tangent: FloatArray
+        arm_a: FloatArray
+        arm_b: FloatArray
+        inv_mass: FloatArray
+        inv_inertia: FloatArray
+
+
+class Gradient(GradientArrays):
     """Gradients of a scalar by the data of a problem, computed by `Derivative.vjp`.
 
     Each gradient is computed at its first use and has the shape of the data. Its unit is the unit of the scalar over
@@ -88,27 +111,10 @@ class Gradient:
         # `_adjoint` holds q, s (m), f (nv) and c (m) of equation (4) in `lavender.gradient`, concatenated.
         self._derivative, self._adjoint = derivative, adjoint
 
-    if TYPE_CHECKING:  # Declare the attributes that `_Input` descriptors define below.
-        b: FloatArray
-        target: FloatArray
-        v_free: FloatArray
-        lower: FloatArray
-        upper: FloatArray
-        mu: FloatArray
-        coefficients: FloatArray
-        patch_radius: FloatArray
-        rolling: FloatArray
-        compliance: FloatArray
+    if TYPE_CHECKING:
         A: Any
         J: sp.csr_array
         M: sp.csr_array
-        jac: FloatArray
-        normal: FloatArray
-        tangent: FloatArray
-        arm_a: FloatArray
-        arm_b: FloatArray
-        inv_mass: FloatArray
-        inv_inertia: FloatArray
 
     @property
     def _q(self) -> FloatArray:
@@ -142,8 +148,7 @@ class Gradient:
             raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
     def _by_b(self) -> FloatArray:
-        m = self._derivative.m
-        return self._adjoint[m : 2 * m]
+        return self._s
 
     _by_target = _by_b
 
@@ -203,10 +208,8 @@ class Gradient:
         return -self._s * self._derivative._impulse
 
     def _by_A(self) -> Any:
-        derivative = self._derivative
-        if issparse(derivative.problem.matrix):
-            return _sum_on_pattern(derivative.problem.matrix, (-self._s, derivative._impulse))
-        return -np.outer(self._s, derivative._impulse)
+        matrix, pairs = self._derivative.problem.matrix, self._list_outer_product_pairs("A")
+        return _sum_on_pattern(matrix, *pairs) if issparse(matrix) else np.outer(*pairs[0])
 
     def _list_outer_product_pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
         """Return the gradient (5) by A, J or M, a sum of outer products u v^T, as pairs (u, v)."""
